@@ -139,13 +139,10 @@ def _with_what_it_says(found: Source) -> Source:
     These are `names`, and `args` from training with `imgsz`.
     """
     args = getattr(found.module, "args", None)
-    size = args.get("imgsz") if isinstance(args, Mapping) else None
-    sized = isinstance(size, int) and not isinstance(size, bool) and 0 < size
-    return dataclasses.replace(
-        found,
-        labels=found.labels or names_in(getattr(found.module, "names", None)),
-        input_size=found.input_size or ((size, size) if sized else None),
-    )
+    side = args.get("imgsz") if isinstance(args, Mapping) else None
+    size = (side, side) if isinstance(side, int) and side > 1 else None
+    names = names_in(getattr(found.module, "names", None))
+    return dataclasses.replace(found, labels=found.labels or names, input_size=found.input_size or size)
 
 
 def named_code(spec: str) -> str | None:

@@ -285,7 +285,7 @@ def _choices(model: Model, images: Tensor) -> str:
 
     def keep(one: Tensor) -> Tensor:
         columns = one.flatten(1).T if one.ndim > 1 else one[None]
-        found.append((one.shape, [row.tolist() for row in columns if bool((row == row.round()).all())]))
+        found.append((one.shape, columns[(columns == columns.round()).all(dim=1)].tolist()))
         return one
 
     outputs = read_by(model.read, *_answer(model, images), model.name)[: len(images)]

@@ -110,9 +110,14 @@ def _first(answer: Any) -> tuple[Any, set[int]]:
     beside = any(isinstance(one, Tensor) and one.ndim < 4 for one in others)
     if first.ndim != 3 or first.shape[2] == 4 or beside:
         return answer, set()
-    maps = list[Tensor]()
-    each_tensor(list(others), lambda one: maps.append(one) or one)
-    return first, {one.shape[1] for one in maps if one.ndim == 4}
+    channels = set[int]()
+
+    def keep(one: Tensor) -> Tensor:
+        channels.update(one.shape[1:2] if one.ndim == 4 else ())
+        return one
+
+    each_tensor(list(others), keep)
+    return first, channels
 
 
 def _is_one(part: Any) -> bool:
