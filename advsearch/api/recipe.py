@@ -36,6 +36,8 @@ from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, Des
 from advsearch.runs.results.base import INTERRUPTED, Result
 from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
 from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import attack_of, read_result
 from advsearch.threads import cores
@@ -86,7 +88,7 @@ def recipe_from_config(
     begun = time.perf_counter()
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
-    described = read_recipe(config.recipe) if resumed is None else None
+    described = None if resumed is not None and _noted(resumed) else read_recipe(config.recipe)
     if described is not None:
         _check(described, config)
         check_figures(described, _check_runs(planned(described, config)), config.recipe)
@@ -105,6 +107,14 @@ def recipe_from_config(
         run.write_summary(result)
         write_page(run.path, result)
         return result
+
+
+def _noted(path: Path) -> bool:
+    """Whether a run has the recipe that it began with; one that was stopped at once has not."""
+    if not (path / STORE).is_file():
+        return False
+    with Store(path / STORE, read_only=True) as store:
+        return store.noted(NOTE) is not None
 
 
 def _seconds(path: Path) -> float:

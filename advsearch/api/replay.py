@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.attack import LOADING, judged_alone, problem_from_config
 from advsearch.api.keywords import ReplayKeywords, asks, configured
 from advsearch.config import AttackConfig, ReplayConfig
 from advsearch.engine.naming import different
@@ -24,7 +24,7 @@ from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.answer import read_answer
-from advsearch.runs.directory import CONFIG, RunDirectory, find_run
+from advsearch.runs.directory import CONFIG, RunDirectory, find_run, only_here
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.replay import NOT_DONE, ReplayResult, ReplayRow
@@ -65,11 +65,15 @@ def replay_from_config(
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage(LOADING)
     folder = find_run(config.answer)
-    summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
+    summary, theirs = attack_of(folder), judged_alone(AttackConfig.from_yaml(folder / CONFIG))
     if config.threads is not None:
         theirs = theirs.model_copy(update={"threads": config.threads})
     if summary.adversarial is None:
         raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to render again")
+    if needed := [one for one in only_here(folder) if not one.startswith(("the objective", "the policy"))]:
+        raise InputError(
+            f"{folder}: {', '.join(needed)}: only the Python session that asked has what judges its answer"
+        )
     different((OWN_MODEL, *config.models), "model")
     problem, warnings = problem_from_config(theirs)
     u = kept_answer(folder, problem)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from advsearch.api.attack import LOADING
+from advsearch.api.attack import LOADING, is_named
 from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
@@ -18,11 +18,14 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
 from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.budget import verification_ladder
-from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, settings_of
+from advsearch.engine.going_on import check_made_of
+from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, only_here, settings_of
 from advsearch.engine.naming import (
     AnyModel,
+    check_not_of_scene,
     check_not_spread,
     different,
+    exists_here,
     load_models,
     model_name,
     scene_settings,
@@ -41,7 +44,7 @@ from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.answer import read_answer
-from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
+from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import attack_of
 from advsearch.scene.description import ENVIRONMENT
@@ -124,10 +127,15 @@ def sweep(
     }
     loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
     if loaded:
+        check_not_of_scene(options)
         described |= _described(loaded)
     else:
         described["object"] = ",".join(name for some in names for name in some)
     config = SweepConfig(**{**brought, **described, **options, "run": None if run is None else str(run)})
+    parts = [f"the model {model_name(one)}" for one in networks if exists_here(one)]
+    parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
+    parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
+    config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
     if config.keep_pictures != "none" and config.run is None:
         raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
     if config.aov is not None and config.run is None:
@@ -135,16 +143,18 @@ def sweep(
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
     progress = progress or NullProgress()
-    if loaded or not all(isinstance(one, (str, Path)) for one in networks):
+    if loaded or only_here(controls) or not all(isinstance(one, (str, Path)) for one in networks):
         check_not_spread(options)
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    job = _job(config, loaded or _places(config), several(networks), task, controls)
-    if config.run is not None:
-        return _kept(config, job, progress, resumed)
-    with _executor(config, progress) as executor:
-        return carry_out(job, None, progress, executor)
+    asked = task if isinstance(task, Task) else config.task
+    with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as folder:
+        job = _job(config, loaded or _places(config), several(networks), asked, controls)
+        if config.run is not None:
+            return _kept(config, job, progress, folder)
+        with _executor(config, progress) as executor:
+            return carry_out(job, None, progress, executor)
 
 
 def sweep_from_config(
@@ -339,13 +349,14 @@ def _stopped(config: SweepConfig) -> Path | None:
         return None
     path = run_path(config.run)
     recipe = path / CONFIG
-    same = recipe.is_file() and recipe.read_text(encoding="utf-8") == config.to_repeat().to_yaml()
+    same = recipe.is_file() and SweepConfig.from_yaml(recipe).plain() == config.to_repeat().plain()
     return path if same and not finished(path) else None
 
 
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
     with RunDirectory.of(config, resumed) as run, _executor(config, progress) as executor:
+        check_made_of(run, job.models)
         return carry_out(job, run, progress, executor)
 
 

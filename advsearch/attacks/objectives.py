@@ -33,6 +33,7 @@ from advsearch.attacks.logit_objectives import (
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
 from advsearch.tasks import Classification, Segmentation, Task
+from advsearch.tasks.classes import ClassTask
 from advsearch.tasks.detection import GOALS, Detection
 
 __all__ = [
@@ -228,7 +229,9 @@ def get_objective(
             )
         found = feature_distance(features, clean)
     else:
-        found = _of_answers(kind.form(targeted=targeted), task)
+        found = kind.form(targeted=targeted)
+        if isinstance(task, ClassTask) and task.nothing:
+            found = _of_answers(found, task)
     found = _aimed(found, task.target) if targeted else found
     return negated(found) if task.minimise else found
 

@@ -79,6 +79,7 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
     return {
         "wanted": wording.goal_text(summary),
         "changed": wording.changed_text(summary),
+        "objective": wording.objective_text(summary),
         "printable": wording.print_cost_text(summary),
         "over": wording.over_text(summary),
         "smallest": wording.smallest_text(summary),

@@ -44,6 +44,7 @@ from advsearch.runs.results.attack import (
     FoundValue,
     LinearTransport,
     NotFinite,
+    ObjectiveValues,
     PathSegments,
     PredictionError,
     Printability,
@@ -52,13 +53,15 @@ from advsearch.runs.results.attack import (
     SearchGradients,
     SharedWork,
     SmallestEpsilon,
+    TriedObjective,
     UsualAnswer,
     VerificationSamples,
     VerifiedRate,
 )
 from advsearch.runs.results.base import Formation, MovedValue
 from advsearch.scene.formation import to_8_bit
-from advsearch.tasks.base import typical
+from advsearch.tasks import Judgement
+from advsearch.tasks.base import mean, typical
 from advsearch.viewer.attack_page import write_report
 
 T = TypeVar("T")
@@ -245,6 +248,10 @@ def _summary(
         ),
         adversarial=_adversarial(problem, findings, adversarial, u),
         verified=_verified(findings.verification),
+        tried_objective=TriedObjective(
+            clean=_objective_over(findings.clean),
+            answer=_objective_over(findings.verification.adversarial_trials if findings.verification else ()),
+        ),
         baseline=None
         if baseline is None
         else BaselineSearch(
@@ -279,6 +286,15 @@ def _summary(
         seed=problem.seed,
         command_line=asked.command_line,
     )
+
+
+def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
+    """The objective over trials; None where it was not asked for, as in those of an older run."""
+    values = [one.objective for one in trials if one.objective is not None]
+    if not values:
+        return None
+    spread = statistics.pstdev(values) if all(map(math.isfinite, values)) else math.nan
+    return ObjectiveValues(mean=mean(values), deviation=spread, low=min(values), high=max(values))
 
 
 def _printability(problem: Problem, findings: Findings) -> Printability | None:

@@ -31,6 +31,7 @@ from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
 from advsearch.scene.surfaces import Surfaces
+from advsearch.settings import as_python
 from advsearch.tasks import Answer, AnyTask, Facts, Mark, Sight, make_task
 
 MOST_ANSWERS = 5
@@ -224,7 +225,7 @@ def render(
     instances = as_controls(controls)
     if around is not None and any(_turns(one) for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
-    size = resolution or (model.input_size[0], model.input_size[1])
+    size = as_python(resolution) or (model.input_size[0], model.input_size[1])
     progress = progress or NullProgress()
     progress.stage("rendering", around or 1)
     formation = None

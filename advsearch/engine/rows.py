@@ -56,7 +56,7 @@ def trial_row(
         step=number,
         seed=seed,
         spp=spp,
-        objective=_number(trial.score),
+        objective=_number(trial.objective),
         success=trial.success if sought else None,
         values=values or {},
         **{"renders": 1, **_said(trial), **more},
@@ -71,6 +71,7 @@ def judged(row: Row, judgement: Judgement) -> Row:
 def _said(judgement: Judgement) -> dict[str, Any]:
     answer = judgement.answer
     return {
+        "score": _number(judgement.score),
         "correct": judgement.right,
         "margin": _number(judgement.margin),
         "label": None if judgement.not_a_number else answer.label,
@@ -80,8 +81,8 @@ def _said(judgement: Judgement) -> dict[str, Any]:
     }
 
 
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
+def _number(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
 
 
 def judgement_of(row: Row) -> Judgement:
@@ -89,12 +90,10 @@ def judgement_of(row: Row) -> Judgement:
 
     In an old row, only the score says whether it was right.
     """
-    score = math.nan if row.objective is None else row.objective
-    margin = math.nan if row.margin is None else row.margin
+    score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
     right = score <= 0.0 if row.correct is None else row.correct
-    return Judgement(
-        score, margin, right, Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability), row.payload
-    )
+    answer = Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability)
+    return Judgement(score, margin, right, answer, row.payload, row.objective)
 
 
 def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:

@@ -63,7 +63,7 @@ def load_model(
         spec: ``"reference"`` (the bundled classifier), with ``"@weights.safetensors"`` if wanted; a path to a
             `torch.export` archive (.pt2) or to TorchScript; ``"package.module:callable"``, which returns an `nn.Module`
             or a `Model`, with ``"@weights.safetensors"`` if wanted; ``"torchvision:NAME@weights.safetensors"``; an
-            `nn.Module` (copied, its weights shared); a `Model`.
+            `nn.Module` (copied, its weights shared, unless they were made in `torch.inference_mode`); a `Model`.
         labels: the label names in index order, or a label file (see `read_labels`). Default "class 0", "class 1", ...
         name: what to call it in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.
@@ -95,6 +95,19 @@ def load_model(
         "max_batch": max_batch,
     }
     given = {key: value for key, value in options.items() if value is not None}
+    if isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None:
+        return dataclasses.replace(_loaded(spec, given, labels, name, max_batch, read), asked=os.fspath(spec))
+    return _loaded(spec, given, labels, name, max_batch, read)
+
+
+def _loaded(
+    spec: object,
+    given: Mapping[str, object],
+    labels: Any,
+    name: str | None,
+    max_batch: int | None,
+    read: Read | None,
+) -> Model:
     names, origin = _given_labels(labels)  # first, because loading a model takes seconds
     found = _find(spec)
     switches = turned_by_code()
@@ -102,6 +115,7 @@ def load_model(
         called_under(found.module, switches)
     if isinstance(found, Model):
         found = dataclasses.replace(found, read=read or found.read)
+        found = found if names is None and name is None else dataclasses.replace(found, asked=None)
         return _relabelled(found, names, origin, name, given)
     low, high = found.batch_limits
     bare = Model(

@@ -54,6 +54,7 @@ class Model:
         device: where the network lives. Images go there, the output comes back.
         read: from what the network answers to so many images, to its output: a tensor (N, ...), or a list with one
             thing for each; None for logits.
+        asked: what `load_model` was given, where that says all of it; None for what exists in this session only.
     """
 
     module: Callable[[Tensor], Any] = field(repr=False)
@@ -67,6 +68,7 @@ class Model:
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
     read: Read | None = field(default=None, repr=False)
+    asked: str | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         height, width = self.input_size

@@ -6,7 +6,7 @@ A network is called with the type and device for new tensors that its own code h
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,17 +66,18 @@ _outside: list[Switches] = []
 
 @contextmanager
 def plainly() -> Iterator[None]:
-    """Turn torch's switches as it comes, and back at the end."""
-    found = Switches.now()
-    _outside.append(found)
-    if found != PLAIN:
-        PLAIN.turn()
-    try:
-        yield
-    finally:
-        _outside.pop()
-        if Switches.now() != found:
-            found.turn()
+    """Turn torch's switches as it comes, and back at the end: also out of `torch.inference_mode`."""
+    with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+        found = Switches.now()
+        _outside.append(found)
+        if found != PLAIN:
+            PLAIN.turn()
+        try:
+            yield
+        finally:
+            _outside.pop()
+            if Switches.now() != found:
+                found.turn()
 
 
 def turned_by_code() -> Switches:

@@ -88,6 +88,11 @@ def margin_text(task: str) -> str:
     return _MARGINS.get(task, "over 0 where the answer is wrong")
 
 
+def is_command(text: str) -> bool:
+    """Whether what a result says of asking the same again is a command; otherwise it says why there is none."""
+    return not text or text.startswith("advsearch ")
+
+
 def objective_label(objective: str) -> str:
     """Return an objective with its unit, for an axis: ``margin [logits]``."""
     return next((f"{objective} [{unit}]" for unit, names in _UNITS.items() if objective in names), objective)

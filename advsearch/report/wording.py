@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.report.phrases import (
     CLASSIFICATION,
+    SUCCESS_ABOVE_ZERO,
     calling,
     calls,
     margin_text,
@@ -16,7 +17,6 @@ from advsearch.report.phrases import (
     wanted,
     with_article,
 )
-from advsearch.settings import split_names
 
 if TYPE_CHECKING:
     from advsearch.runs.results.attack import AttackSummary, SharedWork, VerifiedRate
@@ -101,6 +101,19 @@ def goal_text(summary: AttackSummary) -> str:
     return "easier to recognise" if summary.minimises else ""
 
 
+def objective_text(summary: AttackSummary) -> str:
+    """Return what came of an objective that is no margin, over the trials; empty where there is nothing to say."""
+    tried = summary.tried_objective
+    if tried is None or summary.objective in SUCCESS_ABOVE_ZERO:
+        return ""
+    parts = [
+        f"{name} {one.mean:.3g} (from {one.low:.3g} to {one.high:.3g})"
+        for name, one in (("clean", tried.clean), ("answer", tried.answer))
+        if one is not None
+    ]
+    return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
+
+
 def over_text(summary: AttackSummary) -> str:
     """Return what varied by chance: ``camera and environment, drawn anew for every picture``."""
     return f"{' and '.join(summary.over)}, drawn anew for every picture" if summary.over else ""
@@ -126,6 +139,8 @@ def short_name(value: Any) -> str:
 
 def short_names(text: str) -> str:
     """Return the last parts of paths, of one or of several separated by commas: ``a.hdr, studio``."""
+    from advsearch.settings import split_names  # which is too heavy for a help
+
     return ", ".join(map(short_name, split_names(text)))
 
 

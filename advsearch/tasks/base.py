@@ -56,6 +56,7 @@ class Judgement:
         right: whether the answer is right. NaN is not right.
         answer: what the model says.
         payload: what else is kept of it in the run's rows, as JSON values (boxes, masks); None where there is nothing.
+        objective: what a search maximises, of this picture; None where nothing is searched.
     """
 
     score: float
@@ -63,6 +64,7 @@ class Judgement:
     right: bool
     answer: Answer
     payload: JsonValue = None
+    objective: float | None = None
 
     @classmethod
     def of(cls, score: float, margin: float, answer: Answer, payload: JsonValue = None) -> Judgement:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from advsearch.tasks.boxes import FORMS, corners, overlap
-from advsearch.tasks.detector_answers import Detections, counted, numbers_of
+from advsearch.tasks.detector_answers import Detections, as_option, counted, numbers_of
 
 UNITS = ("fractions", "pixels")
 
@@ -80,13 +80,13 @@ class Reading:
         """Return which other readings would be usual ones: those that differ least in what is said."""
         others = [Reading(form, unit, self.size) for unit in UNITS for form in FORMS[:3]]
         fitting = [self.change_to(one) for one in others if one.usual(boxes) >= USUAL]
-        nearest = [one for one in fitting if len(one.split()) == min(len(two.split()) for two in fitting)]
+        nearest = [one for one in fitting if one.count(":") == min(two.count(":") for two in fitting)]
         return f"; {' or '.join(nearest)} would mend that" if nearest else ""
 
     def change_to(self, other: Reading) -> str:
-        """Return what says another reading in place of this one: "`boxes=xywh`"."""
+        """Return what says another reading in place of this one, such as ``boxes: xywh``."""
         said = [("boxes", self.form, other.form), ("unit", self.unit, other.unit)]
-        return " ".join(f"`{name}={new}`" for name, old, new in said if old != new)
+        return as_option(", ".join(f"{name}: {new}" for name, old, new in said if old != new))
 
     def better(self, boxes: Tensor, true: Tensor, least: float) -> str:
         """Return what says the reading in which one of boxes (D, 4) overlaps the true box `NEARER` than in this one.

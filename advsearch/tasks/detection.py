@@ -29,6 +29,7 @@ from advsearch.tasks.classes import NO, ClassTask, Labels
 from advsearch.tasks.detector_answers import (
     ORDERS,
     Detections,
+    as_option,
     ask_order,
     checked_order,
     detections_in,
@@ -167,7 +168,7 @@ class Detection(ClassTask):
             right = torch.cat([raw[score >= LEAST] for raw, score in each])
         if len(right) and truth is not None and truth.shares is not None:
             better = reading.better(right, truth.shares, self.iou)
-            doubts = f"with {better} one is nearer to the object" if better else reading.fault(right)
+            doubts = f"one of them is nearer to the object with {better}" if better else reading.fault(right)
         else:
             boxes = strongest_boxes(output)
             doubts = reading.fault(boxes) and f"{reading.fault(boxes)}{reading.instead(boxes)}"
@@ -195,7 +196,8 @@ class Detection(ClassTask):
         if not (self.unit or self.seen_unit):
             return (
                 "unit: expected the unit of the model's boxes, and it finds nothing in noise and in the clean scene "
-                "that shows it; say `unit: fractions` or `unit: pixels`, and `boxes` unless they are x0, y0, x1, y1"
+                f"that shows it; say {as_option('unit: fractions')} or {as_option('unit: pixels')}, and `boxes` too "
+                "unless they are x0, y0, x1, y1"
             )
         return ""
 
@@ -205,9 +207,8 @@ class Detection(ClassTask):
         said = []
         if self.undecided and self.seen_order and not self.order:
             said.append(
-                f"Of the numbers of each of its boxes {'first' if self.seen_order == ORDERS[0] else 'second'} is "
-                "taken for the score and the other one for the class, as their values show "
-                f"(`order: {self.seen_order}`)."
+                "Scores and classes of the detector's boxes are told apart by their values: they are read as "
+                f"{as_option(f'order: {self.seen_order}')}."
             )
         if self.doubts:
             said.append(f"The detector's boxes may be read wrongly: {self.doubts}.")
@@ -313,7 +314,7 @@ class Detection(ClassTask):
 
     def _read(self, output: Sequence[Detections]) -> list[Detections]:
         """What the model answered, with boxes as shares of the picture; what names no thing has a score of 0."""
-        found, reading = [], self._reading
+        found, reading = list[Detections](), self._reading
         nothing = torch.tensor(self.nothing, dtype=torch.long)
         for one in self._settled(output):
             boxes, scores = reading.fractions(one["boxes"]), one["scores"]

@@ -36,6 +36,8 @@ NAMES = {
 WORDS = {"boxes": ("box",), "scores": ("score", "conf", "prob", "logit"), "labels": ("label", "class", "cls", "categ")}
 """What is in a name that is none of these."""
 
+NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
+
 TOLERANCE = 1e-3
 """How far outside [0, 1] a score may lie."""
 
@@ -65,7 +67,7 @@ def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
     """
     parts = checked_order(order) if order else ()
     if isinstance(answer, (list, tuple)) and len(answer) == count and all(map(_is_one, answer)):
-        found = [_parts(one, parts) for one in answer]
+        found = [dict(NOTHING) if one is None else _parts(one, parts) for one in answer]
     elif isinstance(answer, Tensor) and answer.ndim == 2 and answer.shape[1] == 7:
         found = [_parts(rows, [part for part in parts if part != "batch"]) for rows in _split(answer, count, parts)]
     else:
@@ -106,8 +108,6 @@ def _columns(order: Sequence[str]) -> dict[str, slice]:
 
 def _parts(answer: Any, order: Sequence[str]) -> dict[str, Tensor]:
     """Return the parts of an answer by name: boxes, and scores, with labels or without, or `either`."""
-    if answer is None:
-        return {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
     if isinstance(answer, Tensor):
         if answer.ndim not in (2, 3) or answer.shape[-1] != 6:
             raise ValueError(EXPECTED)
@@ -257,7 +257,12 @@ def settled(one: Detections, order: str = "") -> Detections:
 
 def ask_order() -> str:
     """What to say where scores and classes cannot be told apart."""
-    return f"say `order`: '{ORDERS[0]}' or '{ORDERS[1]}'"
+    return f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
+
+
+def as_option(options: str) -> str:
+    """Return what says options of detection, as messages name settings."""
+    return f"`task='detection={{{options}}}'`"
 
 
 def order_in(found: Sequence[Detections], classes: int | None = None) -> str:

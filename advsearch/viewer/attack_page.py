@@ -17,7 +17,7 @@ from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.failures import FAILURE_HEADS, answered_text, failure_rows, failures_text, range_text
 from advsearch.report.markup import Html, element, join
 from advsearch.report.method import PLAN_HEADS, method_facts, plan_rows, plan_text
-from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text, objective_label
+from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, is_command, marks_text, objective_label
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, FoundValue, UsualAnswer
@@ -256,6 +256,7 @@ def _cost(summary: AttackSummary) -> Html:
         "Policy": f"{summary.policy}, {wording.count(summary.steps, 'step')}",
         "Goal": wording.goal_text(summary),
         "Budget": wording.budget_text(summary),
+        "Objective": wording.objective_text(summary),
         "Over": wording.over_text(summary),
         "Smallest epsilon": wording.smallest_text(summary),
         "Renders": wording.renders_text(summary),
@@ -279,9 +280,9 @@ def _method(summary: AttackSummary) -> Html:
 
 
 def _repeat(data: RunData) -> Html:
-    commands = [shlex.join(["advsearch", "run", f"{data.summary.run or data.path}/{directory.CONFIG}"])]
-    if data.summary.command_line:
-        commands.append(data.summary.command_line)
+    commands = [data.summary.command_line] if data.summary.command_line else []
+    if is_command(data.summary.command_line):
+        commands.insert(0, shlex.join(["advsearch", "run", f"{data.summary.run or data.path}/{directory.CONFIG}"]))
     recipe = None
     if data.recipe:
         recipe = element("details", element("summary", "All settings"), element("pre", data.recipe, class_="wrap"))

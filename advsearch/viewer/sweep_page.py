@@ -17,7 +17,7 @@ from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
-from advsearch.report.phrases import beside_text, percent
+from advsearch.report.phrases import beside_text, is_command, percent
 from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
@@ -271,7 +271,9 @@ def _cost(path: Path, summary: SweepSummary) -> Html:
         "Samples a pixel": str(summary.spp),
         "Image formation": wording.formation_text(summary.image_formation) if summary.image_formation else "",
         "Seed": str(summary.seed),
-        "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"]),
+        "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"])
+        if is_command(summary.command_line)
+        else "",
         "Command": summary.command_line,
     }
     return join(element("h2", "Cost and conditions"), facts_table(facts))

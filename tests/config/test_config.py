@@ -56,7 +56,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "epsilon": ("nan", "expected a number greater than 0 and at most 1e+06, got nan"),
     "seconds": (0, "expected a number greater than 0 and at most 1e9, got 0"),
-    "target": ([3], "expected names of classes or their numbers, separated by commas, got [3]"),
+    "target": ([3.5], "expected names of classes or their numbers, separated by commas, got [3.5]"),
     "minimise": ("maybe", "expected true or false, got maybe"),
     "smallest": (2, "expected true or false, got 2"),
     "over": ({"camera": 3}, "expected names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}, got camera=3"),

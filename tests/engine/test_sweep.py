@@ -135,6 +135,7 @@ COMPARED = (
     "seed",
     "spp",
     "objective",
+    "score",
     "success",
     "correct",
     "margin",
@@ -517,8 +518,8 @@ def test_the_worst_is_the_largest_margin_and_is_rendered_again(tmp_path: Path) -
     rows = list(result.rows())
     worst = result.summary.worst
     assert worst is not None and worst.verified is not None
-    best = max(rows, key=lambda row: row.objective or -math.inf)
-    assert worst.configuration == best.step and worst.claimed.margin == best.objective
+    best = max(rows, key=lambda row: row.score or -math.inf)
+    assert worst.configuration == best.step and worst.claimed.margin == best.score
     assert plain(worst.values) == best.values and worst.seed == best.seed and worst.claimed.label == "vase"
     checked = worst.verified
     assert (checked.successes, checked.trials, checked.spp) == (7, 7, 36) and checked.labels == {"vase": 7}
@@ -640,10 +641,11 @@ def test_answers_that_are_not_finite_are_counted_and_not_right() -> None:
 
     victim = advsearch.load_model(Fails(), labels=LABELS, input_size=SIZE, name="fails")
     result = advsearch.sweep("mug", victim, {"pose.yaw": "0:360:40"}, trials=0)
-    bad = [row for row in result.rows() if row.objective is None]
+    bad = [row for row in result.rows() if row.score is None]
     assert bad and all((row.correct, row.margin) == (False, None) for row in bad)
     assert result.summary.not_finite == len(bad)
-    assert any("not finite; they count as not right" in text for text in result.summary.warnings)
+    assert any("not numbers; they count as not right" in text for text in result.summary.warnings)
+    assert all((row.label, row.label_index) == (None, None) for row in bad)
     assert result.summary.worst is not None and math.isfinite(result.summary.worst.claimed.margin)
 
 
@@ -695,7 +697,7 @@ def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     assert rows_of(path) == rows
     assert timeless(again.summary) == summary
     rendered_again = FakeRenderer.calls - before - (WHOLE - stops_at)
-    assert 0 <= rendered_again < (4 if stops_at < PICTURES else 9)  # a batch; or what chose the sample count
+    assert 0 <= rendered_again < (5 if stops_at < PICTURES else 9)  # a look and a batch; or what chose the sample count
 
 
 def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path) -> None:
@@ -910,13 +912,13 @@ def test_a_small_sweep_really_rendered_is_repeatable(tmp_path: Path) -> None:
     assert rows_of(tmp_path / "a") == rows_of(tmp_path / "b")
     assert timeless(first.summary) == timeless(second.summary)
     rows = list(first.rows())
-    assert len({row.objective for row in rows}) == 4
+    assert len({row.score for row in rows}) == 4
     scene = advsearch.load_scene("mug", settings={"pose.yaw": 180.0, "camera.elevation": 60.0})
     render = scene.renderer({"pose": {"yaw": [0, 360]}}, resolution=16)
     with torch.no_grad():
         picture = render(render.start, seed=rows[3].seed or 0, spp=1)
         logits = model()((picture * 255.0).round() / 255.0)
-    assert float(logits[0, 1] - logits[0, 0]) == pytest.approx(rows[3].objective, abs=0.2)
+    assert float(logits[0, 1] - logits[0, 0]) == pytest.approx(rows[3].score, abs=0.2)
 
 
 @pytest.mark.parametrize("keep", ["all", "wrong", "none"])

@@ -370,7 +370,7 @@ class Listed(nn.Module):
 def test_a_list_of_mappings_needs_names() -> None:
     model = load_model(Listed(), input_size=8, read=Detection().reader, labels=NAMES)
     task = Detection().on(model)
-    assert task.looks and task.seen_unit == "" and "`unit: pixels`" in task.unsaid, "nothing shows in noise"
+    assert task.looks and task.seen_unit == "" and "unit: pixels" in task.unsaid, "nothing shows in noise"
     assert len(model(torch.zeros(3, 8, 8, 3))) == 3
     with pytest.raises(InputError, match="labels: expected a file with the names of the classes of model Listed"):
         Detection().on(load_model(Listed(), input_size=8, read=Detection().reader))

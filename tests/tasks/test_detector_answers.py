@@ -111,12 +111,14 @@ def test_one_class_is_all_zeros_and_still_no_score(form: str) -> None:
     task, output = on(Shaped(FORMS[form], classes=(0, 0)))
     assert task.judge(output, TRUTH)[0].answer == Answer("cup", 0, pytest.approx(0.8))
     (said,) = task.remarks
-    assert f"`order: {task.seen_order}`" in said and "taken for the score" in said
+    assert f"read as `task='detection={{order: {task.seen_order}}}'`" in said
 
 
 def test_what_the_numbers_leave_open_is_asked_for() -> None:
     network = Shaped(rows, classes=(1, 0), scores=(1.0, 1.0))
-    with pytest.raises(InputError, match="which of a box's two numbers is its score does not show; say `order`"):
+    with pytest.raises(
+        InputError, match=r"which of a box's two numbers is its score does not show; say `task='detection="
+    ):
         on(network)
     task, output = on(network, order="boxes scores labels")
     assert [(one.label, one.probability) for one in task.answers(output, 2)[0]] == [("cup", 1.0), ("bowl", 1.0)]
@@ -130,8 +132,12 @@ def test_a_silent_model_leaves_all_open() -> None:
         model = load_model(Shaped(FORMS[form]), input_size=100, read=task.reader, labels=NAMES)
         return task.on(model).seeing(model(PICTURE * 2.0), TRUTH).unsaid
 
-    assert "say `order`: 'boxes scores labels' or 'boxes labels scores'" in silent("rows")
-    assert "say `unit: fractions` or `unit: pixels`, and `boxes`" in silent("whole classes")
+    assert "say `task='detection={order: boxes scores labels}'` or `task='detection={order: boxes labels" in silent(
+        "rows"
+    )
+    assert "say `task='detection={unit: fractions}'` or `task='detection={unit: pixels}'`, and `boxes`" in silent(
+        "whole classes"
+    )
     assert not silent("whole classes", unit="pixels")
 
 
@@ -153,6 +159,7 @@ def three() -> Rows:
     ("answer", "text"),
     [
         (lambda b, s, c: (b, s, s), "expected for each box a score in"),
+        (lambda b, s, c: None, "expected boxes"),
         (lambda b, s, c: (b, c.long(), c.long()), "expected boxes"),
         (lambda b, s, c: {"boxes": b, "labels": c + 0.5, "scores": s}, "classes that are whole numbers"),
         (lambda b, s, c: torch.cat([b, s[..., None]], dim=-1), "expected boxes"),
@@ -176,10 +183,10 @@ def middle(boxes: Tensor) -> Tensor:
     [
         (lambda b: b, "pixels", ""),
         (lambda b: b / 100.0, "fractions", ""),
-        (middle, "pixels", "`boxes=cxcywh`"),
-        (lambda b: middle(b / 100.0), "fractions", "`boxes=cxcywh`"),
-        (lambda b: torch.cat([b[..., :2], b[..., 2:] - b[..., :2]], dim=-1), "pixels", "`boxes=xywh`"),
-        (lambda b: b[..., [1, 0, 3, 2]], "pixels", "`boxes=yxyx`"),
+        (middle, "pixels", "boxes: cxcywh"),
+        (lambda b: middle(b / 100.0), "fractions", "boxes: cxcywh"),
+        (lambda b: torch.cat([b[..., :2], b[..., 2:] - b[..., :2]], dim=-1), "pixels", "boxes: xywh"),
+        (lambda b: b[..., [1, 0, 3, 2]], "pixels", "boxes: yxyx"),
         (lambda b: 10.0 * b, "pixels", "far outside the picture"),
         (lambda b: b[..., [2, 3, 0, 1]], "pixels", "a right edge left of the left one"),
     ],
@@ -194,9 +201,9 @@ def test_the_unit_is_read_from_boxes_that_count_and_an_odd_form_is_named(
 
 def test_boxes_that_are_said_in_a_wrong_unit_are_smaller_than_a_pixel() -> None:
     task, output = on(Shaped(lambda b, s, c: (b / 100.0, s, c.long())), unit="pixels")
-    assert "`unit=fractions`" in task.doubts
+    assert "unit: fractions" in task.doubts
     unknown = task.seeing(output, None)
-    assert "are smaller than a pixel; `unit=fractions` would mend that" in unknown.doubts
+    assert "are smaller than a pixel; `task='detection={unit: fractions}'` would mend that" in unknown.doubts
 
 
 def test_what_is_said_in_full_is_not_looked_at() -> None:

@@ -12,13 +12,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
 from advsearch.cluster.executor import Done, Executor, InProcess
 from advsearch.described import Value
+from advsearch.engine.going_on import finite, same
 from advsearch.engine.machines import Machines
+from advsearch.engine.memory import Memory
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import LOST, judgement_of, lost_remarks, trial_row
@@ -122,6 +125,7 @@ class Sweep:
         """
         tally = self._counted()
         ending, worst = FINISHED, None
+        self._check_answers()
         for text in self.job.warnings:
             self.stages.progress.message(text)
         try:
@@ -249,6 +253,22 @@ class Sweep:
     def _is_first_of_size(self, model: int) -> bool:
         """Whether no model before it is shown the same pictures."""
         return self.job.sizes[model] not in self.job.sizes[:model]
+
+    def _check_answers(self) -> None:
+        """Look again at the first picture that is stored, where there is more to come here.
+
+        Raises:
+            InputError: a model says something else of it now than it did.
+        """
+        row = None if self.run is None else next(self.run.store.rows(KIND), None)
+        if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
+            return
+        number, model = divmod(row.step, self.models)
+        batches = Batches(self.job, self.per_scene)  # another one: what is done here decides no row
+        look = partial(batches, range(number, number + 1))
+        now = finite(look().judgements[model][0].margin)
+        if not same([row.margin], [now]) and same([now], [finite(look().judgements[model][0].margin)]):
+            raise Memory(self.run).other_answers({"margin": (row.margin, now)})
 
     def _tell(self, count: int, tally: Tally) -> None:
         self._untold += count

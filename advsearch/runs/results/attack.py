@@ -65,6 +65,22 @@ class VerifiedRate(Fields):
     not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
+class ObjectiveValues(Fields):
+    """The objective over some trials, in its own unit."""
+
+    mean: Number
+    deviation: Number = Field(description="standard deviation of one trial")
+    low: Number = Field(description="the least")
+    high: Number = Field(description="the most")
+
+
+class TriedObjective(Fields):
+    """What the search maximised, over the trials of the verification, which have other seeds and 8 bits."""
+
+    clean: ObjectiveValues | None = Field(description="of the clean scene; null where it was not tried")
+    answer: ObjectiveValues | None = Field(description="of the answer; null where nothing was verified")
+
+
 class BaselineSearch(Fields):
     """The random search beside it."""
 
@@ -278,6 +294,7 @@ class AttackSummary(SceneResult):
     clean: CleanAnswer
     adversarial: UsualAnswer | None = Field(description="on the search's answer; null if nothing was searched")
     verified: VerifiedRate | None = Field(description="trials of the answer; null if nothing was verified")
+    tried_objective: TriedObjective | None = Field(default=None, description="the objective over these trials")
     baseline: BaselineSearch | None = Field(default=None, description="the random search; absent without `baseline`")
     answer_from: str | None = Field(default=None, description="`random` where the random search's answer is the run's")
     policy_verified: VerifiedRate | None = Field(default=None, description="of the policy's own answer then")

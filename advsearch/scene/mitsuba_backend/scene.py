@@ -27,7 +27,7 @@ from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_o
 from advsearch.scene.mitsuba_backend.population import media_in, population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mitsuba, one_at_a_time
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import PluginPart, plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -68,6 +68,7 @@ class MitsubaScene:
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
     """
 
+    @one_at_a_time
     def __init__(
         self,
         description: SceneDescription,
@@ -169,6 +170,7 @@ class MitsubaScene:
         value = as_torch(self.parameters[key])
         return value if one.shape is None else value.reshape(one.shape)
 
+    @one_at_a_time
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
         """Render linear radiance with `spp` independent samples a pixel.
 
@@ -184,23 +186,27 @@ class MitsubaScene:
         self._apply(inputs)
         return self._render("hidden" if hide else "path", seed, spp)
 
+    @one_at_a_time
     def guides(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> tuple[Tensor, Tensor]:
         """Render what guides the denoiser: first-hit albedo and shading normal, each (H, W, 3) float32."""
         self._apply(inputs)
         both = self._render("guides", seed, spp)[..., -6:]
         return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
 
+    @one_at_a_time
     def held(self, inputs: Mapping[str, Tensor]) -> Any:
         """Return Mitsuba's scene with these inputs set, until the next call of anything here."""
         self._apply(inputs)
         return self._scene
 
+    @one_at_a_time
     def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; arguments as for `Renderer.surfaces`."""
         self._apply(inputs)
         height, width = self.resolution
         return first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
 
+    @one_at_a_time
     def adjoint(
         self,
         inputs: Mapping[str, Tensor],
@@ -256,6 +262,7 @@ class MitsubaScene:
                 self._write(name, mi.TensorXf(contiguous(value)))
             self.parameters.update()
 
+    @one_at_a_time
     def material_adjoint(
         self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, *, meshes: Collection[str]
     ) -> dict[str, Tensor]:
@@ -289,6 +296,7 @@ class MitsubaScene:
         found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
         return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
 
+    @one_at_a_time
     def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
         """Return what the vertices of light paths add to their pixels for a unit more of a base colour, and the picture
         of these paths.
