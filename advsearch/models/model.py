@@ -228,6 +228,11 @@ def _task_of(answer: Any) -> str | None:
         return "detection"
     tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
     kinds = {2: "classification", 4: "segmentation"}
+    if (
+        isinstance(answer, (list, tuple))
+        and len({one.shape[2:] for one in answer if isinstance(one, Tensor) and one.ndim == 4}) > 1
+    ):
+        return None  # maps of several sizes
     return kinds.get(tensor.dim()) if isinstance(tensor, Tensor) else None
 
 

@@ -74,6 +74,8 @@ def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
         ValueError: it is something else, or scores are not in [0, 1].
     """
     parts = checked_order(order) if order else ()
+    if isinstance(answer, (list, tuple)) and answer and all(isinstance(one, Tensor) and one.ndim > 3 for one in answer):
+        raise ValueError("expected boxes, and not the maps of a head from which they are made: export it in .eval()")
     answer, channels = _first(answer)
     beside = torch.tensor(sorted(channels), dtype=torch.long)
     grid = isinstance(answer, Tensor) and answer.ndim == 3 and answer.shape[0] == count and answer.shape[2] != 4
@@ -113,7 +115,7 @@ def _first(answer: Any) -> tuple[Any, set[int]]:
     channels = set[int]()
 
     def keep(one: Tensor) -> Tensor:
-        channels.update(one.shape[1:2] if one.ndim == 4 else ())
+        channels.update(one.shape[1:2] if one.ndim == 4 and len(one) == len(first) else ())
         return one
 
     each_tensor(list(others), keep)

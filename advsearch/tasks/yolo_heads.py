@@ -84,12 +84,15 @@ def _unfitting(answer: Tensor, classes: int) -> str:
     """What an answer is that has not as many numbers as the classes ask for."""
     length, last = min(answer.shape), answer.shape[0] >= answer.shape[1]
     over = {length - 4 - classes, length - 6 if last else 0}
-    said = f"expected 4 + {classes} or 5 + {classes} numbers of a box for {classes} classes, got {length}"
+    of = f"{classes} class{'es' * (classes > 1)}"
+    said = f"expected 4 + {classes} or 5 + {classes} numbers of a box for {of}, got {length}"
     named = [name for start in HEADS.values() for name in sets_of(length - start)]
     if named:
         return f"{said}; {' or '.join(f'`labels={name}`' for name in named)} would fit"
     if 1 in over:
         return f"{said}, as OBB heads (oriented boxes, with an angle) have it, {_UNREAD}"
+    if 32 in over:
+        return f"{said}, as with mask coefficients, and no prototypes (N, 32, h, w) came beside them"
     if any(one > 0 and one % 3 == 0 for one in over):
         return f"{said}, as pose heads (with keypoints) have it, {_UNREAD}; or give the `labels` of the model's classes"
     return f"{said}; give the `labels` of the model's classes"

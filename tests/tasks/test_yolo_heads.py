@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.errors import InputError
+from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.labels import names_in, read_labels
 from advsearch.tasks import Answer, Detection
@@ -94,6 +94,11 @@ FORMS: dict[str, tuple[Callable[[Tensor], Any], float | None, str]] = {
     "v8 in training form": (lambda n: (first(n), feature_maps(n)), None, V8),
     "v8 with a mapping": (lambda n: (first(n), {"boxes": n[..., :4], "feats": feature_maps(n)}), None, V8),
     "RT-DETR": (lambda n: torch.cat([n[..., :4] / 100.0, n[..., 4:]], dim=2), None, V8_LAST),
+    "RT-DETR in training form": (
+        lambda n: (torch.cat([n[..., :4] / 100.0, n[..., 4:]], dim=2), (noisy(6, len(n), PLACES, 4), n[..., :4], None)),
+        None,
+        V8_LAST,
+    ),
     "v5": (lambda n: n, 0.9, V5),
     "v5 in training form": (lambda n: (n, [noisy(len(n), 3, 8, 8, 8)]), 0.9, V5),
     "v5 of a file": (lambda n: (n, noisy(len(n), 3, 8, 8, 8), noisy(len(n), 3, 4, 4, 8)), 0.9, V5),
@@ -136,7 +141,7 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     assert found.right and found.answer == Answer(names[cup(classes)], cup(classes), pytest.approx(score, abs=1e-4))
     best: Any = found.payload
     assert best["found"][0]["box"] == pytest.approx(CUP, abs=0.1)
-    assert task.seen_order == order and task.seen_unit == ("fractions" if form == "RT-DETR" else "pixels")
+    assert task.seen_order == order and task.seen_unit == ("fractions" if "RT-DETR" in form else "pixels")
     assert not task.unsaid and not task.doubts
     said = " ".join(task.remarks)
     assert f"order: {order}" in said and ("masks are left out" in said) is ("masks" in form)
@@ -161,7 +166,7 @@ def more(columns: int, span: float = 0.9) -> Callable[[Tensor], Tensor]:
         (
             first,
             ["a"],
-            "expected 4 . 1 or 5 . 1 numbers of a box for 1 classes, got 7; give the `labels` of the model's",
+            "expected 4 . 1 or 5 . 1 numbers of a box for 1 class, got 7; give the `labels` of the model's",
         ),
         (lambda n: n[..., :6].mT, NAMES, "expected 4 . 3 or 5 . 3 numbers of a box for 3 classes, got 6"),
     ],
@@ -171,6 +176,13 @@ def test_other_heads_are_refused_in_a_sentence(form: Callable[[Tensor], Any], la
     with pytest.raises(InputError, match=text) as caught:
         on(Head(form), labels)
     assert "\n" not in str(caught.value)
+
+
+def test_what_comes_without_its_prototypes_or_undecoded_is_refused() -> None:
+    with pytest.raises(InputError, match="got 39, as with mask coefficients, and no prototypes"):
+        on(Head(lambda n: first(with_masks(n)).repeat(1, 1, 2)))
+    with pytest.raises(ModelError, match=r"export it in .eval\(\), got list; wrap the network"):
+        on(Head(feature_maps))
 
 
 def test_labels_of_another_set_are_named() -> None:
