@@ -349,7 +349,8 @@ def order_in(found: Sequence[Detections], classes: int | None = None, head: str 
     whole = [bool(((c == c.round()) & (c >= -1.0) & (c < most)).all()) for c in numbers]
     share = [bool(((c >= -TOLERANCE) & (c <= 1.0 + TOLERANCE)).all()) for c in numbers]
     fits = [share[0] and whole[1], share[1] and whole[0]]
-    if not any(fits) and all(share) and classes in (1, 2):
+    broken = not any(bool((c == c.round()).all()) for c in numbers)
+    if not any(fits) and all(share) and broken and classes in (1, 2):
         return f"{list(HEADS)[2 - classes]} {LAYOUTS[1]}"
     if not any(fits) and classes is not None:
         return order_in(found)

@@ -65,7 +65,8 @@ def head_in(answer: Tensor, beside: Collection[int], classes: int, order: str = 
                 )
     if found == [_WITH_ANGLE] and not order:
         raise ValueError(
-            f"its {5 + classes} channels may be those of an OBB head (with an angle), {_UNREAD}, or have objectness"
+            f"its {5 + classes} channels may be those of an OBB head (with an angle), {_UNREAD}; if it has "
+            f"objectness, say `task='detection={{order: {_WITH_ANGLE}}}'`"
         )
     if outside and not found:
         raise ValueError(f"it has {outside}")

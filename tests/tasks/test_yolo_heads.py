@@ -17,6 +17,7 @@ from advsearch.models.labels import names_in, read_labels
 from advsearch.tasks import Answer, Detection
 from advsearch.tasks.boxes import left_over, strongest
 from advsearch.tasks.detection import Place
+from advsearch.tasks.detector_answers import order_in
 
 CUP = (20.0, 40.0, 60.0, 90.0)
 PICTURE = torch.full((100, 100, 3), 0.25)
@@ -159,7 +160,11 @@ def more(columns: int, span: float = 0.9) -> Callable[[Tensor], Tensor]:
     ("form", "labels", "text"),
     [
         (more(1, span=3.0), NAMES, r"answer is \(8, 21\): it has an angle after the scores, as OBB heads have it"),
-        (lambda n: more(1)(n).abs(), NAMES, "may be those of an OBB head"),
+        (
+            lambda n: more(1)(n).abs(),
+            NAMES,
+            f"may be those of an OBB head .*; if it has objectness, say .*{V5[:-4]}first",
+        ),
         (more(6), NAMES, "as pose heads .with keypoints. have it, which are not read; or give the `labels`"),
         (lambda n: torch.cat([free_of_suppression(n), noisy(len(n), PLACES, 1)], dim=2), ["a"], "OBB heads"),
         (lambda n: first(torch.cat([n[..., :4], 9.0 * n[..., 4:] - 4.0], dim=2)), NAMES, "apply a sigmoid to them"),
@@ -211,6 +216,14 @@ def test_an_order_says_what_a_head_is(order: str) -> None:
     assert not task.remarks
     with pytest.raises(InputError, match="order: expected boxes, scores and labels in their order"):
         Detection(order="boxes objectness")
+
+
+def test_a_class_that_is_counted_from_one_is_no_probability() -> None:
+    """Of the only class, which nobody has named: its number is 1, and no score of 1."""
+    rows = [{"boxes": torch.tensor([[20.0, 40.0, 60.0, 90.0]] * 2), "either": torch.tensor([[0.8, 1.0], [0.6, 1.0]])}]
+    assert order_in(rows, 1) == "boxes scores labels"
+    rows[0]["either"] = torch.tensor([[0.8, 0.9], [0.6, 0.9]])
+    assert order_in(rows, 1) == V5 and order_in(rows, 2) == V8_LAST
 
 
 def test_boxes_of_a_head_in_another_form_are_noted() -> None:
