@@ -125,7 +125,7 @@ def _find(spec: object) -> Source | Model:
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
-        return source_of(spec, type(spec).__name__)
+        return transformers.of_network(spec) or timm.of_network(spec) or source_of(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
@@ -163,7 +163,7 @@ def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
     made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE)
     own = {"mean": found.mean, "std": found.std, **pre.parse_normalisation(given.get("mean"), given.get("std"))}
     made = dataclasses.replace(made, mean=own["mean"] or made.mean, std=own["std"] or made.std)
-    made = dataclasses.replace(made, layout=found.layout or made.layout)
+    made = dataclasses.replace(made, layout=found.layout or made.layout, channels=found.channels or made.channels)
     if "input_size" in given:
         made = dataclasses.replace(made, input_size=pre.parse_input_size(given["input_size"]))
     if "value_range" in given:

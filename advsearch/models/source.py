@@ -30,7 +30,7 @@ class Source:
     Args:
         module: the network, in evaluation mode, its parameters without gradients.
         name: what to call it.
-        input_size, mean, std, layout, labels: as in `load_model`; None where the source does not say.
+        input_size, mean, std, layout, channels, labels: as in `load_model`; None where the source does not say.
         batch_limits: (fewest, most) images at once.
         dtype: floating type of the input.
         device: where its weights are.
@@ -42,6 +42,7 @@ class Source:
     mean: Triple | None = None
     std: Triple | None = None
     layout: str | None = None
+    channels: str | None = None
     labels: tuple[str, ...] | None = None
     batch_limits: tuple[int, int] = (1, 64)
     dtype: torch.dtype = torch.float32
