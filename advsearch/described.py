@@ -10,3 +10,7 @@ class Value(TypedDict):
 
     value: float | str
     unit: str
+
+
+NOT_A_NUMBER = "not a number"
+"""What an answer of a model is called that has NaN or infinity in it: it has said nothing."""

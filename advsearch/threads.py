@@ -93,6 +93,24 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
 
 
 @contextmanager
+def given_back() -> Iterator[None]:
+    """Let torch and Dr.Jit have after the block the threads that they had before it, whatever is configured inside."""
+    global _chosen
+    chosen, torch, drjit = _chosen, sys.modules.get("torch"), sys.modules.get("drjit")
+    for_torch, for_drjit = torch and torch.get_num_threads(), drjit and drjit.thread_count()
+    try:
+        yield
+    finally:
+        _chosen = chosen
+        if "torch" in sys.modules:
+            sys.modules["torch"].set_num_threads(for_torch or _default())
+        if drjit is not None and drjit.thread_count() != for_drjit:
+            drjit.set_thread_count(for_drjit)
+        elif "drjit" in sys.modules and drjit is None:
+            apply_to_drjit()
+
+
+@contextmanager
 def all_for_torch() -> Iterator[None]:
     """Give torch every thread inside the `with`, in which nothing is rendered: a training takes half of the time."""
     configure(_chosen, rendering=False)

@@ -111,7 +111,7 @@ def attack_on(
 ) -> Attack:
     """An attack as a configuration describes it, on a problem of one's own."""
     recorder = Recorder(run, problem, memory)
-    return Attack(problem, budget_of(config), policy, recorder, memory, stages, preparation_of(config))
+    return Attack(problem, budget_of(config, problem), policy, recorder, memory, stages, preparation_of(config))
 
 
 def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:

@@ -427,7 +427,8 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     """Parse a command with the real parser, and read its settings."""
     args = _parse(words, words[0])
     if args.command in CONFIGS:
-        otherwise = {"object": "mug"} if "around" in args and args.command == "region" else {}
+        brought = args.command in ("region", "sweep") and ("around" in args or "answer_of" in args)
+        otherwise = {"object": "mug"} if brought else {}
         check_names(config_from(args, CONFIGS[args.command], **otherwise))
     if args.command in ("run", "resume"):
         run = Path(args.run).name if args.command == "resume" else ""

@@ -6,6 +6,7 @@ says.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -30,11 +31,14 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
     Raises:
         InputError: anything that whoever asked can put right; nothing is written then.
     """
+    from advsearch.runs.directory import begun
     from advsearch.runs.results.base import Result
 
-    module = import_module(f"advsearch.api.{config.command}")
-    answer = getattr(module, f"{config.command}_from_config")(
-        config, progress=progress, **({} if resumed is None else {"resumed": resumed})
-    )
+    keeps_run = resumed is None and getattr(config, "out", None) is None
+    with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
+        module = import_module(f"advsearch.api.{config.command}")
+        answer = getattr(module, f"{config.command}_from_config")(
+            config, progress=progress, **({} if folder is None else {"resumed": folder})
+        )
     result: Result = answer if isinstance(answer, Result) else answer.summary
     return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,17 +14,20 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Policy, make_policy
-from advsearch.attacks.objectives import check_objective
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
+from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig
+from advsearch.config.attack import OVER_NUMBERS, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.ahead import Ahead, seen_by
-from advsearch.engine.answers import Described, Looked, check_truth, facts_of
+from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
+from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import (
     Controls,
     PictureSettings,
@@ -33,10 +36,21 @@ from advsearch.engine.loading import (
     load_scene,
     make_renderer,
     named_camera,
+    only_here,
     settings_of,
 )
 from advsearch.engine.memory import Memory
-from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name, scene_settings, several
+from advsearch.engine.naming import (
+    OF_SCENE,
+    AnyModel,
+    check_not_of_scene,
+    check_not_spread,
+    exists_here,
+    load_models,
+    model_name,
+    scene_settings,
+    several,
+)
 from advsearch.engine.objective import Wanted, objective_for, task_for
 from advsearch.engine.outcome import AttackResult, Question, summarise
 from advsearch.engine.print_terms import print_terms
@@ -44,14 +58,15 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.stages import Attack
-from advsearch.engine.transport import CleanMatrix
+from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.ensemble import together
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.directory import RunDirectory, check_free, is_run, run_path
+from advsearch.report.wording import count
+from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.scene.description import SceneDescription
@@ -78,7 +93,7 @@ def attack(
     task: AnyTask = "classification",
     controls: Controls = ("texture",),
     objective: str | Callable[..., Tensor] | None = None,
-    policy: str | Policy[Any] = "auto",
+    policy: str | Mapping[str, object] | Policy[Any] = "auto",
     over: Controls = (),
     run: str | Path | None = None,
     resume: bool = False,
@@ -100,7 +115,7 @@ def attack(
             images (N, H, W, 3), truth, or the target where there is one) that returns (N,) values, which are maximised;
             in classification the output is logits (N, C) and the truth the indices of the right answers. None takes the
             task's own.
-        policy: a name, or an instance with options of its own.
+        policy: a name, a mapping with a `name` and options, or an instance.
         over: controls that vary by chance: the answer has to hold for all of their values.
         run: folder to keep the run in; None keeps it in memory only.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
@@ -111,8 +126,13 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
-    if callable(objective) or not all(isinstance(one, (str, Path)) for one in (scene, *several(model))):
+    loaded_already = not all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
+    if loaded_already or callable(objective) or only_here(controls) or only_here(over):
         check_not_spread(options)
+    if not isinstance(policy, (str, Mapping, Policy)):
+        raise InputError(
+            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {policy!r}"
+        )
     scene = _scene(scene, object, settings)
     described = {
         "object": scene.description.object_name,
@@ -123,24 +143,40 @@ def attack(
         "controls": settings_of(controls),
         "over": settings_of(over),
         "task": as_setting(task) if isinstance(task, Task) else task,
-        "objective": getattr(objective, "__name__", "custom") if callable(objective) else objective,
-        "policy": policy if isinstance(policy, str) else policy.name,
+        "objective": _own_name(objective) if callable(objective) else objective,
+        "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
         "set": _set_by(scene, settings.get("exposure")),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
+    parts = [f"the model {model_name(one)}" for one in several(model) if exists_here(one)]
+    parts += ["the scene"] if scene.only_here else []
+    parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
+    parts += [f"the objective {config.objective}"] if callable(objective) else []
+    parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, _policy_of) else []
+    parts += [f"the control {name}" for name in (*only_here(controls), *only_here(over))]
+    config = config.with_only_here(parts)
     if config.is_matrix and config.ensemble is None:
         raise InputError(
             "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
         )
+    if config.epsilons:
+        listed = ", ".join(f"{one:g}" for one in config.epsilons)
+        raise InputError(
+            f"epsilon: expected one, got {listed}; attack with each, or have `advsearch attack` draw the curve"
+        )
     if config.aov is not None and config.run is None:
         raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
     searched, drawn = _controls(config, controls, over)
-    asked, objective = _asked(config, task, objective)
-    loaded = _model(model, config, asked)
-    job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None)
-    if resume and run is not None and is_run(run_path(run)):
-        return _go_on(job, run, progress or NullProgress())
-    return _carry_out(job, progress or NullProgress())
+    policy = policy if isinstance(policy, Policy) else config.policy_name
+    named = config.objective if objective is None or isinstance(objective, str) else objective
+    asked, objective = _asked(config, task if isinstance(task, Task) else config.task, named)
+    stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
+    with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
+        loaded = _model(model, config, asked)
+        job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None)
+        if folder is None:
+            return _carry_out(job, progress or NullProgress())
+        return _go_on(job, folder, progress or NullProgress())
 
 
 def attack_from_config(
@@ -222,23 +258,48 @@ def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
     return _carry_out(_given(config, scene, model), NullProgress())
 
 
+def _own_name(objective: Callable[..., Tensor]) -> str:
+    """What an objective of the caller's is called; never as one of ours."""
+    name = str(getattr(objective, "__name__", None) or type(objective).__name__)
+    return f"own {name}" if name in OBJECTIVE_KINDS else name
+
+
+def _policy_of(setting: str | Mapping[str, Any]) -> Policy[Any]:
+    config = AttackConfig(object="mug", policy=setting)
+    return make_policy(config.policy_name, **config.policy_options)
+
+
+def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
+    """Whether a file can name a task or a policy, with all of its options."""
+    try:
+        return bool(make(as_setting(entry)) == entry)
+    except InputError:
+        return False
+
+
+def judged_alone(config: AttackConfig) -> AttackConfig:
+    """Return what an answer of a run is judged with: what counts as success needs neither an objective nor a policy
+    that only the session had which searched with them."""
+    change: dict[str, object] = {}
+    if config.objective is not None and config.objective not in OBJECTIVE_KINDS:
+        change["objective"] = None
+    if config.policy_name not in POLICIES:
+        change["policy"] = AttackConfig.model_fields["policy"].default
+    return config.model_copy(update=change)
+
+
 def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: AttackKeywords) -> Scene:
     """The scene as it was given, or the one that a name and the settings describe."""
     if isinstance(scene, Scene):
-        clash = [name for name in ("set", "environment", "up", "camera", "exposure") if settings.get(name) is not None]
-        clash += [] if object is None else ["object"]
-        if clash:
-            raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
+        check_not_of_scene({**settings, "object": object})
         return scene
-    given, lit_by = scene_settings(settings.get("set"), settings.get("exposure")), settings.get("environment")
-    if not (lit_by is None or isinstance(lit_by, (str, Path))):
-        raise one_only("environment", tuple(lit_by))
-    up, camera = settings.get("up"), settings.get("camera")
+    said = SceneConfig(**{"object": "mug", **{name: one for name, one in settings.items() if name in OF_SCENE}})
+    given = scene_settings(said.set_, said.exposure)
     if object is not None:
-        return load_scene(object, lit_by, scene=scene, up=up, settings=given, camera=camera)
+        return load_scene(object, said.environment, scene=scene, up=said.up, settings=given, camera=said.camera)
     if isinstance(scene, Mapping):
         raise InputError("object: which shape of the scene is it? Give its id")
-    return load_scene(scene, lit_by, up=up, settings=given, camera=camera)
+    return load_scene(scene, said.environment, up=said.up, settings=given, camera=said.camera)
 
 
 def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
@@ -325,20 +386,27 @@ def check_from_config(config: AttackConfig) -> None:
         InputError: as for `attack_from_config`.
     """
     job = _job(config)
-    _, _, pictures = _task(job)
+    _, _, pictures = _task(job, shows=False)
     _space(job, framed(job.scene.description, pictures.size(job.loaded[0])))
 
 
-def _task(job: _Job) -> tuple[Task, Callable[[Described, Looked], Facts], PictureSettings]:
-    """The task on the model, what gives it facts, and how pictures are made; refuses what cannot be judged."""
+def _task(job: _Job, *, shows: bool = True) -> tuple[Task, Callable[[Described, Looked], Facts], PictureSettings]:
+    """The task on the model, what gives it facts, and how pictures are made; refuses what cannot be judged.
+
+    With `shows`, the task is shown a clean picture where it asks for one.
+    """
     config, (model, _) = job.config, job.loaded
     asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
     task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
     facts = partial(facts_of, job.scene, config.object, config.label)
     pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
     alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
+    tasks = list[Task]()
     for one, network in alone:
         check_truth(one, network, job.scene, facts(dict), pictures)
+        tasks.append(shown(one, network, [job.scene], config.label, pictures) if shows else one)
+        job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
+    task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
     return task, facts, pictures
 
 
@@ -372,7 +440,7 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
     if config.printable:
         searched = make_space(job.controls, description)
         print_terms(searched, searched.start)  # refuses where nothing can be printed
-    return Problem(
+    problem = Problem(
         renderer,
         space,
         model,
@@ -382,16 +450,28 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
         next_count(config.pixel_sampler, config.search_spp),
         config.seed,
         searched=len(job.controls),
-        draws=config.draws if job.over else 1,
         printable=config.printable,
         aovs=aovs_of(config.aov),
     )
+    problem.draws = search_size(config, problem)[1]
+    return problem
 
 
-def budget_of(config: AttackConfig) -> RenderBudget:
+def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
+    """Return the steps of a search, and how many conditions each looks at: what was asked for, or what is right for
+    one picture, or for many conditions: predicted, rendered, or rendered where only a few numbers are searched."""
+    if problem.conditions is None:
+        return config.steps or STEPS, 1
+    predicted = reason_against(problem, config.steps or OVER_PREDICTED[0], config.specialise) is None
+    balls = any(block.norm != "box" for block in problem.domain.blocks)
+    steps, draws = OVER_PREDICTED if predicted else OVER_RENDERED if balls else OVER_NUMBERS
+    return config.steps or steps, config.draws or draws
+
+
+def budget_of(config: AttackConfig, problem: Problem) -> RenderBudget:
     """Return what an attack may spend."""
     return RenderBudget(
-        steps=config.steps,
+        steps=search_size(config, problem)[0],
         seconds=config.seconds,
         close_looks=config.close_looks,
         baseline=config.baseline,
@@ -423,15 +503,23 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     stages.begin("setup", PREPARING)
     problem = _problem(job)
     own = job.scene.description
-    warnings = [*own.notes, *job.loaded[1], *sentences(problem.space.moved)]
+    warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
     for text in warnings:
         progress.message(text)
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
+        if kept is not None:
+            check_made_of(kept, [job.loaded[0]], {"objective": job.objective if callable(job.objective) else None})
         memory = Memory(kept)
         with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
             recorder = Recorder(kept, problem, memory, Ahead(executor))
-            spent = (budget_of(job.config), policy, recorder, memory, stages, preparation_of(job.config))
+            budget = budget_of(job.config, problem)
+            if problem.conditions is not None and None in (job.config.steps, job.config.draws):
+                progress.message(
+                    f"One answer for many conditions: {count(budget.steps, 'step')}, each over "
+                    f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
+                )
+            spent = (budget, policy, recorder, memory, stages, preparation_of(job.config))
             findings = Attack(problem, *spent, clean=job.clean).carry_out()
         return summarise(_question(job), problem, findings, recorder, stages, warnings)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import advsearch
-from advsearch.api.attack import problem_from_config
+from advsearch.api.attack import judged_alone, problem_from_config
 from advsearch.api.replay import kept_answer
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
@@ -71,7 +71,7 @@ def answer_of(run: str | Path) -> AnsweredRun:
     summary = attack_of(folder)
     if summary.adversarial is None:
         raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to export")
-    problem, _ = problem_from_config(AttackConfig.from_yaml(folder / CONFIG))
+    problem, _ = problem_from_config(judged_alone(AttackConfig.from_yaml(folder / CONFIG)))
     return AnsweredRun(folder, problem, problem.whole(kept_answer(folder, problem)))
 
 

@@ -33,6 +33,7 @@ from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.config import HardenConfig
 from advsearch.config.hardening import PLAIN_SCENES, RENDERED_SCENES
+from advsearch.engine.going_on import check_made_of
 from advsearch.engine.hardening.lessons import Lesson
 from advsearch.engine.hardening.pictures import FOLDER
 from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, TrainingRounds
@@ -127,7 +128,8 @@ def _carry_out(
     order = seeds.stream(config.seed, "order")
     course = Course(student, loaded, config.rate, config.epochs, order, config.texture_looks, optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
-        _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None}, resumed)
+        _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None})
+        check_made_of(run, [loaded])
         work = Hardening(run, course, SceneWork(config, loaded, splits), progress)
         try:
             with interruptible(), executor_for(config, "advsearch.api.harden_scenes:scenes_of", progress) as executor:
@@ -143,16 +145,15 @@ def _carry_out(
         return result
 
 
-def _same_means(run: RunDirectory, given: dict[str, bool], resumed: Path | None) -> None:
+def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
     """Note what a training has from Python, or refuse to go on with other means than it began with.
 
     Raises:
         InputError: it had something else.
     """
-    if resumed is None:
-        run.store.set_note(MEANS, json.dumps(given))
-        return
     before = json.loads(run.store.note(MEANS) or "{}")
+    if not before:
+        run.store.set_note(MEANS, json.dumps(given))
     for name, was in before.items():
         if was != given[name]:
             raise InputError(

@@ -10,16 +10,18 @@ from __future__ import annotations
 import inspect
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar
 
-from advsearch.settings import Config, settings
+from advsearch.engine.loading import Controls, instances_in, lending, lent_controls, only_here, settings_of
+from advsearch.engine.naming import check_not_spread
+from advsearch.engine.turn import in_turn
+from advsearch.settings import Config, as_python, is_shallow, settings
 
 Names = str | Sequence[str]
 """Names in a list, or in a text with commas between them."""
-NamedControls = str | Sequence[str] | Mapping[str, Mapping[str, object] | Sequence[float] | float | None]
-"""Controls by name; a mapping gives each name its settings, and ``mitsuba:KEY`` a range."""
 Named = str | Mapping[str, object]
 """A name, or a mapping with a `name` and options."""
 
@@ -54,7 +56,7 @@ class NamedKeywords(RunKeywords, total=False):
     """What a question takes by name."""
 
     task: Named
-    controls: NamedControls
+    controls: Controls
 
 
 class DerivativeKeywords(PictureKeywords, total=False):
@@ -71,12 +73,12 @@ class SearchKeywords(DerivativeKeywords, total=False):
     """Of every search."""
 
     measure: Literal["no", "quick", "full"]
-    steps: int
+    steps: int | None
     seconds: float | None
     step_size: float | None
     target: int | Names | None
     minimise: bool
-    draws: int
+    draws: int | None
     average: int
     baseline: bool
     verify_spp: int | None
@@ -121,7 +123,7 @@ class GapKeywords(SearchKeywords, NamedKeywords, total=False):
     policy: Named
     workers: int | None
     cluster: str | None
-    over: NamedControls
+    over: Controls
 
 
 class HardenKeywords(RunKeywords, total=False):
@@ -138,7 +140,7 @@ class HardenKeywords(RunKeywords, total=False):
     seed: int
     threads: int | None
     deterministic: bool
-    controls: NamedControls
+    controls: Controls
     spp: int | Literal["auto"] | None
     epsilon: float | Mapping[str, float] | None
     norm: Literal["linf", "l2"] | None
@@ -195,6 +197,7 @@ class RecipeKeywords(RunKeywords, total=False):
     resolution: int | str | tuple[int, int] | None
     model: Path | Names | None
     labels: str | Path | None
+    task: Named | None
     label: str | Mapping[str, str]
     seed: int
     threads: int | None
@@ -289,7 +292,17 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                 signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
-            return function(*args, **given)
+            kept = ("scene", "model", "beside")
+            plain = {key: one if key in kept or not is_shallow(one) else as_python(one) for key, one in given.items()}
+            with ExitStack() as stack:
+                stack.enter_context(in_turn())
+                for key in {"controls", "over"} & plain.keys() - own.parameters.keys():
+                    if instances_in(plain[key]):
+                        if only_here(plain[key]):
+                            check_not_spread(plain)
+                        stack.enter_context(lending(plain[key]))
+                        plain[key] = settings_of(plain[key])
+                return function(*args, **plain)
 
         text = inspect.cleandoc(function.__doc__ or "")
         listed = textwrap.indent("\n".join(lines), "    ")
@@ -302,4 +315,5 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
 
 def configured(config: type[Made], **given: object) -> Made:
     """Return a configuration of settings as Python has them; None is one that was not given."""
-    return config(**{name: value for name, value in given.items() if value is not None})
+    made = config(**{name: value for name, value in given.items() if value is not None})
+    return made.with_only_here([f"the control {name}" for name in only_here(lent_controls())])

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import problem_from_config
+from advsearch.api.attack import judged_alone, problem_from_config
 from advsearch.api.replay import kept_answer
 from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
@@ -26,6 +26,7 @@ from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.rows import judged
 from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import check_all
+from advsearch.engine.turn import in_turn
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
@@ -46,6 +47,7 @@ _ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
 """The name of a file with a photograph that was aligned with a rendering."""
 
 
+@in_turn()
 def photo_agreement(run: str | Path) -> PhotoAgreement:
     """Return how the photographs that were taken for a run agree with its renderings (docs/viewer.md).
 
@@ -251,7 +253,7 @@ def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
 
 def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
     """Who judges by the configurations of an attack: the clean one, the answer, and those of its trials."""
-    problem, _ = problem_from_config(config)
+    problem, _ = problem_from_config(judged_alone(config))
     task = problem.task
     alone = (task.models, task.tasks) if isinstance(task, Together) else ((problem.model,), (task,))
 

@@ -18,6 +18,7 @@ from advsearch.api.photos import Photographs, photographs_in
 from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
 from advsearch.config import AttackConfig, RecipeConfig, SweepConfig
+from advsearch.config.named import name_in
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.sweeps.job import check_all
@@ -28,12 +29,15 @@ from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
 from advsearch.recipes.parts import Planned, listed, made_of, planned
 from advsearch.recipes.table import TRIAL, WORKERS, Answered, Table, photographs_of, rows_of
+from advsearch.report.phrases import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
 from advsearch.runs.results.base import INTERRUPTED, Result
 from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
 from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import attack_of, read_result
 from advsearch.threads import cores
@@ -44,6 +48,9 @@ if TYPE_CHECKING:
 
 TURN = 360.0
 """Degrees."""
+
+CUES = "cues"
+"""The figure of answers by shape and by texture."""
 
 NOTE = "recipe"
 """Under which a run's store keeps the recipe, so that it goes on as it began."""
@@ -81,7 +88,7 @@ def recipe_from_config(
     begun = time.perf_counter()
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
-    described = read_recipe(config.recipe) if resumed is None else None
+    described = None if resumed is not None and _noted(resumed) else read_recipe(config.recipe)
     if described is not None:
         _check(described, config)
         check_figures(described, _check_runs(planned(described, config)), config.recipe)
@@ -102,6 +109,14 @@ def recipe_from_config(
         return result
 
 
+def _noted(path: Path) -> bool:
+    """Whether a run has the recipe that it began with; one that was stopped at once has not."""
+    if not (path / STORE).is_file():
+        return False
+    with Store(path / STORE, read_only=True) as store:
+        return store.noted(NOTE) is not None
+
+
 def _seconds(path: Path) -> float:
     """What a run that is gone on with took so far; a run that was killed has not noted it."""
     before = read_result(path) if (path / SUMMARY).is_file() else None
@@ -114,6 +129,11 @@ def _check(described: Recipe, config: RecipeConfig) -> None:
         raise InputError(f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does")
     for one in described.figures:
         read_options(one, config.recipe)
+        if one.get("figure") == CUES and config.task is not None and name_in(config.task) == DETECTION:
+            raise InputError(
+                f"task: {config.recipe} asks whether answers are classes of the texture or of the shape, and detection "
+                "answers whether the object is found; give it a classifier"
+            )
 
 
 def _check_runs(runs: Sequence[Planned]) -> dict[str, set[str]]:

@@ -154,7 +154,7 @@ def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Te
     def same(values: Tensor, number: int) -> bool:
         trial = verifier.trial("region", number, at(values))
         stages.progress.advance(1)
-        return trial.success == verdict
+        return trial.success == verdict and not trial.not_a_number
 
     seed = seeds.stream(config.seed, "region")
     grown = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_check=on_check)
@@ -215,13 +215,19 @@ def _verdict(verifier: Verifier, centre: Tensor) -> bool:
     """Whether the model is wrong at the centre.
 
     Raises:
-        InputError: that depends on the noise.
+        InputError: that depends on the noise, or the model's answer is not a number.
     """
     verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
-    wrong = 0
+    wrong = nothing = 0
     for number in range(AT_CENTRE):
-        wrong += verifier.trial("centre", number, centre).success
+        trial = verifier.trial("centre", number, centre)
+        wrong, nothing = wrong + trial.success, nothing + trial.not_a_number
         verifier.stages.progress.advance(1)
+    if nothing:
+        raise InputError(
+            f"the model's answer is not a number in {nothing} of {AT_CENTRE} trials at the centre, so there is no "
+            "verdict; choose another centre, or mend the model"
+        )
     verdict = verifier.problem.rule.decided(wrong, AT_CENTRE)
     if verdict is None:
         raise InputError(

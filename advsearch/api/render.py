@@ -5,17 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from advsearch.config import RenderConfig
+from advsearch.engine import rendering
 from advsearch.engine.loading import load_scene
 from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.rendering import Rendering as Rendering
-from advsearch.engine.rendering import render as render
 from advsearch.engine.rendering import writable
 from advsearch.engine.run_settings import RunSettings
+from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.results.render import RenderResult
 from advsearch.scene.surfaces import aovs_of
 from advsearch.tasks import make_task
+
+render = in_turn()(rendering.render)
 
 
 def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:

@@ -12,21 +12,20 @@ from typing import TYPE_CHECKING
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.attack import LOADING, judged_alone, problem_from_config
 from advsearch.api.keywords import ReplayKeywords, asks, configured
-from advsearch.attacks import count_right
 from advsearch.config import AttackConfig, ReplayConfig
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.replaying import OWN_LIGHT, Way, ways_of
 from advsearch.engine.retrial import RetrialCondition, Retrials
-from advsearch.engine.rows import verified_rate
+from advsearch.engine.rows import control_group, verified_rate
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.answer import read_answer
-from advsearch.runs.directory import CONFIG, RunDirectory, find_run
-from advsearch.runs.results.attack import AttackSummary, ControlGroup
+from advsearch.runs.directory import CONFIG, RunDirectory, find_run, only_here
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.replay import NOT_DONE, ReplayResult, ReplayRow
 from advsearch.runs.summary import attack_of
@@ -66,11 +65,15 @@ def replay_from_config(
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage(LOADING)
     folder = find_run(config.answer)
-    summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
+    summary, theirs = attack_of(folder), judged_alone(AttackConfig.from_yaml(folder / CONFIG))
     if config.threads is not None:
         theirs = theirs.model_copy(update={"threads": config.threads})
     if summary.adversarial is None:
         raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to render again")
+    if needed := [one for one in only_here(folder) if not one.startswith(("the objective", "the policy"))]:
+        raise InputError(
+            f"{folder}: {', '.join(needed)}: only the Python session that asked has what judges its answer"
+        )
     different((OWN_MODEL, *config.models), "model")
     problem, warnings = problem_from_config(theirs)
     u = kept_answer(folder, problem)
@@ -228,13 +231,10 @@ def _not_done(way: Way, reason: str) -> ReplayRow:
 
 def _row(way: Way, condition: RetrialCondition, retrials: Retrials, u: torch.Tensor) -> ReplayRow:
     checked = retrials.answer("answer", u, condition)
-    counted = count_right(retrials.clean(condition), condition.spp)
     return ReplayRow(
         way=way.name,
         condition=way.text,
         ending=checked.ending.value,
-        clean=ControlGroup(
-            correct=counted.successes, trials=counted.trials, rate=counted.rate, interval=counted.interval
-        ),
+        clean=control_group(retrials.clean(condition), condition.spp),
         verified=verified_rate(checked.adversarial, checked.adversarial_trials),
     )

@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.api.attack import LOADING
+import torch
+
+from advsearch.api.attack import LOADING, is_named
 from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
-from advsearch.config import SweepConfig
-from advsearch.engine.answers import one_label_for_several
+from advsearch.config import AttackConfig, SweepConfig
+from advsearch.controls import Control
+from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.budget import verification_ladder
-from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, settings_of
+from advsearch.engine.going_on import check_made_of
+from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, only_here, settings_of
 from advsearch.engine.naming import (
     AnyModel,
+    check_not_of_scene,
     check_not_spread,
     different,
+    exists_here,
     load_models,
     model_name,
     scene_settings,
     several,
 )
+from advsearch.engine.outcome import AttackResult
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.answer import SweepResult
-from advsearch.engine.sweeps.axes import read_axes
+from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
 from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
@@ -35,8 +43,11 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.directory import CONFIG, RunDirectory, check_free, is_run, run_path
+from advsearch.runs.answer import read_answer
+from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
+from advsearch.runs.summary import attack_of
+from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES, split_names
@@ -44,6 +55,12 @@ from advsearch.tasks import AnyTask, Task, make_task
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
+"""Settings that a scene of the caller's own has."""
+
+CLEAN = "clean"
+"""What the scene without the answer of a run is called beside that with it."""
 
 SAMPLES = 100
 """Draws where there is no grid and nothing is said."""
@@ -53,13 +70,14 @@ AnyScene = Scene | str | Path
 
 @asks(SweepConfig, SweepKeywords)
 def sweep(
-    scene: AnyScene | Sequence[AnyScene],
-    model: AnyModel | Sequence[AnyModel] = "reference",
+    scene: AnyScene | Sequence[AnyScene] | None = None,
+    model: AnyModel | Sequence[AnyModel] | None = None,
     grid: Mapping[str, object] | None = None,
     *,
     task: AnyTask = "classification",
     samples: int | None = None,
     controls: Controls = (),
+    answer_of: str | Path | AttackResult | None = None,
     run: str | Path | None = None,
     progress: Progress | None = None,
     **settings: Unpack[SweepKeywords],
@@ -70,12 +88,16 @@ def sweep(
     arguments are the settings of `advsearch sweep`.
 
     Args:
-        scene: from `load_scene`, or what that takes; or several.
-        model: from `load_model`, or what that takes; or several, which are shown the same pictures.
+        scene: from `load_scene`, or what that takes; or several. None takes that of `answer_of`.
+        model: from `load_model`, or what that takes; or several, which are shown the same pictures. None takes that of
+            `answer_of`, and the reference model without.
         task: what judges the models' outputs: a name, a mapping with a `name` and options, or an instance.
         grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
         samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
         controls: what is drawn by chance, as for `attack`.
+        answer_of: an attack that was kept, or its folder, whose answer is swept beside the clean scene, under the same
+            draws; `summary.beside` compares the two. Where neither `grid` nor `controls` is given, what the attack was
+            over varies.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
         progress: told how far it is.
 
@@ -83,8 +105,15 @@ def sweep(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
-    scenes = _several(scene)
-    networks = _several(model)
+    brought = _brought(answer_of, varies=bool(grid) or bool(controls))
+    if scene is None and not brought:
+        raise InputError("scene: expected what load_scene returns or takes, got nothing; name one")
+    if scene is not None:
+        brought = {name: value for name, value in brought.items() if name not in OF_A_SCENE}
+    scenes = _several(brought["object"] if scene is None else scene)
+    networks = _several(brought.get("model", "reference") if model is None else model)
+    controls = controls or brought.get("controls", ())
+    task = brought.get("task", task) if task == "classification" else task
     names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
     if names and len(names) < len(scenes):
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
@@ -94,13 +123,19 @@ def sweep(
         "controls": settings_of(controls),
         "grid": dict(grid or {}),
         "samples": samples,
+        "answer_of": _folder(answer_of),
     }
     loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
     if loaded:
+        check_not_of_scene(options)
         described |= _described(loaded)
     else:
         described["object"] = ",".join(name for some in names for name in some)
-    config = SweepConfig(**{**described, **options, "run": None if run is None else str(run)})
+    config = SweepConfig(**{**brought, **described, **options, "run": None if run is None else str(run)})
+    parts = [f"the model {model_name(one)}" for one in networks if exists_here(one)]
+    parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
+    parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
+    config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
     if config.keep_pictures != "none" and config.run is None:
         raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
     if config.aov is not None and config.run is None:
@@ -108,16 +143,18 @@ def sweep(
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
     progress = progress or NullProgress()
-    if loaded or not all(isinstance(one, (str, Path)) for one in networks):
+    if loaded or only_here(controls) or not all(isinstance(one, (str, Path)) for one in networks):
         check_not_spread(options)
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    job = _job(config, loaded or _places(config), several(networks), task, controls)
-    if config.run is not None:
-        return _kept(config, job, progress, resumed)
-    with _executor(config, progress) as executor:
-        return carry_out(job, None, progress, executor)
+    asked = task if isinstance(task, Task) else config.task
+    with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as folder:
+        job = _job(config, loaded or _places(config), several(networks), asked, controls)
+        if config.run is not None:
+            return _kept(config, job, progress, folder)
+        with _executor(config, progress) as executor:
+            return carry_out(job, None, progress, executor)
 
 
 def sweep_from_config(
@@ -141,6 +178,52 @@ def sweep_from_config(
 
 
 # ---- from names to things -------------------------------------------------------------------------------------------
+
+
+def _folder(answer: str | Path | AttackResult | None) -> str | None:
+    """The run of an answer.
+
+    Raises:
+        InputError: the attack was not kept.
+    """
+    if isinstance(answer, AttackResult) and answer.run is None:
+        raise InputError("answer_of: expected an attack that was kept, got one that was not; give it a `run`")
+    kept = answer.run if isinstance(answer, AttackResult) else answer
+    return None if kept is None else str(kept)
+
+
+def _brought(answer: str | Path | AttackResult | None, *, varies: bool) -> dict[str, Any]:
+    """The settings that an answer brings with it; none without one."""
+    folder = _folder(answer)
+    if folder is None:
+        return {}
+    return SweepConfig.of_answer(AttackConfig.from_yaml(find_run(folder) / CONFIG), varies=varies)
+
+
+def _beside_answer(
+    config: SweepConfig, places: Sequence[NamedScene], drawn: Sequence[Control], axes: Sequence[Axis]
+) -> tuple[NamedScene, ...]:
+    """The places as they are, and then with the answer of the run that the configuration names.
+
+    Raises:
+        InputError: the run has no answer, or the sweep varies what that sets.
+        FileFormatError: it did not end, or is of another command.
+    """
+    if config.answer_of is None:
+        return tuple(places)
+    folder = find_run(config.answer_of)
+    summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
+    if summary.adversarial is None:
+        raise InputError(f"answer_of: {folder} ended with {summary.ending!r}, so that there is no answer to sweep")
+    held = RunSettings(theirs.epsilon, theirs.norm, theirs.texture_resolution).given_to(theirs.controls)
+    varied = {control.name for control in drawn} | {axis.instance for axis in axes}
+    if twice := sorted(varied & {control.name for control in held}):
+        raise InputError(
+            f"answer_of: the answer of {folder} says what {twice[0]} is already; leave it out of `grid` and `controls`"
+        )
+    u, name = torch.from_numpy(read_answer(folder)), folder.resolve().name
+    clean = [replace(place, held=held, answer=CLEAN) for place in places]
+    return (*clean, *(replace(place, u=u, answer=f"{name}'s" if name == CLEAN else name) for place in clean))
 
 
 def _several(given: Any) -> list[Any]:
@@ -190,21 +273,28 @@ def _job(
             "grid: expected something that varies, got nothing; add an axis such as `grid` pose.yaw=0:360:24, or "
             "`controls=pose` `samples=100`"
         )
+    places = _beside_answer(config, places, drawn, axes)
     samples = config.samples or (SAMPLES if drawn and not axes else 1)
     check_scenes(places, drawn, axes)
     made = make_task(task)
     networks, warnings = _models(models, config, made)
-    tasks = tuple(made.on(network) for network in networks)
+    pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
+    scenes = [place.scene for place in places]
+    tasks = tuple(shown(made.on(network), network, scenes, config.label, pictures) for network in networks)
+    warnings += [remark for task in tasks for remark in task.remarks]
     own = {place.object: place.scene.description.object.label for place in places}
     warnings += one_label_for_several(networks, config.label, own)
     for place in places:
-        warnings += place.scene.description.notes
+        described = place.scene.description
+        for control in on_grid(drawn, axes, described):
+            described = control.prepare(described) if control.kind == ENVIRONMENT else described
+        warnings += described.notes
     return Job(
         object=config.object,
         environment=config.lit_by,
         task=config.task_name,
         label=config.label,
-        pictures=PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed),
+        pictures=pictures,
         spp=next_count(config.pixel_sampler, config.search_spp),
         places=tuple(places),
         models=networks,
@@ -259,13 +349,14 @@ def _stopped(config: SweepConfig) -> Path | None:
         return None
     path = run_path(config.run)
     recipe = path / CONFIG
-    same = recipe.is_file() and recipe.read_text(encoding="utf-8") == config.to_repeat().to_yaml()
+    same = recipe.is_file() and SweepConfig.from_yaml(recipe).plain() == config.to_repeat().plain()
     return path if same and not finished(path) else None
 
 
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
     with RunDirectory.of(config, resumed) as run, _executor(config, progress) as executor:
+        check_made_of(run, job.models)
         return carry_out(job, run, progress, executor)
 
 

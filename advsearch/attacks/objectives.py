@@ -33,6 +33,7 @@ from advsearch.attacks.logit_objectives import (
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
 from advsearch.tasks import Classification, Segmentation, Task
+from advsearch.tasks.classes import ClassTask
 from advsearch.tasks.detection import GOALS, Detection
 
 __all__ = [
@@ -229,6 +230,8 @@ def get_objective(
         found = feature_distance(features, clean)
     else:
         found = kind.form(targeted=targeted)
+        if isinstance(task, ClassTask) and task.nothing:
+            found = _of_answers(found, task)
     found = _aimed(found, task.target) if targeted else found
     return negated(found) if task.minimise else found
 
@@ -291,6 +294,15 @@ def _aimed(objective: Objective, target: Any) -> Objective:
         return objective(output, images, target)
 
     return aimed
+
+
+def _of_answers(objective: Objective, task: Task) -> Objective:
+    """Wrap an objective of logits so that it sees only what is an answer."""
+
+    def of_answers(output: Any, images: Tensor, truth: Any) -> Tensor:
+        return objective(task.answerable(output, truth), images, truth)
+
+    return of_answers
 
 
 def negated(objective: Objective) -> Objective:

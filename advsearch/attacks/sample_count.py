@@ -66,8 +66,8 @@ class SampleCount:
 
     Attributes:
         spp: samples per pixel to verify with.
-        converged: whether the margins had settled there; False means that the ladder ended first.
-        table: one row per configuration and rung, in the order of measurement.
+        converged: whether all margins are shown to have settled there; if not, it is the last rung of the ladder.
+        table: one row per configuration and rung that was measured, in this order.
         renders: renders spent.
     """
 
@@ -85,7 +85,8 @@ def choose_spp(
     seeds: int = SEEDS,
     drift: float = DRIFT,
 ) -> SampleCount:
-    """Climb a ladder of sample counts until no configuration's margin drifts, and return the rung reached.
+    """Climb a ladder of sample counts with each configuration until its margin no longer drifts; return the highest
+    rung that one of them needed.
 
     A configuration has settled at a rung with mean margin m when, against the rung below,
 
@@ -93,14 +94,20 @@ def choose_spp(
 
     So the change must be *shown* to be small (that it is smaller than its own uncertainty would pass any measurement
     that is noisy enough), and small against the distance to the decision at margin zero. The error still left at the
-    upper rung is smaller than the change that led there, since it falls with the sample count. A margin near zero
-    never settles: its verdict does depend on the noise, and `converged` says so.
+    upper rung is smaller than the change that led there, since it falls with the sample count: what has settled is not
+    rendered at higher rungs. A margin near zero never settles: its verdict does depend on the noise, and `converged`
+    says so.
 
     The rungs are looked at after half of the renders, and once more after all of them if that does not settle it. Each
     look has intervals of 97.5 %, so that both together are wrong in 5 % of all cases at most (Bonferroni).
 
+    Three quarters of the samples of a whole ladder are those of its last rung. So a look that cannot settle anything,
+    as far as the noise so far tells (`_may_settle`), is left out; where none is left that could, or one configuration
+    has not settled, the last rung is taken as it is. That may take `converged` away, but never gives it.
+
     Args:
-        margins: the configurations, e.g. {"clean": ..., "adversarial": ...}; each renders once per call.
+        margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each renders once per call. The first
+            should be the one that is least likely to settle.
         seed: root seed; every render gets another seed of the stream "sample count".
         ladder: sample counts, rising, at least one. A single one is returned as it is, unmeasured and not converged.
         seeds: renders per configuration and rung at most, at least 4.
@@ -115,23 +122,54 @@ def choose_spp(
         raise InputError(f"seeds and drift: expected at least 4 and a number in (0, 1), got {seeds} and {drift}")
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
-    values: dict[tuple[str, int], list[float]] = {(name, level): [] for name in margins for level in range(len(ladder))}
+    table, renders, reached = list[Rung](), 0, 1
+    for name, margin in margins.items():
+        values = _climbed(margin, seed, ladder, seeds, drift)
+        below = None
+        for spp, found in zip(ladder, values, strict=False):
+            below = _rung(name, spp, found, below, drift)
+            table.append(below)
+        renders, reached = renders + sum(map(len, values)), max(reached, len(values) - 1)
+        if not table[-1].settled:
+            return SampleCount(ladder[-1], False, tuple(table), renders)
+    return SampleCount(ladder[reached], True, tuple(table), renders)
 
-    def rung(name: str, level: int, count: int) -> Rung:
-        """The summary of at least so many renders."""
-        found = values[name, level]
-        for number in range(len(found), count):
-            found.append(margins[name](ladder[level], stream(seed, "sample count", level * seeds + number)))
-        below = _rung(name, ladder[level - 1], values[name, level - 1], None, drift) if level else None
-        return _rung(name, ladder[level], found, below, drift)
 
-    for level, count in product(range(1, len(ladder)), (seeds // LOOKS, seeds)):
-        two = [[rung(name, one, count) for name in margins] for one in (level - 1, level)]
-        settled = all(one.settled for one in two[1])
-        if settled:
+def _climbed(margin: MarginOf, seed: int, ladder: Sequence[int], seeds: int, drift: float) -> list[list[float]]:
+    """Return the margins of one configuration at each rung, up to that at which it settles or beyond which none can
+    settle it."""
+    values: list[list[float]] = [[] for _ in ladder]
+    looks = list(product(range(1, len(ladder)), (seeds // LOOKS, seeds)))
+    for number, (level, count) in enumerate(looks):
+        if not any(_may_settle(values, ladder, *later, drift) for later in looks[number:]):
             break
-    reached = [rung(name, one, 0) for one in range(level + 1) for name in margins]
-    return SampleCount(ladder[level], settled, tuple(reached), sum(map(len, values.values())))
+        if not _may_settle(values, ladder, level, count, drift):
+            continue
+        for one in (level - 1, level):
+            for index in range(len(values[one]), count):
+                values[one].append(margin(ladder[one], stream(seed, "sample count", one * seeds + index)))
+        if _rung("", 0, values[level], _rung("", 0, values[level - 1], None, drift), drift).settled:
+            break
+    return [found for found in values if found]
+
+
+def _may_settle(values: Sequence[list[float]], ladder: Sequence[int], level: int, count: int, drift: float) -> bool:
+    """Whether so many renders at a rung may show that the margin has settled there, by what has been rendered.
+
+    The mean may be off by its standard error, and may move on by as much as it has moved before. Deviations stay; at
+    rungs that were not rendered they fall with the root of the samples.
+    """
+    known = [one for one in range(level + 1) if values[one]]
+    if not known:
+        return True
+    best, mean = values[known[-1]], {one: math.fsum(values[one]) / len(values[one]) for one in known}
+    moved = abs(mean[known[-1]] - mean[known[-2]])
+    largest = abs(mean[known[-1]]) + moved + _deviation(best) / math.sqrt(len(best))
+    deviations = [
+        _deviation(values[one]) if values[one] else _deviation(best) * math.sqrt(ladder[known[-1]] / ladder[one])
+        for one in (level - 1, level)
+    ]
+    return math.hypot(*deviations) * _quantile(count) / math.sqrt(count) <= drift * largest
 
 
 def most_samples(configurations: int, ladder: Sequence[int] = LADDER, seeds: int = SEEDS) -> int:
@@ -143,11 +181,20 @@ def _rung(name: str, spp: int, values: list[float], below: Rung | None, drift: f
     """Summarise the margins of one rung and compare them with the rung below."""
     count = len(values)
     mean = math.fsum(values) / count
-    deviation = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (count - 1))
-    tail = (1.0 - CONFIDENCE) / LOOKS / 2.0
-    half_width = float(stdtrit(count - 1, 1.0 - tail)) * deviation / math.sqrt(count)
+    half_width = _quantile(count) * _deviation(values) / math.sqrt(count)
     if below is None:
         return Rung(name, spp, mean, half_width, math.nan, False)
     change = mean - below.mean
     settled = abs(change) + math.hypot(half_width, below.half_width) <= drift * abs(mean)
     return Rung(name, spp, mean, half_width, change, settled)
+
+
+def _deviation(values: Sequence[float]) -> float:
+    """The standard deviation of what these were drawn from."""
+    mean = math.fsum(values) / len(values)
+    return math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
+
+
+def _quantile(count: int) -> float:
+    """Of Student's t, for the interval of a mean of so many values at one of the looks."""
+    return float(stdtrit(count - 1, 1.0 - (1.0 - CONFIDENCE) / LOOKS / 2.0))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from scipy.special import betaincinv
+from scipy.special import betaincinv, ndtri
 
 from advsearch.errors import InputError
 
@@ -16,10 +17,8 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
     """Return the exact two-sided binomial interval of a success rate.
 
     low solves P(X >= successes | low) = a/2 and high solves P(X <= successes | high) = a/2, with a = 1 - confidence.
-    These
-    are quantiles of beta distributions: low = B(a/2; k, n - k + 1), high = B(1 - a/2; k + 1, n - k). The interval
-        covers
-    the true rate at least as often as it says, at every n (Clopper and Pearson 1934).
+    These are quantiles of beta distributions: low = B(a/2; k, n - k + 1), high = B(1 - a/2; k + 1, n - k). The interval
+    covers the true rate at least as often as it says, at every n (Clopper and Pearson 1934).
 
     Args:
         successes: k, from 0 to n.
@@ -42,6 +41,45 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
     low = 0.0 if successes == 0 else float(betaincinv(successes, trials - successes + 1, tail))
     high = 1.0 if successes == trials else float(betaincinv(successes + 1, trials - successes, 1.0 - tail))
     return low, high
+
+
+def paired_difference(both: int, first: int, second: int, neither: int) -> tuple[float, tuple[float, float]]:
+    """Return how much more often the second of two paired outcomes happens than the first, and its 95 % interval.
+
+    The interval of the difference of two shares that were counted in the same n pairs, from the Wilson intervals of
+    both and their correlation (Newcombe 1998, "Improved confidence intervals for the difference between binomial
+    proportions based on paired data", method 10).
+
+    Args:
+        both: pairs in which both happen.
+        first: in which the first alone happens.
+        second: likewise.
+        neither: in which none happens.
+
+    Raises:
+        InputError: there is no pair, or less than none.
+    """
+    n = both + first + second + neither
+    if n < 1 or min(both, first, second, neither) < 0:
+        raise InputError(f"pairs: expected at least one, got {both}, {first}, {second} and {neither}")
+    shares = (both + second) / n, (both + first) / n
+    (low, high), (other_low, other_high) = (_wilson(share, n) for share in shares)
+    spread = (both + first) * (second + neither) * (both + second) * (first + neither)
+    covariance = float(both * neither - first * second)
+    if covariance > 0.0:
+        covariance = max(covariance - n / 2.0, 0.0)
+    phi = covariance / math.sqrt(spread) if spread else 0.0
+    (p, q), down = shares, (shares[0] - low, other_high - shares[1])
+    up = high - shares[0], shares[1] - other_low
+    below, above = (math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b)) for a, b in (down, up))
+    return p - q, (max(-1.0, p - q - below), min(1.0, p - q + above))
+
+
+def _wilson(share: float, n: int) -> tuple[float, float]:
+    """Wilson's score interval of a share of n, 95 %."""
+    z = float(ndtri(0.5 + CONFIDENCE / 2.0))
+    middle, half = share + z * z / (2 * n), z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,11 @@ def answer(summary: AttackSummary | CurveResult | MatrixResult) -> str:
 
 def _rates(summary: AttackSummary) -> list[list[str]]:
     clean, control, success = summary.clean, summary.clean.control, wording.success(summary)
-    rated = _rate("right", control.correct, control.trials, control.interval) if control else ["not verified"]
+    rated = (
+        _rate("right", control.correct, control.trials, control.interval, control.not_a_number)
+        if control
+        else ["not verified"]
+    )
     rows = [["clean", *cells(summary.task, clean), *rated]]
     if summary.adversarial:
         rows.append(["adversarial", *cells(summary.task, summary.adversarial), *_verified(success, summary.verified)])
@@ -62,17 +66,20 @@ def _rates(summary: AttackSummary) -> list[list[str]]:
 
 
 def _verified(what: str, rated: VerifiedRate | None) -> list[str]:
-    return _rate(what, rated.successes, rated.trials, rated.interval) if rated else ["not verified"]
+    if rated is None:
+        return ["not verified"]
+    return _rate(what, rated.successes, rated.trials, rated.interval, rated.not_a_number)
 
 
-def _rate(what: str, number: int, trials: int, interval: Interval) -> list[str]:
-    return [f"{what} in {number} of {trials}", wording.interval_text(interval)]
+def _rate(what: str, number: int, trials: int, interval: Interval, not_a_number: int = 0) -> list[str]:
+    return [wording.tally(what, number, trials, not_a_number), wording.interval_text(interval)]
 
 
 def _facts(summary: AttackSummary) -> dict[str, str]:
     return {
         "wanted": wording.goal_text(summary),
         "changed": wording.changed_text(summary),
+        "objective": wording.objective_text(summary),
         "printable": wording.print_cost_text(summary),
         "over": wording.over_text(summary),
         "smallest": wording.smallest_text(summary),

@@ -51,6 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--size", metavar="MM", type=float,
         help=f"print: the real object's longest side in millimetres (default: {USUAL_SIZE:g})",
     )  # fmt: skip
+    parser.add_argument(
+        "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"
+    )
     parser.add_argument("--paper", help="print: a4, a3 or letter (default: a4)")
     parser.add_argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)")
 
@@ -60,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     format = args.format or SUFFIXES.get(by_name, by_name)
-    for name in ("size", "paper", "icc"):
+    for name in ("size", "sheets", "paper", "icc"):
         if format != "print" and getattr(args, name) is not None:
             raise InputError(f"--{name}: belongs to --format print; leave it out")
     if format not in WRITERS:
@@ -139,14 +142,15 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
     longest = USUAL_SIZE if args.size is None else args.size
     with at_work(as_json=True, quiet=False):
         from advsearch.engine.printing import printable
-        from advsearch.report.sheets import write_sheets
+        from advsearch.report.sheets import MOST_SHEETS, write_sheets
         from advsearch.runs.files import placed_by, replacing
 
         pieces = printable(args.run, longest)
         profile = None if args.icc is None else Path(args.icc)
         title = f"{Path(args.run).name}, object of {longest:g} mm"
         with placed_by("out"), replacing(out) as part:
-            pages = write_sheets(part, pieces, title, paper=(args.paper or "a4").lower(), profile=profile)
+            paper, most = (args.paper or "a4").lower(), MOST_SHEETS if args.sheets is None else args.sheets
+            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most)
     sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
     text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
     if args.size is None:

@@ -1,4 +1,4 @@
-"""Flags made from the settings of `AttackConfig`, and a configuration made from flags.
+"""Flags made from the settings of a command, and a configuration made from flags.
 
 Values stay text until the configuration reads them, so that a wrong one is reported in one way wherever it came from.
 """
@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.errors import InputError
-from advsearch.settings import Config, Setting, check_once, parse_assignment, settings, split_names
+from advsearch.settings import Config, Setting, check_once, parse_assignment, settings, shown, split_names
 
-_NO_SETTINGS = {"code": "--code"}
+_NO_SETTINGS = {"code": "--code", "sheets": "--sheets", "paper": "--paper", "size": "--size"}
 """Flags which messages name too and which are no setting of a configuration."""
 
 SCENE = (
@@ -150,16 +150,39 @@ def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
 
 
 def _controls(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose,texture={...}``."""
+    """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose={...},texture={...}``.
+
+    Raises:
+        InputError: a control is given twice, or settings in braces cannot be read.
+    """
     controls: list[tuple[str, Any]] = []
-    for text in given:
-        names, equals, settings_text = text.partition("=")
-        plain = [name.strip() for name in names.split(",") if name.strip()]
-        last = [plain.pop() if plain else ""] if equals else []
-        controls += [(name, {}) for name in plain]
-        controls += [parse_assignment(f"{name}={settings_text}", flag) for name in last]
+    for part in (part for text in given for part in _parts(text) if part.strip()):
+        name, settings = parse_assignment(part, flag) if "=" in part else (part.strip(), {})
+        if isinstance(settings, str) and settings.startswith("{"):
+            raise InputError(
+                f"{flag} {name}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}}, got {shown(settings)}; write a "
+                "colon and a space behind each parameter, close every bracket, and put a comma before the next control"
+            )
+        controls.append((name, settings))
     check_once((name for name, _ in controls), flag)
     return dict(controls)
+
+
+def _parts(text: str) -> list[str]:
+    """Return what stands between the commas of a text that are in no brackets."""
+    parts, depth, quote = [""], 0, ""
+    for sign in text:
+        if quote:
+            quote = "" if sign == quote else quote
+        elif depth and sign in "\"'":
+            quote = sign
+        else:
+            depth += (sign in "{[") - (sign in "}]")
+        if sign == "," and depth <= 0:
+            parts.append("")
+        else:
+            parts[-1] += sign
+    return parts
 
 
 READERS = {"assignments": _assignments, "choices": _choices, "axes": _axes, "controls": _controls}

@@ -13,6 +13,7 @@ from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 
 if TYPE_CHECKING:
+    from advsearch.scene.assets import ObjectAsset
     from advsearch.scene.importing.scenes import Contents
 
 HELP = "say, and picture, what is understood of a mesh or scene file"
@@ -63,6 +64,8 @@ def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
         "texture": list(whole.base_color.shape[1::-1]),
         "up": None if whole.up is None else whole.up.axis,
     }
+    materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
+    slow = _slow(whole)
     nodes = [
         {"name": one.name, "mesh": one.mesh, "triangles": one.triangles, "size": list(one.size)} for one in found.nodes
     ]
@@ -70,11 +73,13 @@ def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
         told = {
             "file": args.file,
             **facts,
+            "materials": [{"name": name, "triangles": count} for name, count in materials.items()],
             "nodes": nodes,
             "lights": list(found.lights),
             "cameras": list(found.cameras),
         }
-        output.print_json({"schema": 1, "command": "import", **told, "warnings": list(whole.warnings), "out": args.out})
+        said = {"slow": slow, "warnings": list(whole.warnings), "out": args.out}
+        output.print_json({"schema": 1, "command": "import", **told, **said})
         return 0
     width, height = whole.base_color.shape[1], whole.base_color.shape[0]
     print(f"{args.file}: {facts['triangles']:,} triangles, a texture of {width} x {height}, {facts['up']} up")
@@ -87,12 +92,32 @@ def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
         print(f"One of them as the object, the rest around it: --object '{args.file}#{found.nodes[-1].name}'")
         if len(found.nodes) > 1:
             print(f"Another one moves with it: --control pose,pose:{found.nodes[0].mesh}")
-    for what, names in (("lights", found.lights), ("cameras (--camera NAME)", found.cameras)):
+    paint = "materials (--control 'texture={materials: [NAME]}')"
+    for what, names in (
+        (paint, materials),
+        ("lights", found.lights),
+        ("cameras (--camera NAME)", found.cameras),
+    ):
         if names:
             print(f"{what}: {', '.join(names)}")
-    for warning in whole.warnings:
-        print(f"Note: {warning}")
+    for note in (*whole.warnings, *slow):
+        print(f"Note: {note}")
     return 0
+
+
+def _slow(whole: ObjectAsset) -> list[str]:
+    """Return what of an object makes searches slower, and why."""
+    features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}
+    features["its emission"] = whole.emission
+    found = [name for name, one in features.items() if one is not None]
+    if not found:
+        return []
+    *others, last = found
+    named = f"{', '.join(others)} and {last}" if others else last
+    return [
+        f"slow: for {named}, controls that move outlines (pose, camera, geometry) are differentiated by differences, "
+        "which takes several renders a step; textures and light are not slower"
+    ]
 
 
 def _mitsuba(args: argparse.Namespace, out: Path | None) -> Callable[[], int]:

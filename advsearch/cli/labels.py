@@ -8,7 +8,7 @@ from advsearch.cli import output
 from advsearch.errors import InputError
 
 HELP = "find the names of a model's classes, as --label takes them"
-MORE = ". With --labels the model itself is not loaded"
+MORE = ". With --labels the model itself is not loaded. What stands for no thing, such as background, is left out"
 EXAMPLES = (
     "labels",
     "labels mug --labels labels.json",
@@ -35,12 +35,15 @@ def run(args: argparse.Namespace) -> int:
 
     with at_work(as_json=True, quiet=False):
         from advsearch.models import matching_labels
+        from advsearch.models.labels import names_nothing
 
         labels = class_names(getattr(args, "model", "reference"), getattr(args, "labels", None))
         if args.word is None:
             indices = list(range(len(labels)))
         else:
             indices = [index for index, _ in matching_labels(args.word, labels)]
+        if args.word is None or not names_nothing(args.word):
+            indices = [index for index in indices if not names_nothing(labels[index])]
     if not indices:
         raise InputError(f"none of the {len(labels)} labels is like {args.word!r}; leave the word out to see all")
     if args.json:

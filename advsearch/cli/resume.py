@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     import sys
 
     from advsearch.cli.run import carry_out, changes_in, command_in
-    from advsearch.runs.directory import CONFIG, find_run
+    from advsearch.runs.directory import CONFIG, find_run, only_here
     from advsearch.runs.listing import finished
 
     path, changes = find_run(args.run), changes_in(args.change)
@@ -45,6 +45,11 @@ def run(args: argparse.Namespace) -> int:
 
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
+    if only := only_here(path):
+        raise InputError(
+            f"{path}: cannot go on from here: {', '.join(only)} existed only in the Python session that asked; call "
+            "the same function with the same arguments again, an attack with `resume=True`"
+        )
     return carry_out(command_in(path / CONFIG), path / CONFIG, changes, args, resumed=path)
 
 

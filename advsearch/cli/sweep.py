@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli.output import columns
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
-from advsearch.report.phrases import answer_text, margin_text, percent
+from advsearch.report.phrases import answer_text, beside_text, margin_text, percent
 from advsearch.report.surface_words import surface_sentences
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.sweep import AxisRow, SweepSummary, WorstConfiguration
+    from advsearch.runs.results.sweep import AxisRow, PairedRates, SweepSummary, WorstConfiguration
+    from advsearch.settings import Config
 
 HELP = "measure how often the model is right over a grid or a random sample of configurations"
 EXAMPLES = (
@@ -20,6 +22,7 @@ EXAMPLES = (
     "sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270",
     "sweep --object mug --control pose,camera --samples 1000",
     "sweep --object mug --control pose --samples 200 --surface",
+    "sweep --answer-of mug-texture-001 --control camera,environment --samples 200",
 )
 READING = "How often it is right at each value, over all others, with the 95 % interval:"
 """What the tables show."""
@@ -29,6 +32,21 @@ BAR = 20
 
 MOST_ROWS = 24
 """Values of an axis that are all shown; of more, half as many: those where the model does worst."""
+
+
+class _Sweep(QuestionCommand):
+    """The command, which may take scene and model from the run whose answer it sweeps."""
+
+    def config(self, args: argparse.Namespace) -> Config:
+        """Return what the flags describe, over what the run of an answer brings."""
+        file = self.file(args)
+        if file is None:
+            return super().config(args)
+        from advsearch.cli.flags import config_from
+        from advsearch.config import AttackConfig, SweepConfig
+
+        varies = "grid" in args or "controls" in args
+        return config_from(args, SweepConfig, **SweepConfig.of_answer(AttackConfig.from_yaml(file), varies=varies))
 
 
 def answer(summary: SweepSummary) -> str:
@@ -47,14 +65,33 @@ def _verdict(summary: SweepSummary) -> str:
     rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
     if summary.ending == INTERRUPTED and seen < summary.planned:
         return f"Interrupted after {seen} of {summary.planned} configurations: right in {correct} ({rate})."
+    if summary.beside and summary.beside.pairs:
+        return "\n\n".join(_beside(pair, summary.beside.answer) for pair in summary.beside.pairs)
     return f"The model is right in {correct} of {wording.count(seen, 'configuration')} ({rate})."
+
+
+def _beside(pair: PairedRates, answer: str) -> str:
+    """What the pairs of a model say, and both rates side by side."""
+    rows = [
+        [
+            name,
+            f"right in {one.correct} of {one.configurations}",
+            percent(one.accuracy),
+            wording.interval_text(one.interval),
+        ]
+        for name, one in (("clean", pair.clean), (answer, pair.answer))
+    ]
+    return f"{beside_text(answer, pair)}\n\n{columns(rows)}"
 
 
 def _tables(summary: SweepSummary) -> list[str]:
     by_axis: dict[str, list[AxisRow]] = {}
-    for row in summary.axes:
+    for row in (one for one in summary.axes if one.axis != "answer"):
         by_axis.setdefault(row.axis, []).append(row)
-    return [READING, *(_table(name, rows) for name, rows in by_axis.items())] if by_axis else []
+    reading = (
+        f"Of the clean scene and the answer together: {READING[0].lower()}{READING[1:]}" if summary.beside else READING
+    )
+    return [reading, *(_table(name, rows) for name, rows in by_axis.items())] if by_axis else []
 
 
 def _table(name: str, rows: Sequence[AxisRow]) -> str:
@@ -123,4 +160,4 @@ def _said(worst: WorstConfiguration, task: str) -> str:
     return f"{text}; margin ({margin_text(task)}) {claim.margin:.3g}; {rate}"
 
 
-COMMAND = QuestionCommand("sweep", answer)
+COMMAND = _Sweep("sweep", answer, about="answer_of")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib
 import json
+import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -77,6 +80,36 @@ def check_installed() -> None:
         raise InputError("workers: needs Dask; pip install 'advsearch[dask]', or leave `workers` out") from None
 
 
+def check_main() -> None:
+    """Check that workers on this machine can import the script that runs: each does, as `multiprocessing` has it.
+
+    Raises:
+        InputError: a script asks outside of `if __name__ == "__main__":`, so that each worker would ask again.
+    """
+    main, name = sys.modules["__main__"], '`if __name__ == "__main__":`'
+    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
+    frame = sys._current_frames().get(threading.main_thread().ident or 0)
+    while frame is not None and not (frame.f_code.co_name == "<module>" and frame.f_globals is vars(main)):
+        frame = frame.f_back
+    if file is None or frame is None or (spec is not None and spec.name.endswith("__main__")):
+        return
+    try:
+        tree = ast.parse(Path(file).read_text(encoding="utf-8"))
+    except OSError:
+        raise InputError(f"workers: expected a script that they can import, got {file}; put it into a file") from None
+    except (ValueError, SyntaxError):
+        return
+    line, guards = frame.f_lineno, ("__name__", "parent_process", "current_process")
+    for one in (node for node in ast.walk(tree) if isinstance(node, ast.If) and node.lineno <= line):
+        leaves = any(isinstance(part, ast.NotEq) for part in ast.walk(one.test))  # where it is imported
+        if (leaves or line <= (one.end_lineno or 0)) and any(guard in ast.unparse(one.test) for guard in guards):
+            return
+    raise InputError(
+        f"workers: expected {file} to ask under {name}, got a call outside of it, in line {line}; put it there: "
+        "every worker imports the script and would ask again"
+    )
+
+
 def key_of(work: Work, files: Files) -> str:
     """Return a name of a work by its content."""
     said = [work.function, work.settings, work.threads, sorted(files.named.items())]
@@ -95,6 +128,7 @@ def place_of(workers: int | None, cluster: str | None) -> Site:
         FileFormatError: the file is missing or says something else.
     """
     if cluster is None or cluster == LOCAL:
+        check_main()
         return local(workers or threads.cores())
     if cluster.startswith(SCHEMES):
         if workers is not None:

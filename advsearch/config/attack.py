@@ -20,6 +20,13 @@ if TYPE_CHECKING:
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
 
+STEPS = 40
+"""Of a search about one picture."""
+
+OVER_PREDICTED, OVER_RENDERED, OVER_NUMBERS = (400, 8), (150, 4), (STEPS, 4)
+"""Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
+pictures (`benchmarks/bank.py`), where each is rendered, and where only a few numbers are searched (a pose)."""
+
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
 
@@ -70,7 +77,7 @@ class AttackConfig(DerivativeConfig):
         ),
         Clash(
             "draws",
-            lambda one: not one.over,
+            lambda one: not one.over and one.draws != OVER_RENDERED[1],  # which run.yaml of older versions always say
             "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out",
         ),
         Clash(
@@ -113,10 +120,12 @@ class AttackConfig(DerivativeConfig):
     policy: str | dict[str, JsonValue] = setting(
         "auto", "search", "the rule that proposes configurations", "the name of a policy, or NAME={OPTION: VALUE}"
     )
-    steps: int = setting(
-        40,
+    steps: int | None = setting(
+        None,
         "search",
         "steps of the search, its budget in renders",
+        otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} where pictures are predicted, "
+        f"{OVER_RENDERED[0]} where they are rendered",
         ge=1,
         le=1_000_000,
     )
@@ -168,7 +177,14 @@ class AttackConfig(DerivativeConfig):
         flag="",
         min_length=None,
     )
-    draws: int = setting(4, "search", "conditions that a step of --over looks at", ge=1, le=1000)
+    draws: int | None = setting(
+        None,
+        "search",
+        "conditions that a step of --over looks at",
+        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted, {OVER_RENDERED[1]} else",
+        ge=1,
+        le=1000,
+    )
     average: int = setting(
         0,
         "search",

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
 from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, check_once, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
 
 OF_ALL: Mapping[str, object] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
 """What is as it is unless it is given, and has to be left so with `all`."""
@@ -98,14 +97,8 @@ class StabilityConfig(Config):
 
     @field_validator("case", "group", "run", mode="before")
     @classmethod
-    def _as_text(cls, value: Any) -> Any:
-        """Accept a path for a folder and a list of names for names; refuse what can't be a name."""
-        text = str(value) if isinstance(value, Path) else value
-        if isinstance(text, (list, tuple)) and all(isinstance(part, str) for part in text):
-            text = ",".join(text)
-        if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
-            raise ValueError("an empty name")
-        return text
+    def _as_text(cls, value: Any, info: Any) -> Any:
+        return as_text(value, several=info.field_name != "run")
 
     @field_validator("case", "group")
     @classmethod

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from pydantic import field_validator
 
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, check_once, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
 
 FEWEST_ROWS = 100
 """Rows of which one half can choose and the other can count."""
@@ -64,13 +64,8 @@ class ExplainConfig(Config):
 
     @field_validator("sweeps", "run", mode="before")
     @classmethod
-    def _as_text(cls, value: Any) -> Any:
-        """Accept a path for a folder and a list of names for names; refuse what can't be a name."""
-        parts = list(value) if isinstance(value, (list, tuple)) else [value]
-        text = ",".join(map(str, parts)) if all(isinstance(one, (str, Path)) for one in parts) else value
-        if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
-            raise ValueError("an empty name")
-        return text
+    def _as_text(cls, value: Any, info: Any) -> Any:
+        return as_text(value, several=info.field_name == "sweeps")
 
     @field_validator("sweeps")
     @classmethod

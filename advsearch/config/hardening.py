@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import model_validator
 
-from advsearch.config.attack import AttackConfig
+from advsearch.config.attack import STEPS, AttackConfig
 from advsearch.settings import setting, setting_as_in
 
 ALL = "all"
@@ -103,6 +103,7 @@ class HardenConfig(AttackConfig):
         0.02, "training", "clean accuracy that may be lost; weights that lose more are not kept", ge=0.0, le=1.0
     )
     measured: int = setting(28, "verification", "held-out scenes that are attacked, before and after", ge=1, le=100_000)
+    steps: int = setting_as_in(AttackConfig, "steps", default=STEPS, otherwise="")
     trials: int | None = setting_as_in(AttackConfig, "trials", default=6)
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", default=32)
     workers: int | None = setting_as_in(

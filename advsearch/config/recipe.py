@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import field_validator
+from pydantic import JsonValue, field_validator
 
+from advsearch.config.named import read_named
 from advsearch.config.scene import SceneConfig
 from advsearch.files import MESHES, either
-from advsearch.settings import Clash, Config, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, as_text, setting, setting_as_in, split_names
 
 ALL_OBJECTS = "*"
 """Under this a label stands that is right for every object without one of its own."""
@@ -64,6 +65,9 @@ class RecipeConfig(Config):
         otherwise="what the recipe names",
     )
     labels: str | None = setting_as_in(SceneConfig, "labels")
+    task: str | dict[str, JsonValue] | None = setting_as_in(
+        SceneConfig, "task", default=None, otherwise="what the recipe says, or classification"
+    )
     label: dict[str, str] = setting(
         dict,
         "model",
@@ -79,16 +83,15 @@ class RecipeConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RECIPE-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("recipe", "photographs", "object", "environment", "model", "labels", "run", mode="before")
+    @field_validator("recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before")
     @classmethod
-    def _as_text(cls, value: Any) -> Any:
-        """Accept a path for a file and a list of names for names; refuse what can't be a name."""
-        text = str(value) if isinstance(value, Path) else value
-        if isinstance(text, (list, tuple)) and all(isinstance(part, str) for part in text):
-            text = ",".join(text)
-        if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
-            raise ValueError("an empty name")
-        return text
+    def _as_text(cls, value: Any, info: Any) -> Any:
+        return as_text(value, several=info.field_name in ("object", "environment", "model"))
+
+    @field_validator("task", mode="before")
+    @classmethod
+    def _task_with_options(cls, value: Any) -> Any:
+        return read_named(value, "task", "classification")
 
     @field_validator("photographs")
     @classmethod

@@ -9,7 +9,7 @@ from pydantic import field_validator
 
 from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, check_once, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
 
 WAYS = (
     "samples",
@@ -57,14 +57,8 @@ class ReplayConfig(Config):
 
     @field_validator("answer", "ways", "model", "run", mode="before")
     @classmethod
-    def _as_text(cls, value: Any) -> Any:
-        """Accept a path for a folder and a list of names for names; refuse what can't be a name."""
-        text = str(value) if isinstance(value, Path) else value
-        if isinstance(text, (list, tuple)) and all(isinstance(part, str) for part in text):
-            text = ",".join(text)
-        if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
-            raise ValueError("an empty name")
-        return text
+    def _as_text(cls, value: Any, info: Any) -> Any:
+        return as_text(value, several=info.field_name in ("ways", "model"))
 
     @field_validator("ways")
     @classmethod

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, field_validator, model_validator
@@ -12,10 +11,13 @@ from advsearch.config.named import name_in, read_named
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.options import by_key
-from advsearch.settings import Clash, Config, check_once, number_or_text, setting, split_names
+from advsearch.settings import Clash, Config, as_text, check_once, number_or_text, setting, shown, split_names
 
 DEFAULT_ENVIRONMENT = "studio"
 """What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
+
+SEVERAL = ("object", "environment", "model", "label", "target", "held_out", "held_out_environment")
+"""The settings that may be several names, where a command takes several."""
 
 ControlsByName = dict[str, dict[str, object]]
 """Controls as they are asked for: their names, each with its settings."""
@@ -242,21 +244,19 @@ class SceneConfig(Config):
         "labels",
         "label",
         "task",
+        "up",
+        "camera",
         "run",
         "objective",
         "target",
+        "held_out",
+        "held_out_environment",
         mode="before",
         check_fields=False,
     )
     @classmethod
-    def _as_text(cls, value: Any) -> Any:
-        """Accept a path for a file, a number or a list of names for labels; refuse what can't be a name."""
-        text = str(value) if isinstance(value, (Path, int)) and not isinstance(value, bool) else value
-        if isinstance(text, (list, tuple)) and all(isinstance(part, str) for part in text):
-            text = ",".join(text)
-        if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
-            raise ValueError("an empty name")
-        return text
+    def _as_text(cls, value: Any, info: Any) -> Any:
+        return as_text(value, several=info.field_name in SEVERAL)
 
     @field_validator("task", mode="before")
     @classmethod
@@ -296,7 +296,7 @@ class SceneConfig(Config):
         parts = value.lower().split("x") if isinstance(value, str) else value
         if isinstance(parts, int):
             parts = [parts]
-        return parts * 2 if isinstance(parts, list) and len(parts) == 1 else parts
+        return [*parts, *parts] if isinstance(parts, (list, tuple)) and len(parts) == 1 else parts
 
     @field_validator("resolution")
     @classmethod
@@ -314,5 +314,5 @@ class SceneConfig(Config):
 
 def one_only(name: str, names: Sequence[str]) -> InputError:
     """The error for several objects, environments or models where one is looked at."""
-    listed = ",".join(names)
+    listed = shown(",".join(names))
     return InputError(f"{name}: expected one {name}, got {listed}; give one, or compare several with advsearch sweep")

@@ -70,6 +70,16 @@ class SweepConfig(SceneConfig):
         description="what is drawn by chance beside the grid, separated by commas",
         min_length=None,
     )
+    answer_of: str | None = setting(
+        None,
+        "sweep",
+        "a run of attack whose answer is swept beside the clean scene, under the same draws; it brings scene and model "
+        "with it, and what its --over drew where nothing else varies",
+        "the name or the folder of a run",
+        metavar="RUN",
+        otherwise="none",
+        min_length=1,
+    )
     samples: int | None = setting(
         None,
         "sweep",
@@ -135,6 +145,24 @@ class SweepConfig(SceneConfig):
     def environments(self) -> tuple[str, ...]:
         """The environments by name."""
         return split_names(self.lit_by)
+
+    @classmethod
+    def of_answer(cls, theirs: AttackConfig, *, varies: bool) -> dict[str, Any]:
+        """Return the settings that a sweep of an attack's answer takes from the attack, where it says nothing else.
+
+        Args:
+            theirs: the attack's settings.
+            varies: whether the sweep says itself what varies; otherwise it is what the attack was over.
+        """
+        apart = ("controls", "texture_resolution", "spp", "seed", "threads", "deterministic")
+        kept = {name: value for name, value in cls.shared(theirs).items() if name not in apart}
+        return kept if varies else {**kept, "controls": theirs.over}
+
+    @field_validator("answer_of", mode="before")
+    @classmethod
+    def _run_as_text(cls, value: Any) -> Any:
+        """Accept a path for a folder."""
+        return str(value) if isinstance(value, Path) else value
 
     @field_validator("trials")
     @classmethod

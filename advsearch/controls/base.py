@@ -132,7 +132,8 @@ class BoundControl(ABC):
 
     def printed(self, u: Tensor) -> Tensor | None:
         """Return the searched colours that a printer would print, (h, w, 3) display-referred sRGB in [0, 1], as a
-        differentiable function of u; None without."""
+        differentiable function of u; where only some are searched (h, w, 4), with 1 for these and 0 for others; None
+        without."""
         return None
 
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
@@ -161,11 +162,11 @@ class Control(ABC):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings: those of the class, unless the scene names
-        them.
+        """Return the parameters of an instance that is given some settings: those of the class, unless the scene or the
+        settings name them.
 
         Args:
-            settings: names of what is given.
+            settings: names of what is given, perhaps with the values.
         """
         return cls.parameters
 

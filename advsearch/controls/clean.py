@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from advsearch.errors import InputError
-from advsearch.scene.description import ENVIRONMENT, SceneDescription
+from advsearch.scene.description import ENVIRONMENT, SceneDescription, check_one_environment
 from advsearch.scene.settings import SETTINGS
 
 Number = float | str
@@ -58,6 +58,7 @@ def check_prepared(control: str, before: SceneDescription, after: SceneDescripti
         InputError: it was asked for.
     """
     if after.environment is not None and after.environment is not before.environment:
+        check_one_environment(after.parts, f"`controls` {control}")
         if ENVIRONMENT in before.given:
             raise InputError(
                 f"`environment={before.environment_spec}` and `controls` {control} contradict each other: the control "

@@ -12,7 +12,8 @@ section 3), 9 coefficients for each colour channel as multiples of the map's mea
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import ClassVar
@@ -25,7 +26,9 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
-from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription, is_path
+from advsearch.scene.environments import import_environment
 from advsearch.scene.exposure import metered_gain
 from advsearch.scene.harmonics import real_harmonics
 from advsearch.scene.settings import CHANNELS, LIT
@@ -47,7 +50,7 @@ class EnvironmentControl(NumberControl):
             0.0,
             float(len(library.list_environments())),
             OWN_MAP,
-            "A bundled environment instead of the scene's own, metered afresh.",
+            "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr file.",
             options=(OWN_MAP, *library.list_environments()),
             estimators=(),
         ),
@@ -78,6 +81,16 @@ class EnvironmentControl(NumberControl):
         ),
     )
 
+    @classmethod
+    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+        """The parameters, with the files that `which` names among its options."""
+        which, *others = cls.parameters
+        given = settings.get("which") if isinstance(settings, Mapping) else None
+        given = given.get("choices") if isinstance(given, Mapping) else given
+        named = [given] if isinstance(given, str) or not isinstance(given, Sequence) else given
+        files = [one for one in named if isinstance(one, str) and one not in which.options and is_path(one)]
+        return (replace(which, options=tuple(dict.fromkeys((*which.options, *files)))), *others)
+
     def check_choices(self) -> None:
         given = self.chosen["epsilon"]
         if "epsilon" in self._given and "harmonics" not in self._given:
@@ -87,33 +100,47 @@ class EnvironmentControl(NumberControl):
             )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """An environment that is fixed is the scene's."""
-        spec = self.specs.get("which")
-        if not isinstance(spec, Fixed) or spec.value in (OWN_MAP, scene.bundled_environment):
-            scene.environment_for(f"`controls` {self.name}")
-            return scene
-        name = str(spec.value)
-        return replace(scene, environment=library.load_environment(name), environment_spec=name)
+        """An environment that is fixed is the scene's; so is the first of several where these are files, and the
+        scene's own is none of them."""
+        spec, allowed = self.specs.get("which"), self._allowed()
+        files = [str(one) for one in allowed if _is_file(one)]
+        found = {name: _loaded(name) for name in files}
+        notes = [note for one in found.values() for note in one.warnings]
+        if OWN_MAP in allowed or self._own_name(scene) is not None or not (isinstance(spec, Fixed) or files):
+            lit = scene.environment_for(f"`controls` {self.name}")
+            if found and scene.photograph is None and not lit.photographed and scene.number("ground.size") > 0.0:
+                names = ", ".join(one.name for one in found.values())
+                notes.append(
+                    f"{names}: the object stands on the scene's table there, too; ground.kind=photograph shows the "
+                    "floor of each picture instead"
+                )
+        else:
+            name = str(allowed[0])
+            scene = replace(scene, environment=_loaded(name), environment_spec=name)
+        return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         """Of `which`, the scene's own environment, by its name where only that is allowed."""
         if parameter.name != "which":
             return super().default(scene, parameter)
-        by_name = OWN_MAP not in self._allowed() and scene.bundled_environment in self._allowed()
-        return str(scene.bundled_environment) if by_name else OWN_MAP
+        return OWN_MAP if OWN_MAP in self._allowed() else self._own_name(scene) or OWN_MAP
 
     def setting(self, parameter: Parameter) -> str:
         return ENVIRONMENT if parameter.name == "which" else super().setting(parameter)
 
     def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
         if parameter.name == "which" and OWN_MAP not in self._allowed():
-            return scene.environment_spec
+            return self._own_name(scene) or scene.environment_spec
         return super().unchanged(scene, parameter)
 
     def _allowed(self) -> tuple[Number, ...]:
         """The environments that can be chosen."""
         spec = self.specs.get("which")
         return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else (OWN_MAP,)
+
+    def _own_name(self, scene: SceneDescription) -> str | None:
+        """What the scene's own environment is called among those that can be chosen; None if it is none of them."""
+        return next((str(one) for one in self._allowed() if _is_own(one, scene)), None)
 
     def budget(self, scene: SceneDescription, parameter: Parameter) -> Budget:
         if parameter.name != "harmonics":
@@ -133,10 +160,36 @@ class EnvironmentControl(NumberControl):
         return {"environment.data": lit}
 
     def _map(self, scene: SceneDescription, which: int) -> Tensor:
-        name = self.parameters[0].options[which]
-        if name in (OWN_MAP, scene.bundled_environment):
-            return _tensor_of(scene)
-        return _bundled(name, scene)
+        name = self.own[0].options[which]
+        return _tensor_of(scene) if name == OWN_MAP or _is_own(name, scene) else _metered(_loaded(name), scene)
+
+
+def _is_file(name: Number) -> bool:
+    return isinstance(name, str) and name not in EnvironmentControl.parameters[0].options
+
+
+def _is_own(name: Number, scene: SceneDescription) -> bool:
+    """Whether an environment is the scene's own."""
+    own = scene.environment
+    if own is None or not _is_file(name):
+        return name == scene.bundled_environment is not None
+    return bool(own.source) and os.path.realpath(str(name)) == os.path.realpath(own.source)
+
+
+def _loaded(name: str) -> EnvironmentAsset:
+    """An environment by its name, or from a file, which is read again when it has changed."""
+    if not _is_file(name):
+        return library.load_environment(name)
+    try:
+        about = os.stat(name)
+    except OSError:
+        return import_environment(name)  # which says what is wrong
+    return _read(os.path.realpath(name), name, about.st_mtime_ns, about.st_size)
+
+
+@lru_cache(maxsize=64)
+def _read(place: str, name: str, *version: int) -> EnvironmentAsset:
+    return import_environment(name)
 
 
 @lru_cache(maxsize=4)
@@ -144,11 +197,12 @@ def _tensor_of(scene: SceneDescription) -> Tensor:
     return torch.from_numpy(scene.environment_for("the environment").radiance.copy())
 
 
-@lru_cache(maxsize=16)
-def _bundled(name: str, scene: SceneDescription) -> Tensor:
-    """A bundled map in its own size, as bright as keeps the picture's exposure."""
-    asset = library.load_environment(name)
-    share = metered_gain(replace(scene, environment=asset)) / metered_gain(scene)
+@lru_cache(maxsize=64)
+def _metered(asset: EnvironmentAsset, scene: SceneDescription) -> Tensor:
+    """Another map in its own size, as bright as keeps the picture's exposure; the ground stays of the same kind."""
+    own = scene.environment_for("the environment")
+    there = replace(scene, environment=replace(asset, photographed=own.photographed))
+    share = metered_gain(there) / metered_gain(scene) if scene.metered else 1.0
     return torch.from_numpy(asset.radiance.copy()) * share
 
 

@@ -68,13 +68,15 @@ class NumberControl(Control, ABC):
     """
 
     choices: ClassVar[tuple[Choice, ...]] = ()
+    own: tuple[Parameter, ...]
+    """The parameters of this instance: `declared` of its settings."""
     amount: ClassVar[str | None] = None
     """The parameter whose value in the scene as it was described means that the rest of the control does not show: the
     power of a lamp, say. None where the scene has all parameters of itself."""
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         self.name = name or self.kind
-        own = self.declared(settings)
+        own = self.own = self.declared(settings)
         known = [one.name for one in own] + [one.name for one in self.choices]
         for setting in settings:
             if setting not in known:
@@ -160,7 +162,7 @@ class NumberControl(Control, ABC):
     def bind(self, scene: SceneDescription) -> BoundNumbers:
         slots: list[Slot] = []
         begin = 0
-        for parameter in self.parameters:
+        for parameter in self.own:
             value = self.default(scene, parameter)
             slot = Slot(parameter, self._spec(scene, parameter, value), self.size(parameter), begin, value)
             slots.append(slot)

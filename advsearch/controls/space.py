@@ -119,6 +119,26 @@ class Space:
                 found.update(control.describe(*arguments))
         return found
 
+    def holding(self, u: Tensor) -> Space:
+        """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
+
+        Args:
+            u: (d,) of as many whole controls.
+
+        Raises:
+            InputError: no number of controls has so many coordinates.
+        """
+        sizes = [len(control.start) for control in self.controls]
+        count = next((k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)), None)
+        if count is None:
+            raise InputError(f"controls: expected the coordinates of whole controls, of {sizes} each, got {len(u)}")
+        held = [
+            _Held(control, part) for control, part in zip(self.controls, torch.split(u, sizes[:count]), strict=False)
+        ]
+        chosen = Space(self.controls[:count], self.scene)
+        lit_by = chosen.lit_by(chosen.describe(u)) or self.environment
+        return replace(self, controls=(*held, *self.controls[count:]), environment=lit_by)
+
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
         """Return what lights a configuration in the place of the scene's environment; None if nothing does.
 
@@ -144,6 +164,24 @@ class Space:
         return {file_name(name): data for one in named for name, data in one.items()}
 
 
+class _Held(BoundControl):
+    """A control that stays at one configuration, and takes no coordinates."""
+
+    def __init__(self, control: BoundControl, at: Tensor) -> None:
+        self._control, self._at = control, at
+        self.name, self.start, self.groups = control.name, torch.zeros(0), ()
+        self.moved, self.refines, self.on_top = control.moved, control.refines, control.on_top
+
+    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        return self._control.inputs(self._at, so_far)
+
+    def picture(self, u: Tensor, image: Tensor) -> Tensor:
+        return self._control.picture(self._at, image)
+
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
+        return self._control.describe(self._at, so_far)
+
+
 def file_name(name: str) -> str:
     """Return a control's name as it stands in names of files: texture@chair of texture:chair."""
     return name.replace(":", "@")
@@ -158,5 +196,6 @@ def _with_inputs(control: BoundControl, u: Tensor, so_far: Mapping[str, Tensor])
     own = control.inputs(u, so_far)
     for name in own:
         if name in so_far and name not in control.refines:
-            raise InputError(f"controls: two controls set {name}; leave one of them out")
+            hint = "; one `texture` takes several materials" if name.endswith(".base_color") else ""
+            raise InputError(f"controls: two controls set {name}; leave one of them out{hint}")
     return {**so_far, **own}

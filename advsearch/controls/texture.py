@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -33,10 +33,12 @@ from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Control, Group, Parameter, Value
 from advsearch.controls.values import LARGEST_EPSILON
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.surface_map import texel_area
+from advsearch.scene.description import OBJECT, SceneDescription
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.surface_map import Mask, texel_area, texels_of_faces
 
 RESOLUTIONS = (256, 512)
 """Smallest and largest side that is taken from the object's own texture when none is asked for."""
@@ -47,6 +49,8 @@ FORMS = ("texels", "palette", "waves")
 LARGEST_WAVES = 64
 LARGEST_PALETTE = 64
 LLOYD_STEPS = 30
+LEAST_ALONE = 0.5
+"""Share of the texels of materials that must be theirs alone for them to be painted."""
 WAVE_REACH = 3.0
 """Argument of the tanh that the slowest wave alone reaches at its largest amplitude: 0.995 of the ball's radius."""
 
@@ -63,6 +67,9 @@ class TextureControl(Control):
         form: "texels" (each on its own), "palette" (a few colours) or "waves" (smooth).
         colors: number of colours of the palette, 1 to 64.
         waves: number of waves along each side of the texture, 1 to 64.
+        materials: a name or names of materials in the mesh's file: only their texels are searched, and all others stay
+            as they are, bit for bit. Then the texture has the mesh's own size where no resolution is asked for, unless
+            both its sides are under 256. None paints all of the mesh.
         texels: stands for form "texels" when `texture.texels` is asked for; its range cannot be set.
         palette: likewise.
         amplitudes: likewise, for form "waves".
@@ -75,6 +82,7 @@ class TextureControl(Control):
     form: str | None = None
     colors: int = 6
     waves: int = 8
+    materials: str | Sequence[str] | None = None
     texels: object = None
     palette: object = None
     amplitudes: object = None
@@ -143,6 +151,7 @@ class TextureControl(Control):
         Choice("form", "texels", "What is searched: texels, palette (a few colours) or waves (smooth patterns)."),
         Choice("colors", 6, "Number of colours of the palette.", whole=(1, LARGEST_PALETTE)),
         Choice("waves", 8, "Number of waves along each side of the texture.", whole=(1, LARGEST_WAVES)),
+        Choice("materials", None, "Materials of the mesh's file that are painted, by name; by default all of it."),
     )
 
     def __post_init__(self) -> None:
@@ -150,22 +159,77 @@ class TextureControl(Control):
             if getattr(self, choice.name) is not None:  # None is "what the norm, the form or the object says"
                 choice.check(self.name, getattr(self, choice.name))
         object.__setattr__(self, "form", self.chosen_form(FORMS, self.form))
+        names = [self.materials] if isinstance(self.materials, str) else self.materials
+        if names is not None:
+            if not (isinstance(names, Sequence) and names and all(isinstance(one, str) for one in names)):
+                raise InputError(
+                    f"{self.name}.materials: expected names of materials, got {self.materials!r}; put quotes around a "
+                    "name that reads as a number"
+                )
+            object.__setattr__(self, "materials", list(dict.fromkeys(names)))
+
+    def mesh_in(self, scene: SceneDescription) -> MeshPart:
+        if self._named_material(scene):
+            return scene.meshes[OBJECT]
+        try:
+            return super().mesh_in(scene)
+        except UnknownNameError:
+            materials, hint = scene.object.mesh.materials, f"It stands in `controls` {self.name}."
+            kind = "mesh of the scene" + (" or material of the object" if materials else "")
+            raise UnknownNameError(kind, self.mesh, [*scene.meshes, *materials], hint) from None
+
+    def materials_in(self, scene: SceneDescription) -> Sequence[str] | None:
+        """Return the materials that it paints in a scene; None for all of the mesh."""
+        return self._named_material(scene) or (None if self.materials is None else list(self.materials))
+
+    def _named_material(self, scene: SceneDescription) -> list[str]:
+        """The materials of the object that its name means, as in `texture:paint`, where no mesh is called so."""
+        from advsearch.scene.importing.scenes import clean  # takes time, and most do without
+
+        if self.mesh in scene.meshes:
+            return []
+        return [one for one in scene.object.mesh.materials if self.mesh in (one, clean(one))]
 
     def bind(self, scene: SceneDescription) -> BoundControl:
-        mesh = self.mesh_in(scene)
+        mesh, names = self.mesh_in(scene), self.materials_in(scene)
         own = torch.from_numpy(mesh.base_color.copy())
-        side = self.resolution or min(max(max(own.shape[:2]), RESOLUTIONS[0]), RESOLUTIONS[1])
-        original = resampled(own, int(side))
-        return BoundTexture(self.name, self.mesh, original, self._painter(mesh.mesh, original))
+        longer = max(own.shape[:2])
+        if self.resolution or names is None or longer < RESOLUTIONS[0]:
+            own = resampled(own, int(self.resolution or min(max(longer, RESOLUTIONS[0]), RESOLUTIONS[1])))
+        if names is None:
+            return BoundTexture(self.name, mesh.name, own, self._painter(mesh.mesh, own, None))
+        where = self._texels_of(mesh, names, (own.shape[0], own.shape[1]))
+        return BoundTexture(self.name, mesh.name, own, self._painter(mesh.mesh, own, where), where, ", ".join(names))
 
-    def _painter(self, mesh: Mesh, original: Tensor) -> Painter:
+    def _texels_of(self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]) -> Mask:
+        """Which texels (h, w) only lookups on some materials read."""
+        known, whose = part.mesh.materials, "the object" if part.name == OBJECT else part.name
+        if not known:
+            raise InputError(f"{self.name}.materials: {whose} has no materials with names; leave materials out")
+        for name in names:
+            if name not in known:
+                raise UnknownNameError(f"material of {whose}", name, known)
+        where, share = texels_of_faces(part.mesh, np.concatenate([known[name] for name in names]), shape)
+        if share < LEAST_ALONE:
+            raise InputError(
+                f"{self.name}.materials: other materials read {100 * (1 - share):.0f} % of the texels of "
+                f"{', '.join(names)} too, so that it cannot be painted alone; give each material texels of its own in "
+                f"the file, {'take a higher resolution, ' if self.resolution else ''}or leave materials out"
+            )
+        return where
+
+    def _painter(self, mesh: Mesh, original: Tensor, where: Mask | None) -> Painter:
+        shape = original.shape[0], original.shape[1]
+        mask = torch.ones(shape, dtype=torch.bool) if where is None else torch.from_numpy(where)
+        texels = original[mask]
         if self.form == "palette":
-            centres = palette(original, texel_area(mesh, len(original)), int(self.colors))
-            return Recoloured(original, centres, Budget(self.norm, self._radius(centres.numel())))
+            area = np.where(mask.numpy(), texel_area(mesh, shape), 0.0).astype(np.float32)
+            centres = palette(original, area if area.any() else mask.numpy().astype(np.float32), int(self.colors))
+            return Recoloured(texels, centres, Budget(self.norm, self._radius(centres.numel())))
         if self.form == "waves":
-            flat = self._radius(original.numel()) / (math.sqrt(original.numel()) if self.norm == "l2" else 1.0)
-            return Waved(original, int(self.waves), flat)
-        return Repainted(original, Budget(self.norm, self._radius(original.numel())))
+            flat = self._radius(texels.numel()) / (math.sqrt(texels.numel()) if self.norm == "l2" else 1.0)
+            return Waved(texels, mask, int(self.waves), flat)
+        return Repainted(texels, Budget(self.norm, self._radius(texels.numel())))
 
     def _radius(self, count: int) -> float:
         """Radius of the ball over `count` numbers."""
@@ -175,7 +239,7 @@ class TextureControl(Control):
 
 
 class Painter(ABC):
-    """One form of the control: a map from its slice of u to texels.
+    """One form of the control: a map from its slice of u to the n texels that it paints, row by row.
 
     Attributes:
         start: (d,) float32, the slice that gives the original.
@@ -187,33 +251,32 @@ class Painter(ABC):
 
     @abstractmethod
     def texels(self, u: Tensor) -> Tensor:
-        """Map (d,) in [0, 1] to (h, w, 3) display-referred sRGB in [0, 1]; differentiable."""
+        """Map (d,) in [0, 1] to (n, 3) display-referred sRGB in [0, 1]; differentiable."""
 
 
 class Repainted(Painter):
     """Each texel value on its own."""
 
     def __init__(self, original: Tensor, budget: Budget) -> None:
-        self._shape = original.shape
         self.start = original.reshape(-1)
         self.group = Group("texels", original.numel(), ("adjoint",), budget)
 
     def texels(self, u: Tensor) -> Tensor:
-        return u.reshape(self._shape)
+        return u.reshape(-1, 3)
 
 
 class Recoloured(Painter):
     """A few colours, from which each texel takes its change by how much it resembles them.
 
     Args:
-        original: (h, w, 3) sRGB.
+        original: (n, 3) sRGB.
         centres: (k, 3) sRGB, the palette of the original.
         budget: ball around the palette.
     """
 
     def __init__(self, original: Tensor, centres: Tensor, budget: Budget) -> None:
         self._original, self._centres = original, centres
-        squared = (original[:, :, None, :] - centres).square().sum(dim=-1)
+        squared = (original[..., None, :] - centres).square().sum(dim=-1)
         self._weights = torch.softmax(-squared / (2.0 * _spread(centres) ** 2), dim=-1)
         self.start = centres.reshape(-1)
         self.group = Group("palette", centres.numel(), ("adjoint", "differences"), budget)
@@ -227,15 +290,16 @@ class Waved(Painter):
     """Cosine waves along both sides of the texture, added up and held inside a radius by a tanh.
 
     Args:
-        original: (h, w, 3) sRGB.
+        original: (n, 3) sRGB.
+        where: (h, w) bool, the texels that are painted.
         count: number of waves along each side; wave m has m half periods, and the amplitude that a coordinate at the
             end of its range gives falls as 1 / (1 + the wave's frequency).
         radius: largest change of a texel value.
     """
 
-    def __init__(self, original: Tensor, count: int, radius: float) -> None:
-        height, width = original.shape[:2]
-        self._original, self._count, self._radius = original, count, radius
+    def __init__(self, original: Tensor, where: Tensor, count: int, radius: float) -> None:
+        height, width = where.shape
+        self._original, self._where, self._count, self._radius = original, where, count, radius
         number = torch.arange(count)
         self._down = torch.cos(math.pi * (torch.arange(height) + 0.5)[:, None] * number / height)
         self._across = torch.cos(math.pi * (torch.arange(width) + 0.5)[:, None] * number / width)
@@ -244,11 +308,11 @@ class Waved(Painter):
         self.group = Group("amplitudes", len(self.start), ("adjoint", "simultaneous"))
 
     def texels(self, u: Tensor) -> Tensor:
-        original, reach, down, across = (
-            held.to(u.device) for held in (self._original, self._reach, self._down, self._across)
+        original, where, reach, down, across = (
+            held.to(u.device) for held in (self._original, self._where, self._reach, self._down, self._across)
         )
         amplitudes = (2.0 * u - 1.0).reshape(self._count, self._count, 3) * reach
-        summed = torch.einsum("hm,wn,mnc->hwc", down, across, amplitudes)
+        summed = torch.einsum("hm,wn,mnc->hwc", down, across, amplitudes)[where]
         return (original + self._radius * torch.tanh(summed)).clamp(0.0, 1.0)
 
 
@@ -259,32 +323,47 @@ class BoundTexture(BoundControl):
         name: the instance's name.
         on: name of the mesh.
         original: (h, w, 3) float32 display-referred sRGB in [0, 1].
-        painter: maps u to texels.
+        painter: maps u to the texels that are painted.
+        where: (h, w) bool, which these are; None for all.
+        materials: whose they are, in words.
     """
 
-    def __init__(self, name: str, on: str, original: Tensor, painter: Painter) -> None:
+    def __init__(
+        self, name: str, on: str, original: Tensor, painter: Painter, where: Mask | None = None, materials: str = ""
+    ) -> None:
         self.name = name
         self._on = on
         self._original = original
+        self._where = None if where is None else torch.from_numpy(where)
         self._painter = painter
+        self._materials = materials
         self.start = painter.start
         self.groups = (painter.group,)
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return {f"{self._on}.base_color": srgb_to_linear(self._painter.texels(u))}
+        return {f"{self._on}.base_color": srgb_to_linear(self._texels(u))}
+
+    def _texels(self, u: Tensor) -> Tensor:
+        """All texels (h, w, 3) of a slice of u."""
+        painted, original = self._painter.texels(u), self._original.to(u.device)
+        if self._where is None:
+            return painted.reshape(original.shape)
+        return original.index_put(self._where.to(u.device).nonzero(as_tuple=True), painted)
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        change = self._painter.texels(u.detach()) - self._original.to(u.device)
-        return {
+        change = self._painter.texels(u.detach()) - self._painter.texels(self.start.to(u.device))
+        named: dict[str, Value] = {f"{self.name}.materials": {"value": self._materials, "unit": "name"}}
+        return (named if self._materials else {}) | {
             f"{self.name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},
             f"{self.name}.rms": {"value": float(change.pow(2).mean().sqrt()), "unit": "sRGB"},
         }
 
     def printed(self, u: Tensor) -> Tensor | None:
-        return self._painter.texels(u)
+        texels = self._texels(u)
+        return texels if self._where is None else torch.cat([texels, self._where.to(texels)[..., None]], dim=-1)
 
     def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return {self.name: self._painter.texels(u.detach()), f"{self.name}-original": self._original}
+        return {self.name: self._texels(u.detach()), f"{self.name}-original": self._original}
 
 
 def resampled(image: Tensor, side: int) -> Tensor:

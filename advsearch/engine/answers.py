@@ -43,6 +43,27 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described, lo
     return Facts(name, label, scene.description.object.label, numbers, sight)
 
 
+def shown(task: Task, model: Model, scenes: Sequence[Scene], label: str | None, pictures: PictureSettings) -> Task:
+    """Return the task after it has seen what its model answers to clean pictures, where it asks for that (`looks`).
+
+    Args:
+        task, model, pictures: as for `check_truth`.
+        scenes: at least one; the next is shown where those before leave open how answers are to be read.
+        label: what was said to be right.
+
+    Raises:
+        InputError: no scene shows it, so it has to be said.
+    """
+    if not task.looks:
+        return task
+    for scene in scenes:
+        view = render(scene, model, task=task, label=label, spp=LOOK_SPP, **vars(pictures)).views[0]
+        task = task.seeing(view.output, view.truth)
+        if not task.unsaid:
+            return task
+    raise InputError(f"model {model.name}: {task.unsaid}")
+
+
 def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, pictures: PictureSettings) -> None:
     """Refuse a scene of which the task cannot say what is right, before anything is prepared.
 

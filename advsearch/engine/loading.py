@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import final
 
-from advsearch.controls import Control, Space, gathered, make_control, make_space, settings_by_name
+from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.models.switches import plainly
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.description import (
@@ -19,6 +23,7 @@ from advsearch.scene.description import (
     SceneDescription,
     check_ground,
     check_meshes,
+    check_one_environment,
     describe,
 )
 from advsearch.scene.formation import ImageFormation
@@ -28,8 +33,9 @@ from advsearch.scene.mitsuba_backend.samplers import SAMPLER
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import Given
+from advsearch.settings import as_python
 
-Controls = str | Sequence[str | Control] | Mapping[str, object]
+Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 """One control or several, by name or instance; a mapping gives each name its settings, and ``mitsuba:KEY`` a range."""
 
 DEFAULT_RESOLUTION = 128
@@ -42,9 +48,11 @@ class Scene:
 
     Attributes:
         description: the scene as data.
+        only_here: whether it was made of something that no file and no command can name.
     """
 
     description: SceneDescription
+    only_here: bool = False
 
     def renderer(
         self,
@@ -70,9 +78,11 @@ class Scene:
         Raises:
             InputError: a control is unknown or impossible in this scene, or an argument is out of range.
         """
+        resolution = as_python(resolution)
         description = framed(self.description, resolution)
-        space = make_space(as_controls(controls), description)
-        return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
+        with plainly():
+            space = make_space(as_controls(controls), description)
+            return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
 
     def lit_by(self, environment: EnvironmentAsset | None) -> Scene:
         """Return the scene under another environment that was asked for; None for no map.
@@ -84,7 +94,9 @@ class Scene:
         own = self.description
         given = own.given | {ENVIRONMENT}
         check_ground(own.given_values, name)
-        return Scene(replace(own, environment=environment, environment_spec=name, given=given))
+        if environment is not None:
+            check_one_environment(own.parts, f"`environment={name}`")
+        return Scene(replace(own, environment=environment, environment_spec=name, given=given), self.only_here)
 
     def __repr__(self) -> str:
         described = self.description
@@ -101,7 +113,7 @@ class Scene:
         own = self.description
         check_meshes(own, given)
         values = {**own.values, **{name: resolved[name] for name in given}}
-        return Scene(replace(own, values=values, given=own.given | set(given)))
+        return Scene(replace(own, values=values, given=own.given | set(given)), self.only_here)
 
 
 @dataclass(frozen=True)
@@ -125,6 +137,7 @@ class PictureSettings:
         return self.resolution or (model.input_size[0], model.input_size[1])
 
 
+@plainly()
 def load_scene(
     object: str | Path | ObjectAsset,
     environment: str | Path | EnvironmentAsset | None = None,
@@ -149,6 +162,7 @@ def load_scene(
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
     """
+    settings = None if settings is None else as_python(settings)
     if scene is None:
         described = describe(object, environment, given=settings, up=up)
     elif not isinstance(object, str):
@@ -157,7 +171,10 @@ def load_scene(
         described = describe(object, environment, given=settings, up=up, plugins=scene)
     else:
         described = describe(f"{scene}#{object}", environment, given=settings, up=up)
-    return Scene(described if camera is None else described.seen_by(camera))
+    only_here = isinstance(scene, Mapping) or not all(
+        one is None or isinstance(one, (str, Path)) for one in (object, environment)
+    )
+    return Scene(described if camera is None else described.seen_by(camera), only_here)
 
 
 def named_camera(description: SceneDescription) -> str | None:
@@ -217,7 +234,8 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
     """
     if isinstance(controls, Mapping):
         return {name: dict(given) for name, given in settings_by_name(controls).items()}
-    several = [part.strip() for part in controls.split(",")] if isinstance(controls, str) else list(controls)
+    several = [controls] if isinstance(controls, Control) else controls
+    several = [part.strip() for part in several.split(",")] if isinstance(several, str) else list(several)
     as_controls(several)
     return {
         one.name if isinstance(one, Control) else one: one.settings() if isinstance(one, Control) else {}
@@ -235,6 +253,8 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
     """
     if isinstance(controls, str):
         controls = [part.strip() for part in controls.split(",") if part.strip()]
+    if isinstance(controls, Control):
+        controls = [controls]
     if not isinstance(controls, Mapping):
         if not all(isinstance(one, (str, Control)) for one in controls):
             raise InputError(f"controls: expected names or Control instances, got {controls!r}")
@@ -245,4 +265,38 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
         if len(set(names)) != len(names):
             raise InputError(f"controls: every instance needs a name of its own, got {', '.join(names)}")
         return ready + as_controls({one: {} for one in names})
-    return tuple(make_control(name, given) for name, given in gathered(controls).items())
+    return tuple(lent_control(name) or make_control(name, given) for name, given in gathered(controls).items())
+
+
+def instances_in(controls: object) -> list[Control]:
+    """Return the instances among controls."""
+    listed = controls if isinstance(controls, (list, tuple)) else [controls]
+    return [one for one in listed if isinstance(one, Control)]
+
+
+_LENT: ContextVar[Mapping[str, Control]] = ContextVar("lent", default=MappingProxyType({}))
+
+
+def lent_control(name: str) -> Control | None:
+    """Return the instance that stands for the name of a control, if one does."""
+    return _LENT.get().get(name)
+
+
+def lent_controls() -> list[Control]:
+    """Return all of them."""
+    return list(_LENT.get().values())
+
+
+@contextmanager
+def lending(controls: Controls) -> Iterator[None]:
+    """Let the instances among controls be what their names stand for inside the block, where only names are told."""
+    token = _LENT.set({**_LENT.get(), **{one.name: one for one in instances_in(controls)}})
+    try:
+        yield
+    finally:
+        _LENT.reset(token)
+
+
+def only_here(controls: Controls) -> list[str]:
+    """Return the classes of controls that have no name by which a file or another process could ask for them."""
+    return [type(one).__name__ for one in instances_in(controls) if CONTROLS.get(one.kind) is not type(one)]

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Wanted
+from advsearch.engine.going_on import same
 from advsearch.engine.problem import OnImage
 from advsearch.engine.rows import judgement_of
 from advsearch.errors import InputError
@@ -178,13 +179,23 @@ class Memory:
         if self._run is not None:
             self._run.store.set_note(key, json.dumps(value))
 
+    def other_answers(self, values: Mapping[str, tuple[float | None, float | None]]) -> InputError:
+        """Return the error of a run that goes on with another model or objective, from what these said and say."""
+        told = ", ".join(
+            f"{name} was {before} and is {now}" for name, (before, now) in values.items() if not same([before], [now])
+        )
+        path, again = ("", "") if self._run is None else (self._run.path, self._run.again)
+        return InputError(
+            f"{path}: cannot go on: the same picture of the clean scene has other values now ({told}), so model, "
+            f"objective or scene are not those that it began with; take these again, or {again}"
+        )
+
     def _check(self, entry: Entry, u: Tensor, index: int) -> None:
         if entry.facts.u != _digest(u) or entry.facts.index != index:
-            path = self._run.path if self._run is not None else ""
+            path, again = ("", "") if self._run is None else (self._run.path, self._run.again)
             raise InputError(
                 f"{path}: cannot go on: evaluation {entry.number} of the {entry.kind} is another one now than it was, "
-                "so advsearch, its packages or the number of threads have changed since; start again with "
-                f"advsearch run {path}/run.yaml"
+                f"so advsearch, its packages or the number of threads have changed since; {again}"
             )
 
 

@@ -81,7 +81,12 @@ def model_name(model: AnyModel) -> str:
     """Return what a model is called in settings."""
     if isinstance(model, (str, Path)):
         return str(model)
-    return str(getattr(model, "name", None) or type(model).__name__)
+    return str(getattr(model, "asked", None) or getattr(model, "name", None) or type(model).__name__)
+
+
+def exists_here(model: AnyModel) -> bool:
+    """Whether a model exists in this session only, so that no file and no command can name it."""
+    return not isinstance(model, (str, Path)) and getattr(model, "asked", None) is None
 
 
 def different(names: Sequence[str], setting: str) -> Sequence[str]:
@@ -98,6 +103,21 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
     return names
 
 
+OF_SCENE = ("set", "environment", "up", "camera", "exposure", "object")
+"""The settings that say what a scene is."""
+
+
+def check_not_of_scene(settings: Mapping[str, object]) -> None:
+    """Refuse settings of a scene that is loaded already.
+
+    Raises:
+        InputError: there are some.
+    """
+    clash = [name for name in OF_SCENE if settings.get(name) is not None]
+    if clash:
+        raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
+
+
 def check_not_spread(settings: Mapping[str, object]) -> None:
     """Refuse to share work on what is loaded already.
 
@@ -107,6 +127,6 @@ def check_not_spread(settings: Mapping[str, object]) -> None:
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
             raise InputError(
-                f"{name}: expected names of objects, models and an objective beside it, which other processes can "
-                "load, got ones that are loaded; give their names or files"
+                f"{name}: expected names of objects, models, controls and an objective beside it, which other "
+                "processes can load, got some that are loaded; give their names or files"
             )

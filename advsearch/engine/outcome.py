@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -20,8 +21,9 @@ from advsearch.engine.pictures import write_artifacts, write_object, write_pictu
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
-from advsearch.engine.rows import lost_remarks, verified_rate
+from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.searches import UNPRINTED
+from advsearch.engine.transport import remark
 from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
@@ -42,6 +44,7 @@ from advsearch.runs.results.attack import (
     FoundValue,
     LinearTransport,
     NotFinite,
+    ObjectiveValues,
     PathSegments,
     PredictionError,
     Printability,
@@ -50,13 +53,15 @@ from advsearch.runs.results.attack import (
     SearchGradients,
     SharedWork,
     SmallestEpsilon,
+    TriedObjective,
     UsualAnswer,
     VerificationSamples,
     VerifiedRate,
 )
 from advsearch.runs.results.base import Formation, MovedValue
 from advsearch.scene.formation import to_8_bit
-from advsearch.tasks.base import typical
+from advsearch.tasks import Judgement
+from advsearch.tasks.base import mean, typical
 from advsearch.viewer.attack_page import write_report
 
 T = TypeVar("T")
@@ -163,7 +168,8 @@ def summarise(
     search = findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
-    spp = max(PICTURE_SPP, findings.sample_count.spp if findings.sample_count else 0)
+    verified = findings.sample_count is not None and not findings.interrupted  # whoever presses Ctrl-C is in a hurry
+    spp = max(PICTURE_SPP, findings.spp) if verified else PICTURE_SPP
     noise = seeds.stream(problem.seed, "pictures")
     stages.progress.stage("making the pictures and the report", hint=f"pictures of {spp} samples a pixel")
     with torch.no_grad():
@@ -242,6 +248,10 @@ def _summary(
         ),
         adversarial=_adversarial(problem, findings, adversarial, u),
         verified=_verified(findings.verification),
+        tried_objective=TriedObjective(
+            clean=_objective_over(findings.clean),
+            answer=_objective_over(findings.verification.adversarial_trials if findings.verification else ()),
+        ),
         baseline=None
         if baseline is None
         else BaselineSearch(
@@ -276,6 +286,15 @@ def _summary(
         seed=problem.seed,
         command_line=asked.command_line,
     )
+
+
+def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
+    """The objective over trials; None where it was not asked for, as in those of an older run."""
+    values = [one.objective for one in trials if one.objective is not None]
+    if not values:
+        return None
+    spread = statistics.pstdev(values) if all(map(math.isfinite, values)) else math.nan
+    return ObjectiveValues(mean=mean(values), deviation=spread, low=min(values), high=max(values))
 
 
 def _printability(problem: Problem, findings: Findings) -> Printability | None:
@@ -321,9 +340,7 @@ def _adversarial(problem: Problem, findings: Findings, picture: Tensor, u: Tenso
 def _control(findings: Findings) -> ControlGroup | None:
     if not findings.clean:
         return None
-    counted = count_right(findings.clean, findings.spp)
-    rate, interval = counted.rate, counted.interval
-    return ControlGroup(correct=counted.successes, trials=counted.trials, rate=rate, interval=interval)
+    return control_group(findings.clean, findings.spp)
 
 
 def _described(problem: Problem, u: Tensor) -> dict[str, DescribedValue]:
@@ -413,8 +430,8 @@ def _average(findings: Findings) -> AverageCase:
         correct=counted.successes,
         accuracy=counted.rate,
         interval=counted.interval,
-        margin=sum(scores) / len(scores),
-        worst_margin=max(scores),
+        margin=mean_number(scores),
+        worst_margin=max((score for score in scores if score == score), default=math.nan),
     )
 
 
@@ -458,12 +475,12 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
 
 def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[str]:
     """What a reader has to know beside the numbers."""
-    remarks = []
+    remarks = [told] if (told := remark(findings.rendered_because)) else []
     count = findings.sample_count
     if count is not None and count.table and not count.converged:
         remarks.append(
-            f"The margin still moved with the sample count at {count.spp} samples a pixel, the most that was tried: "
-            "noise may take part in the verdict."
+            f"It is not shown that the margin stands still at {count.spp} samples a pixel, the most that a check "
+            "takes: noise may take part in the verdict."
         )
     if not_finite := problem.renderer.non_finite + recorder.ahead.non_finite:
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")

@@ -28,16 +28,21 @@ WEIGHT = 10.0
 
 
 def variation(colors: Tensor) -> Tensor:
-    """Return the mean length of the step from a pixel (h, w, 3) to its right and lower neighbours, by channel."""
+    """Return the mean length of the step from a pixel (h, w, 3) to its right and lower neighbours, by channel; of a
+    picture (h, w, 4) only between pixels that its last channel has."""
+    if colors.shape[-1] == 3:
+        colors = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=-1)
     padded = F.pad(colors.permute(2, 0, 1)[None], (0, 1, 0, 1), mode="replicate")[0]
     here = padded[:, :-1, :-1]
-    steps = torch.stack([padded[:, :-1, 1:] - here, padded[:, 1:, :-1] - here])
-    length: Tensor = torch.linalg.vector_norm(steps, dim=0).mean()
+    steps = torch.stack([(one - here)[:3] * one[3:] for one in (padded[:, :-1, 1:], padded[:, 1:, :-1])])
+    length: Tensor = torch.linalg.vector_norm(steps, dim=0)[:, here[3] > 0.0].mean()
     return length
 
 
 def off_print(colors: Tensor) -> Tensor:
-    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest printable colour."""
+    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest printable colour; of a picture
+    (h, w, 4) of those that its last channel has."""
+    colors = colors if colors.shape[-1] == 3 else colors[colors[..., 3] > 0][:, None, :3]
     nearest = (LOW + STEP * ((colors.detach() - LOW) / STEP).round()).clamp(LOW, HIGH)
     distance: Tensor = torch.linalg.vector_norm(colors - nearest, dim=2).mean()
     return distance

@@ -14,6 +14,7 @@ from advsearch.config import AttackConfig
 from advsearch.controls.base import Control
 from advsearch.controls.patch.control import enlarged
 from advsearch.controls.space import file_name
+from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import as_controls, load_scene
 from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import Mask, Piece
@@ -24,7 +25,7 @@ from advsearch.runs.summary import read_result
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.raster import doubled_areas
-from advsearch.scene.surface_map import rasterised
+from advsearch.scene.surface_map import Ints, rasterised
 
 BLEED = 3.0
 """Millimetres of colour beyond the line to cut."""
@@ -65,10 +66,11 @@ def printable(run: str | Path, size: float) -> list[Piece]:
             pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
             given = config.controls.get(control.name, {}).get("size")
             pieces.append(_patch(control.name, pixels, size * _side(control, summary, given)))
-        elif control.kind == "texture" and picture.is_file():
-            mesh = control.mesh_in(scene.description).mesh
+        elif isinstance(control, TextureControl) and picture.is_file():
+            mesh, named = control.mesh_in(scene.description).mesh, control.materials_in(scene.description)
+            faces = None if named is None else np.concatenate([mesh.materials[one] for one in named])
             extent = float(np.ptp(scene.description.object.mesh.vertices, axis=0).max())
-            pieces.extend(_charts(control.name, read_png(picture), mesh, size / extent))
+            pieces.extend(_charts(control.name, read_png(picture), mesh, faces, size / extent))
     if not pieces:
         raise InputError(f"{folder}: it has neither a texture nor a patch, so that there is nothing to print")
     return pieces
@@ -88,16 +90,17 @@ def _patch(name: str, pixels: Floats, side: float) -> Piece:
     return _piece(f"{name}, {side:.1f} mm a side", pixels, (pixel, pixel), None)
 
 
-def _charts(name: str, texture: Floats, mesh: Mesh, scale: float) -> Iterator[Piece]:
-    """Yield the connected parts of a texture as they are seen from outside, the largest first.
+def _charts(name: str, texture: Floats, mesh: Mesh, faces: Ints | None, scale: float) -> Iterator[Piece]:
+    """Yield the connected parts of a texture as they are seen from outside, the largest first; with `faces` those of
+    these faces.
 
     Neighbouring texels of one part lie a distance apart on the surface; the mean over the part, along columns and rows,
     is the size that they get. `scale` is in millimetres a mesh unit.
     """
     areas = doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
-    charts = rasterised(mesh, len(texture))
+    charts = rasterised(mesh, (texture.shape[0], texture.shape[1]))
     places = charts.positions().astype(np.float64)
-    labels, count = ndimage.label(charts.covered)
+    labels, count = ndimage.label(charts.covered & (True if faces is None else np.isin(charts.face, faces)))
     boxes = ndimage.find_objects(labels)
     order = sorted(range(count), key=lambda index: -int((labels[boxes[index]] == index + 1).sum()))
     for number, index in enumerate(order, 1):

@@ -164,9 +164,12 @@ class Problem:
         return self.judge(picture, self.whole(u, seed if drawn else None))
 
     def judge(self, picture: Tensor, whole: Tensor) -> Judgement:
-        """Return what the task says of the model's output for a picture (H, W, 3) of the whole space at `whole`."""
+        """Return what task and objective say of the model's output for a picture (H, W, 3), of the whole space at
+        `whole`."""
         with torch.no_grad():
-            return self.task.judge(self.model(picture), self.truth(whole))[0]
+            output, truth = self.model(picture), self.truth(whole)
+            objective = float(self.objective(output, picture[None], truth)[0])
+            return replace(self.task.judge(output, truth)[0], objective=objective)
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
         """Return what shows the model's answer to a picture (H, W, 3) of the whole space at `whole`."""
@@ -343,7 +346,8 @@ class Problem:
     def _usual(each: Sequence[Judgement]) -> Judgement:
         """The most frequent answer, with the means over all."""
         score, margin = (mean(values) for values in ([one.score for one in each], [one.margin for one in each]))
-        return replace(typical(each), score=score, margin=margin, right=margin <= 0.0)
+        usual = typical(each)
+        return Judgement.of(score, margin, usual.answer, usual.payload)
 
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""

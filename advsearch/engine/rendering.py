@@ -19,6 +19,7 @@ from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
+from advsearch.models.switches import plainly
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked
@@ -30,6 +31,7 @@ from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
 from advsearch.scene.surfaces import Surfaces
+from advsearch.settings import as_python
 from advsearch.tasks import Answer, AnyTask, Facts, Mark, Sight, make_task
 
 MOST_ANSWERS = 5
@@ -47,6 +49,8 @@ class View:
         answers: what the model says, the likeliest first.
         marks: what shows its answer, and what is true, in the picture; empty where words say it all.
         surfaces: what is seen in each pixel; None where nobody asked.
+        output: of the model, for its task.
+        truth: of the scene; None where the task does not depend on what is seen, or nobody says it.
     """
 
     azimuth: float
@@ -55,6 +59,8 @@ class View:
     answers: tuple[Answer, ...]
     marks: tuple[Mark, ...] = ()
     surfaces: Surfaces | None = None
+    output: Any = None
+    truth: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +179,7 @@ class Rendering:
         )
 
 
+@plainly()
 def render(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
@@ -218,12 +225,13 @@ def render(
     instances = as_controls(controls)
     if around is not None and any(_turns(one) for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
-    size = resolution or (model.input_size[0], model.input_size[1])
+    size = as_python(resolution) or (model.input_size[0], model.input_size[1])
     progress = progress or NullProgress()
     progress.stage("rendering", around or 1)
     formation = None
     views = []
     untold: list[str] = []
+    remarks: tuple[str, ...] = ()
     for description in _turned(scene.description, around):
         description = framed(description, size)
         space = compose(instances, description)
@@ -232,22 +240,24 @@ def render(
         with torch.no_grad():
             radiance = renderer.radiance(space.start, seeds.stream(seed, "pictures"), spp)
             picture = to_8_bit(space.picture(space.start, formation.display(radiance)))
-            output = model(picture)
-            answers = asked.answers(output, MOST_ANSWERS)[0]
-            marks: tuple[Mark, ...] = ()
+            output, truth = model(picture), None
             if asked.varies:
                 facts = _facts(description, label, partial(renderer.surfaces, space.start), space.describe(space.start))
                 try:
-                    marks = tuple(asked.marks(output, asked.truth(facts))[0])
+                    truth = asked.truth(facts)
                 except InputError as error:
                     untold = [f"Nothing is drawn into the picture: {error}"]
+            asked = asked.seeing(output, truth)
+            answers = asked.answers(output, MOST_ANSWERS)[0]
+            marks = () if truth is None else tuple(asked.marks(output, truth)[0])
+        remarks = remarks or asked.remarks
         azimuth = description.number("camera.azimuth")
         surfaces = renderer.surfaces(space.start) if aov else None
-        views.append(View(azimuth, picture, radiance * formation.gain, answers, marks, surfaces))
+        views.append(View(azimuth, picture, radiance * formation.gain, answers, marks, surfaces, output, truth))
         progress.advance(1)
     assert formation is not None
     own = scene.description
-    warnings = (*own.notes, *sentences(space.moved), *untold)
+    warnings = (*(space.scene or own).notes, *sentences(space.moved), *untold, *remarks)
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from advsearch.attacks import Trials
-from advsearch.described import Value
+from advsearch.attacks import Trials, count_right
+from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.report.wording import count
-from advsearch.runs.results.attack import VerifiedRate
+from advsearch.runs.results.attack import ControlGroup, VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.tasks import Answer, Judgement
+from advsearch.tasks.base import mean
 
 LOST = "(no answer)"
 """The answer to a picture that nobody could make; what the row keeps beside it says why."""
@@ -55,7 +56,7 @@ def trial_row(
         step=number,
         seed=seed,
         spp=spp,
-        objective=_number(trial.score),
+        objective=_number(trial.objective),
         success=trial.success if sought else None,
         values=values or {},
         **{"renders": 1, **_said(trial), **more},
@@ -70,29 +71,33 @@ def judged(row: Row, judgement: Judgement) -> Row:
 def _said(judgement: Judgement) -> dict[str, Any]:
     answer = judgement.answer
     return {
+        "score": _number(judgement.score),
         "correct": judgement.right,
         "margin": _number(judgement.margin),
-        "label": answer.label,
+        "label": None if judgement.not_a_number else answer.label,
         "label_index": answer.index,
         "probability": answer.probability,
         "payload": judgement.payload,
     }
 
 
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
+def _number(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
 
 
 def judgement_of(row: Row) -> Judgement:
-    """Return what was said of a trial from its row; in an old row, only the score says whether it was right."""
-    score = math.nan if row.objective is None else row.objective
-    margin = math.nan if row.margin is None else row.margin
+    """Return what was said of a trial from its row: nothing where it has no label, for the answer was not a number.
+
+    In an old row, only the score says whether it was right.
+    """
+    score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
     right = score <= 0.0 if row.correct is None else row.correct
-    return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability), row.payload)
+    answer = Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability)
+    return Judgement(score, margin, right, answer, row.payload, row.objective)
 
 
 def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:
-    """Return the rate of a success, with how often each such answer was given and the mean score of the trials."""
+    """Return the rate of a success, how often each such answer was given, and the mean score of what is a number."""
     labels = Counter(trial.answer.label for trial in trials if trial.success)
     return VerifiedRate(
         successes=rate.successes,
@@ -101,5 +106,21 @@ def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:
         interval=rate.interval,
         spp=rate.spp,
         labels=dict(labels.most_common()),
-        margin=sum(trial.score for trial in trials) / len(trials),
+        margin=mean_number(trial.score for trial in trials),
+        not_a_number=sum(trial.not_a_number for trial in trials),
     )
+
+
+def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
+    """Return how many trials of the clean scene are right."""
+    counted, nothing = count_right(trials, spp), sum(trial.not_a_number for trial in trials)
+    rate, interval = counted.rate, counted.interval
+    return ControlGroup(
+        correct=counted.successes, trials=counted.trials, rate=rate, interval=interval, not_a_number=nothing
+    )
+
+
+def mean_number(values: Iterable[float]) -> float:
+    """Return the mean of those that are numbers; NaN where none is."""
+    numbers = [value for value in values if not math.isnan(value)]
+    return mean(numbers) if numbers else math.nan

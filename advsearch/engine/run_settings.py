@@ -8,7 +8,7 @@ from typing import Any
 
 from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
 from advsearch.controls.values import is_number
-from advsearch.engine.loading import Controls, as_controls, settings_of
+from advsearch.engine.loading import Controls, as_controls, lent_control, settings_of
 from advsearch.errors import InputError, UnknownNameError
 
 
@@ -36,18 +36,21 @@ class RunSettings:
         Raises:
             InputError: an instance takes a setting that is given here.
         """
+        ready: tuple[Control, ...] = ()
         if not isinstance(controls, (str, Mapping)):
-            for one in (one for one in controls if isinstance(one, Control)):
-                for choice in _counting(type(one), one.settings()):
-                    if choice.run_setting and getattr(self, choice.run_setting) is not None:
-                        raise InputError(
-                            f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
-                            f"{type(one).__name__}({choice.name}=...)"
-                        )
-            if all(isinstance(one, Control) for one in controls):
-                return as_controls(controls)
+            controls = [controls] if isinstance(controls, Control) else list(controls)
+            as_controls(controls)  # refuses what is none
+            ready = tuple(one for one in controls if isinstance(one, Control))
+            controls = [one for one in controls if isinstance(one, str)]
         named = settings_of(controls)
-        return as_controls({asked: {**self._taken(asked, given), **given} for asked, given in named.items()})
+        for one in (*ready, *(lent for lent in map(lent_control, named) if lent)):
+            for choice in _counting(type(one), one.settings()):
+                if choice.run_setting and getattr(self, choice.run_setting) is not None:
+                    raise InputError(
+                        f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
+                        f"{type(one).__name__}({choice.name}=...)"
+                    )
+        return ready + as_controls({asked: {**self._taken(asked, given), **given} for asked, given in named.items()})
 
     def _taken(self, asked: str, given: Mapping[str, object]) -> dict[str, object]:
         """What one control takes, by the names of its own settings."""

@@ -30,7 +30,7 @@ from advsearch.engine.memory import TRANSPORT, Frames, Memory
 from advsearch.engine.print_terms import less_print_terms, penalised
 from advsearch.engine.problem import OnImage, Problem
 from advsearch.engine.record import Findings, Recorder, Stages
-from advsearch.engine.transport import CleanMatrix, Transport, reason_against
+from advsearch.engine.transport import CleanMatrix, Transport, reason_against, remark
 from advsearch.report.wording import count
 from advsearch.scene.transport.renderer import TransportTooLargeError
 
@@ -67,7 +67,7 @@ class Searches:
     def collect_transport(self) -> None:
         """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
         problem, steps, findings = self.problem, self.budget.steps, self.findings
-        findings.rendered_because = reason_against(problem, steps, self.specialise) or ""
+        self._renders_because(reason_against(problem, steps, self.specialise) or "")
         if findings.rendered_because:
             return
         stored, keep = self.memory.note(TRANSPORT), partial(self.memory.set_note, TRANSPORT)
@@ -80,7 +80,14 @@ class Searches:
         try:
             findings.transport.prepare(self.stages.progress.advance)
         except TransportTooLargeError as error:
-            findings.transport, findings.rendered_because = None, str(error)
+            findings.transport = None
+            self._renders_because(str(error))
+
+    def _renders_because(self, reason: str) -> None:
+        """Keep why the search renders, and say so where that needn't be."""
+        self.findings.rendered_because = reason
+        if told := remark(reason):
+            self.stages.progress.message(told)
 
     def run(self) -> None:
         """The search, the same without print terms where it has them, and the random one, each with as many renders."""

@@ -34,6 +34,7 @@ def find_smallest(searches: Searches, verifier: Verifier) -> None:
         kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
         ranked = transport is None  # what is predicted has no noise
         results.append(searches.search(kind, searches.policy, budget.steps, seed, domain=inside, ranked=ranked))
+        findings.search = findings.search or results[0]  # the answer if this is interrupted
         verifier.begin("trying smaller changes", MOST_CHECKS * budget.trials, at_most=True)
         return results[-1].best_u
 
@@ -47,6 +48,8 @@ def find_smallest(searches: Searches, verifier: Verifier) -> None:
             verifier.stages.progress.advance(1)
         if transport is not None:
             transport.correct(u, scores)
+        if failures <= allowed:
+            findings.search = replace(results[-1], best_u=u)
         return failures <= allowed
 
     def seems(u: Tensor, check: int) -> bool:

@@ -6,12 +6,15 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from torch import Tensor
+
 from advsearch import seeds
 from advsearch.attacks import Ending, Policy, SearchResult, Verification, count_right, run_trials
 from advsearch.attacks.smallest import scaled
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
 from advsearch.engine.budget import Preparation, RenderBudget
 from advsearch.engine.failures import check_failures
+from advsearch.engine.going_on import finite, same
 from advsearch.engine.gradients import inside
 from advsearch.engine.memory import PLAN, Memory
 from advsearch.engine.planning import cosine_samples, cosines, measured_plan, plan_gradients, tuned
@@ -23,6 +26,10 @@ from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.engine.verifier import Verifier
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
+from advsearch.tasks import Judgement
+
+LOOK, LOOKED_AT = "first look", ("score", "margin", "objective")
+"""The note of what the model and the objective said of the first look, and of what it consists for each picture."""
 
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
@@ -166,6 +173,7 @@ class Attack:
             trials=FIRST_LOOK,
             on_trial=lambda *_: self._advance(),
         )
+        self._check_look(start)
         looks_right = any(trial.right for trial in findings.first_look)
         if not self.problem.rule.control or (looks_right and not budget.smallest):
             return True
@@ -173,6 +181,24 @@ class Attack:
         self._verifier.begin("checking the clean scene with fresh renders", budget.trials)
         self._verifier.try_clean()
         return not self.problem.rule.already_wrong(count_right(findings.clean, findings.spp))
+
+    def _check_look(self, start: Tensor) -> None:
+        """Note what was seen, or refuse to go on with a model or an objective that says something else of the same
+        pictures than it did. One that says something else each time can't be told by it.
+
+        Raises:
+            InputError: it does.
+        """
+        now = [_values(one) for one in self.findings.first_look]
+        before = self.memory.note(LOOK)
+        if before is None:
+            self.memory.set_note(LOOK, now)
+            return
+        if all(map(same, before, now)):
+            return
+        seed = seeds.stream(seeds.stream(self.problem.seed, "first look"), "verification", 0)
+        if same(_values(self.problem.trial(start, seed, self._asked_spp)), now[0]):
+            raise self.memory.other_answers(dict(zip(LOOKED_AT, zip(before[0], now[0], strict=True), strict=True)))
 
     def _advance(self, steps: int = 1) -> None:
         self.stages.progress.advance(steps)
@@ -192,7 +218,7 @@ class Attack:
             raise RuntimeError("nothing was searched, so there is nothing to verify")
         answer = problem.domain.project(found.best_u)
         if not self.budget.smallest or findings.sample_count is None:
-            self._verifier.choose_spp({"clean": problem.domain.start, "adversarial": answer})
+            self._verifier.choose_spp({"adversarial": answer, "clean": problem.domain.start})
         groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
         self._verifier.begin("checking the answer with fresh renders", groups * self.budget.trials, at_most=True)
         self._verifier.try_clean()
@@ -225,6 +251,10 @@ class Attack:
             success_rate=baseline.success_rate,
             distribution=None,
         )
+
+
+def _values(trial: Judgement) -> list[float | None]:
+    return [finite(getattr(trial, name)) for name in LOOKED_AT]
 
 
 def _rank(verification: Verification) -> tuple[bool, int, float]:

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from advsearch.attacks import Verification, count_right
+from advsearch.attacks import Verification
 from advsearch.engine.ahead import Ahead
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, Retrials
-from advsearch.engine.rows import verified_rate
+from advsearch.engine.rows import control_group, verified_rate
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import ControlGroup
 from advsearch.runs.results.matrix import MatrixCell, MatrixModel
 
 
@@ -65,15 +64,13 @@ class Transfer:
         self._progress.stage(title, self._each, hint=f"{self._each} answers; `trials` or `verify_spp` shorten it")
 
     def _control(self, one: RetrialCondition) -> MatrixModel:
-        trials, problem = count_right(self._retrials.clean(one), one.spp), one.problem
+        problem = one.problem
         return MatrixModel(
             model=one.name,
             labels=list(problem.task.truth_names(problem.truth())),
             input_size=_size(problem),
             spp=one.spp,
-            clean=ControlGroup(
-                correct=trials.successes, trials=trials.trials, rate=trials.rate, interval=trials.interval
-            ),
+            clean=control_group(self._retrials.clean(one), one.spp),
         )
 
 

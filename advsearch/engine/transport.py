@@ -24,8 +24,8 @@ from advsearch.engine.problem import OnImage, Problem
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import BasisRenderer
-from advsearch.scene.transport.plan import lights_to_collect, predicting, samples_to_collect, why_not
-from advsearch.scene.transport.renderer import PredictingRenderer
+from advsearch.scene.transport.plan import HAZE, NOISE, lights_to_collect, predicting, samples_to_collect, why_not
+from advsearch.scene.transport.renderer import TOO_LARGE, PredictingRenderer
 
 WORTH = 16
 """Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
@@ -48,6 +48,12 @@ FEWEST_SCORES = 4
 """Trials whose spread says something."""
 SPREAD = 1.64
 """Standard deviations under their mean above which 19 of 20 scores lie."""
+AVOIDABLE = {
+    HAZE: "leave the haze out",
+    NOISE: "`denoise=oidn` takes the noise out",
+    TOO_LARGE: "take a lower `resolution` or texture resolution, or set ADVSEARCH_LIMITS=2 where memory allows it",
+}
+"""Reasons to render that cost much, and what a user can do instead."""
 Tick = Callable[[int], None]
 Judged = float | Tensor
 
@@ -100,6 +106,13 @@ def reason_against(problem: Problem, steps: int, specialise: bool) -> str | None
         worth = WORTH_A_LIGHT * lights_to_collect(problem.renderer)
         return f"basis pictures pay from {worth} evaluations on" if steps < worth else None
     return reason
+
+
+def remark(reason: str) -> str:
+    """Return what a user should know of a search that renders for a reason; empty where it has to."""
+    instead = next((what for why, what in AVOIDABLE.items() if reason.startswith(why)), "")
+    costs = "Each step of the search is rendered, which takes several times as long as predicting it"
+    return f"{costs}: {reason}; {instead}." if instead else ""
 
 
 def _varying(problem: Problem) -> list[str]:

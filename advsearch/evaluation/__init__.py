@@ -1,1 +1,1 @@
-"""Studies of the tool itself: how its reference model is made and how good it is."""
+"""Studies of the tool itself: error against run time, extreme cases, and what leaving things out brings."""

@@ -28,6 +28,17 @@ background first and the numbers that its authors gave, of which 11 have no clas
 `voc` has the background first."""
 
 
+NOTHING = frozenset(
+    "background bg noobject noobj noclass nothing none null void n/a n.a. unlabeled unlabelled unused ??? ∅".split()
+)
+"""Names of classes that stand for no thing, without blanks, hyphens and underscores; "none of the above" is a thing."""
+
+
+def names_nothing(name: str) -> bool:
+    """Whether a class of that name stands for no thing: background, "no object", a number that nothing has."""
+    return re.sub(r"[\s_<>()\[\]-]+", "", name.casefold()) in NOTHING
+
+
 @dataclass(frozen=True)
 class LabelSet:
     """The classes that count as right for one object ("coffee mug" and "cup" may both be).

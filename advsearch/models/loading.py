@@ -19,6 +19,7 @@ from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
 from advsearch.models.source import Source, source_of
+from advsearch.models.switches import called_under, plainly, turned_by_code
 from advsearch.models.zoo import timm, torchvision, transformers
 from advsearch.registry import Registry
 
@@ -39,6 +40,7 @@ FORMS = (
 )
 
 
+@plainly()
 def load_model(
     spec: str | os.PathLike[str] | nn.Module | Model,
     *,
@@ -61,7 +63,7 @@ def load_model(
         spec: ``"reference"`` (the bundled classifier), with ``"@weights.safetensors"`` if wanted; a path to a
             `torch.export` archive (.pt2) or to TorchScript; ``"package.module:callable"``, which returns an `nn.Module`
             or a `Model`, with ``"@weights.safetensors"`` if wanted; ``"torchvision:NAME@weights.safetensors"``; an
-            `nn.Module` (copied, its weights shared); a `Model`.
+            `nn.Module` (copied, its weights shared, unless they were made in `torch.inference_mode`); a `Model`.
         labels: the label names in index order, or a label file (see `read_labels`). Default "class 0", "class 1", ...
         name: what to call it in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.
@@ -93,10 +95,27 @@ def load_model(
         "max_batch": max_batch,
     }
     given = {key: value for key, value in options.items() if value is not None}
+    if isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None:
+        return dataclasses.replace(_loaded(spec, given, labels, name, max_batch, read), asked=os.fspath(spec))
+    return _loaded(spec, given, labels, name, max_batch, read)
+
+
+def _loaded(
+    spec: object,
+    given: Mapping[str, object],
+    labels: Any,
+    name: str | None,
+    max_batch: int | None,
+    read: Read | None,
+) -> Model:
     names, origin = _given_labels(labels)  # first, because loading a model takes seconds
     found = _find(spec)
+    switches = turned_by_code()
+    if isinstance(found, Source) and isinstance(found.module, nn.Module):
+        called_under(found.module, switches)
     if isinstance(found, Model):
         found = dataclasses.replace(found, read=read or found.read)
+        found = found if names is None and name is None else dataclasses.replace(found, asked=None)
         return _relabelled(found, names, origin, name, given)
     low, high = found.batch_limits
     bare = Model(

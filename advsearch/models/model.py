@@ -54,6 +54,7 @@ class Model:
         device: where the network lives. Images go there, the output comes back.
         read: from what the network answers to so many images, to its output: a tensor (N, ...), or a list with one
             thing for each; None for logits.
+        asked: what `load_model` was given, where that says all of it; None for what exists in this session only.
     """
 
     module: Callable[[Tensor], Any] = field(repr=False)
@@ -67,6 +68,7 @@ class Model:
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
     read: Read | None = field(default=None, repr=False)
+    asked: str | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         height, width = self.input_size
@@ -121,9 +123,11 @@ class Model:
 
     def ask(self, x: Tensor) -> Any:
         """Return the output for a batch as `batches` yields it."""
+        with torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
+            answer = self.module(x)
         if self.read is not None:
-            return read_by(self.read, self.module(x), len(x), self.name)
-        logits = logits_of(self.module(x), len(x), self.classes, self.name)
+            return read_by(self.read, answer, len(x), self.name)
+        logits = logits_of(answer, len(x), self.classes, self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
 
 

@@ -19,8 +19,20 @@ from advsearch.models.model import Model, ModelWarning, each_tensor, logits_of, 
 #: Rows that are non-negative and sum to 1 within this are taken for probabilities.
 PROBABILITY_TOLERANCE = 1e-3
 
+#: Rows that are non-negative and sum to 100 within this share of it are taken for percentages.
+PERCENT_TOLERANCE = 5e-3
+
+ODD_ADVICE = (
+    "They are taken for logits: the probabilities that are shown are none, and margins are differences of such scores. "
+    "Return what stands before the last function"
+)
+
 #: Two answers are the same if they differ by less than this times the largest logit (float32 kernels differ by 1e-6).
 REPEAT_TOLERANCE = 1e-3
+
+ROUNDING = 4.0
+"""Steps between neighbouring numbers of the network's type by which its pictures are changed at least, and answers may
+differ: a network in bfloat16 tells 0.50 from 0.51 and no less."""
 
 STEP = 1e-3
 """Change of each value of an image, in [0, 1], along the gradient that is checked."""
@@ -72,10 +84,12 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             "check its weights and the value range and normalisation that it expects"
         )
     found = fitting_labels(rows.shape[1], labels, labels_source, model.name) if logits else labels or ()
-    probabilities = logits and _probabilities(rows)
+    percentages = logits and _probabilities(rows / 100.0, PERCENT_TOLERANCE)
+    probabilities = logits and (percentages or _probabilities(rows))
     if probabilities:
+        kind = "percentages that sum to 100" if percentages else "probabilities"
         _warn(
-            f"model {model.name} answers with probabilities. Their logarithm is used, so that margins are log-odds, "
+            f"model {model.name} answers with {kind}. Their logarithm is used, so that margins are log-odds, "
             "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
         )
     if not logits and _pixel_probabilities(model, noise):
@@ -83,7 +97,9 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             f"model {model.name} answers with probabilities for each pixel: margins are differences of these and no "
             "log-odds, and gradients vanish where one rounds to 0 or 1: remove the final softmax if you can"
         )
-    repeatable = _same(rows[:1], again)
+    repeatable = _same(model, rows[:1], again)
+    if repeatable and logits and not probabilities and (odd := _odd_scores(model, rows)):
+        _warn(f"model {model.name} answers with {odd}. {ODD_ADVICE}")
     if not repeatable:
         _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
     return dataclasses.replace(
@@ -125,7 +141,8 @@ def _answer(model: Model, images: Tensor) -> tuple[Any, int]:
     """Return what the network gives for images (N, H, W, 3), and for how many: no fewer than it takes at once."""
     padded = torch.cat([images, images[-1:].expand(max(model.batch_limits[0] - len(images), 0), -1, -1, -1)])
     x = model.preprocessing(padded.to(model.device)).to(model.dtype)
-    return _guarded(model, lambda: model.module(x)), len(padded)
+    with torch.set_grad_enabled(torch.is_grad_enabled()):
+        return _guarded(model, lambda: model.module(x)), len(padded)
 
 
 def _numbers(output: Any) -> Tensor:
@@ -161,9 +178,26 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
         ) from error
 
 
-def _probabilities(rows: Tensor) -> bool:
+def _probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:
     sums = rows.sum(dim=1)
-    return bool((rows >= 0).all()) and bool(((sums - 1).abs() < PROBABILITY_TOLERANCE).all())
+    return bool((rows >= 0).all()) and bool(((sums - 1).abs() < tolerance).all())
+
+
+def _odd_scores(model: Model, rows: Tensor) -> str:
+    """What rows of scores (N, classes) are that are neither logits nor probabilities; empty of others.
+
+    A black picture tells a sigmoid from means of the picture, which are 0 there.
+    """
+    least = float(rows.min())
+    if least >= 0.0 and float(rows.max()) <= 1.0:
+        with torch.no_grad():
+            black = _run(model, torch.zeros(1, *model.input_size, 3))
+        rows = torch.cat([rows, black])
+    if 0.0 <= float(rows.min()) and float(rows.max()) <= 1.0 and bool(rows.any(dim=1).all()):
+        return "scores in [0, 1] that do not sum to 1, as after a sigmoid for each class"
+    if least >= 0.0 and bool(((torch.exp(-rows).sum(dim=1) - 1.0).abs() < PROBABILITY_TOLERANCE).all()):
+        return "costs, of which the least is meant: minus the logarithm of probabilities"
+    return ""
 
 
 def _pixel_probabilities(model: Model, images: Tensor) -> bool:
@@ -176,8 +210,9 @@ def _pixel_probabilities(model: Model, images: Tensor) -> bool:
     return _probabilities(output.movedim(1, -1).reshape(-1, output.shape[1]))
 
 
-def _same(a: Tensor, b: Tensor) -> bool:
-    return bool((a - b).abs().amax() <= REPEAT_TOLERANCE * a.abs().amax().clamp_min(1e-6))
+def _same(model: Model, a: Tensor, b: Tensor) -> bool:
+    tolerance = max(REPEAT_TOLERANCE, ROUNDING * torch.finfo(model.dtype).eps)
+    return bool((a - b).abs().amax() <= tolerance * a.abs().amax().clamp_min(1e-6))
 
 
 def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int, int]:
@@ -190,7 +225,7 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
             together = _run(model, pair)
     except ModelError:
         return 1, 1
-    if rows is not None and not _same(rows, together):
+    if rows is not None and not _same(model, rows, together):
         _warn(
             f"model {model.name} answers an image differently in a batch: was it exported in training mode? "
             "Call .eval() before exporting"
@@ -220,7 +255,7 @@ def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
 
 def _check_gradient(model: Model, images: Tensor, gradient: Tensor, weights: Tensor) -> None:
     """Warn if a network's answers do not move as its gradient says: it is masked, or not of this network."""
-    step = STEP * gradient.sign()
+    step = max(STEP, ROUNDING * torch.finfo(model.dtype).eps) * gradient.sign()
     ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
     with torch.no_grad():
         answers = [_run(model, end) for end in ends]

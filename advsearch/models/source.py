@@ -90,10 +90,17 @@ def frozen(module: nn.Module, name: str) -> nn.Module:
 
 
 def sharing_copy(module: nn.Module) -> nn.Module:
-    """Return a copy that has the same weights, but gradients of its own."""
-    memo: dict[int, Any] = {id(p): nn.Parameter(p.detach(), p.requires_grad) for p in module.parameters()}
-    memo.update({id(buffer): buffer for buffer in module.buffers()})
+    """Return a copy that has the same weights, but gradients of its own.
+
+    Weights that were made in `torch.inference_mode` are copied: nothing can be differentiated through them.
+    """
+    memo: dict[int, Any] = {id(p): nn.Parameter(_usable(p.detach()), p.requires_grad) for p in module.parameters()}
+    memo.update({id(buffer): _usable(buffer) for buffer in module.buffers()})
     return copy.deepcopy(module, memo)
+
+
+def _usable(weights: torch.Tensor) -> torch.Tensor:
+    return weights.clone() if weights.is_inference() else weights
 
 
 def load_weights(module: nn.Module, path: Path, name: str) -> None:

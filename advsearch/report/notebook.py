@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from advsearch.report import wording
 from advsearch.report.drawing import Figures
 from advsearch.report.markup import Html, element, join
-from advsearch.report.phrases import cells, percent
+from advsearch.report.phrases import beside_text, cells, percent
 from advsearch.report.studies import sweep_figure
 from advsearch.runs.images import png_bytes
 from advsearch.runs.results.attack import AttackSummary, VerifiedRate
@@ -43,7 +43,9 @@ def attack_html(summary: AttackSummary, pictures: Mapping[str, ArrayLike]) -> st
     ]
     rows = [["", "answer", "probability", "rate", "95 % interval"]]
     success, control = wording.success(summary), summary.clean.control
-    rate = _rate("right", control.correct, control.trials, control.interval) if control else ["", ""]
+    rate = (
+        _rate("right", control.correct, control.trials, control.interval, control.not_a_number) if control else ["", ""]
+    )
     rows.append(["clean", *cells(summary.task, summary.clean), *rate])
     if summary.adversarial:
         rows.append(["adversarial", *cells(summary.task, summary.adversarial), *_verified(success, summary.verified)])
@@ -56,6 +58,7 @@ def sweep_html(summary: SweepSummary) -> str:
     """Return a sweep's accuracy, its map, and the accuracy of every value of every axis."""
     if not summary.configurations:
         return element("p", "No configuration was looked at.")
+    compared = [beside_text(summary.beside.answer, one) for one in summary.beside.pairs] if summary.beside else []
     total = f"Right in {summary.correct} of {summary.configurations} configurations"
     rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
     figure = sweep_figure(summary)
@@ -64,7 +67,9 @@ def sweep_html(summary: SweepSummary) -> str:
         mine = [row for row in summary.axes if row.axis == name]
         rows += [axis_cells(row) for row in mine] if len(mine) <= MOST_ROWS else []
     drawn = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
-    return element("div", element("p", f"{total} ({rate})."), drawn, _table(rows) if len(rows) > 1 else None)
+    return element(
+        "div", element("p", " ".join(compared) or f"{total} ({rate})."), drawn, _table(rows) if len(rows) > 1 else None
+    )
 
 
 def study_html(said: str, figure: Figures, tables: Sequence[Sequence[Sequence[str]]]) -> str:
@@ -90,11 +95,11 @@ def axis_cells(row: AxisRow) -> list[str]:
 
 
 def _verified(what: str, rated: VerifiedRate | None) -> list[str]:
-    return _rate(what, rated.successes, rated.trials, rated.interval) if rated else ["", ""]
+    return _rate(what, rated.successes, rated.trials, rated.interval, rated.not_a_number) if rated else ["", ""]
 
 
-def _rate(what: str, number: int, trials: int, interval: Interval) -> list[str]:
-    return [f"{what} in {number} of {trials}", wording.interval_text(interval)]
+def _rate(what: str, number: int, trials: int, interval: Interval, not_a_number: int = 0) -> list[str]:
+    return [wording.tally(what, number, trials, not_a_number), wording.interval_text(interval)]
 
 
 def _picture(png: bytes, width: int, alt: str) -> Html:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
+
+from advsearch.described import NOT_A_NUMBER
 
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
 """Tasks whose answers have words of their own; others are quoted."""
@@ -63,9 +65,32 @@ def with_article(name: str) -> str:
     return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
 
 
+def beside_text(answer: str, pair: Any) -> str:
+    """Return what a model does without and with the answer of a run (`PairedRates`), in sentences."""
+    sides = [
+        f"{one.correct} of {one.configurations} ({percent(one.accuracy)}, 95 % interval "
+        f"{percent_number(one.interval[0])}-{percent_number(one.interval[1])} %)"
+        for one in (pair.clean, pair.answer)
+    ]
+    low, high = (100.0 * end for end in pair.interval)
+    ends = f"{-high:.0f} to {-low:.0f}" if pair.difference < 0 else f"{low:.0f} to {high:.0f}"
+    shown = "" if low > 0.0 or high < 0.0 else "; that there is a difference is not shown"
+    return (
+        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} with the answer of {answer}: "
+        f"{abs(100.0 * pair.difference):.0f} points {'fewer' if pair.difference < 0 else 'more'} (95 % interval of "
+        f"pairs {ends}){shown}. Right in the clean one alone are {pair.clean_only} pairs, with the answer alone "
+        f"{pair.answer_only}."
+    )
+
+
 def margin_text(task: str) -> str:
     """Return what the margin of a task is, as a clause."""
     return _MARGINS.get(task, "over 0 where the answer is wrong")
+
+
+def is_command(text: str) -> bool:
+    """Whether what a result says of asking the same again is a command; otherwise it says why there is none."""
+    return not text or text.startswith("advsearch ")
 
 
 def objective_label(objective: str) -> str:
@@ -97,6 +122,8 @@ def cells(task: str, answer: Said) -> list[str]:
 def answer_text(task: str, answer: Said) -> str:
     """Return an answer on one line: ``vase, 91 %``, ``no cup found (best 0.12)``."""
     label, number = cells(task, answer)
+    if task == SEGMENTATION and number and label.startswith(_NONE):
+        return f"{label} found, accuracy over the object's pixels {percent(answer.probability)}"
     if task == SEGMENTATION and number:
         return f"accuracy over the object's pixels {percent(answer.probability)}, most often {label}"
     if task == DETECTION and number:
@@ -106,6 +133,10 @@ def answer_text(task: str, answer: Said) -> str:
 
 def calls(task: str, thing: str, label: str) -> str:
     """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
+    if label == NOT_A_NUMBER:
+        return f"answers nothing for {thing}, for its answer is not a number"
+    if task == SEGMENTATION and label.startswith(_NONE):
+        return f"finds {label}"
     if task == CLASSIFICATION:
         return f"calls {thing} {with_article(label)}"
     if task == DETECTION:
@@ -115,6 +146,8 @@ def calls(task: str, thing: str, label: str) -> str:
 
 def calling(task: str, label: str) -> str:
     """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
+    if task == SEGMENTATION and label.startswith(_NONE):
+        return f"finding {label}"
     if task == CLASSIFICATION:
         return f"calling it {with_article(label)}"
     if task == DETECTION:

@@ -37,7 +37,9 @@ SQUARE = 50.0
 RULER = 100.0
 MARK, AWAY = 5.0, 1.0
 """Length of a mark where to cut, and its distance from the bleed, millimetres."""
-MOST_PAGES = 200
+MOST_SHEETS = 200
+"""Sheets that are written unless more are asked for."""
+SHEETS_EVER = 10_000
 LARGEST_PROFILE = 16 << 20
 
 
@@ -85,7 +87,13 @@ class Placed:
 
 
 def write_sheets(
-    path: Path, pieces: Sequence[Piece], title: str, *, paper: str = "a4", profile: Path | None = None
+    path: Path,
+    pieces: Sequence[Piece],
+    title: str,
+    *,
+    paper: str = "a4",
+    profile: Path | None = None,
+    most: int = MOST_SHEETS,
 ) -> int:
     """Write the PDF and return how many pages it has.
 
@@ -95,15 +103,23 @@ def write_sheets(
         title: of the first page.
         paper: one of `PAPERS`.
         profile: an ICC profile of an RGB printer, into which the colours are converted; None leaves them sRGB.
+        most: sheets that may follow the first page, 1 to `SHEETS_EVER`.
 
     Raises:
-        InputError: there is no such paper, or there would be more than `MOST_PAGES` pages.
+        InputError: there is no such paper, or there would be more sheets; the message says how many.
         FileFormatError: the profile is none of an RGB printer.
     """
     if paper not in PAPERS:
         raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
+    if not 1 <= most <= SHEETS_EVER:
+        raise InputError(f"sheets: expected a whole number from 1 to {SHEETS_EVER}, got {most}")
     convert = None if profile is None else _conversion(profile)
     pages = list(pages_of(pieces, PAPERS[paper]))
+    if len(pages) > most:
+        raise InputError(
+            f"sheets: it takes {len(pages)} sheets of {paper}, and up to {most} are written; say that so many are "
+            f"wanted (`sheets={len(pages)}`), or give a larger `paper` or a smaller `size`"
+        )
     with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
         file.savefig(_cover(pieces, title, PAPERS[paper], len(pages), profile))
         for number, page in enumerate(pages, 1):
@@ -115,14 +131,13 @@ def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[li
     """Yield what is on each page: rows of parts, the highest first, from the upper left.
 
     Raises:
-        InputError: it would take more than `MOST_PAGES` pages.
+        InputError: a pixel is larger than a page, or there would be more than `SHEETS_EVER` pages.
     """
     width, height = paper[0] - 2 * MARGIN, paper[1] - 2 * MARGIN - FOOT
     parts = [part for piece in pieces for part in _parts(piece, width, height)]
     parts.sort(key=lambda part: -_extent(part)[1])
     page: list[Placed] = []
     x = y = row = 0.0
-    count = 1
     for part in parts:
         across, down = _extent(part)
         if x + across > width and x > 0.0:
@@ -130,9 +145,6 @@ def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[li
         if y + down > height and page:
             yield page
             page, x, y, row = [], 0.0, 0.0, 0.0
-            count += 1
-            if count > MOST_PAGES:
-                raise InputError(f"size: it would take more than {MOST_PAGES} sheets; give a smaller one")
         frame = _frame(part.piece)
         page.append(Placed(part.piece, part.name, part.trim, MARGIN + x + frame[0], MARGIN + y + frame[1]))
         x, row = x + across, max(row, down)
@@ -147,6 +159,8 @@ def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
     columns = _cuts(wide, (width - 2 * frame[0]) / piece.pixel[0])
     rows = _cuts(high, (height - 2 * frame[1]) / piece.pixel[1])
     several = len(columns) * len(rows) > 1
+    if len(columns) * len(rows) > SHEETS_EVER:
+        raise InputError(f"size: it would take more than {SHEETS_EVER} sheets; give a smaller one")
     for i, (y0, y1) in enumerate(rows):
         for j, (x0, x1) in enumerate(columns):
             name = f"{piece.name}, row {i + 1} of {len(rows)}, column {j + 1} of {len(columns)}"
@@ -155,8 +169,8 @@ def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
 
 def _cuts(length: int, most: float) -> list[tuple[int, int]]:
     """Cut so many pixels into equal parts of at most so many; the first and the end of each."""
-    if most < 1.0 or length / most > MOST_PAGES:
-        raise InputError(f"size: it would take more than {MOST_PAGES} sheets; give a smaller one")
+    if most < 1.0:
+        raise InputError("size: a pixel of it is larger than a sheet; give a smaller one, or a larger `paper`")
     count = math.ceil(length / math.floor(most))
     ends = [round(length * number / count) for number in range(count + 1)]
     return list(itertools.pairwise(ends))

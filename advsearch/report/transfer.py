@@ -33,7 +33,8 @@ def matrix_rows(result: MatrixResult) -> list[list[str]]:
     rows = []
     if result.tested:
         clean = [one.clean for one in result.tested]
-        right = [f"right {one.correct}/{one.trials}, {wording.interval_text(one.interval)}" for one in clean]
+        counts = [f"right {one.correct}/{one.trials}{wording.no_numbers(one.not_a_number)}" for one in clean]
+        right = [f"{n}, {wording.interval_text(one.interval)}" for n, one in zip(counts, clean, strict=True)]
         rows.append(["clean scene", "", *right])
     for row in result.table:
         rows.append([wording.short_name(row.attacked), row.ending, *map(_cell, row.tested)])
@@ -43,4 +44,5 @@ def matrix_rows(result: MatrixResult) -> list[list[str]]:
 def _cell(cell: MatrixCell) -> str:
     rated = cell.verified
     mark = " *" if cell.ending == "found" else " (wrong already)" if cell.ending == "already wrong" else ""
-    return f"{rated.successes}/{rated.trials}, {wording.interval_text(rated.interval)}{mark}"
+    rate = f"{rated.successes}/{rated.trials}{wording.no_numbers(rated.not_a_number)}"
+    return f"{rate}, {wording.interval_text(rated.interval)}{mark}"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.report.phrases import (
     CLASSIFICATION,
+    SUCCESS_ABOVE_ZERO,
     calling,
     calls,
     margin_text,
@@ -16,7 +17,6 @@ from advsearch.report.phrases import (
     wanted,
     with_article,
 )
-from advsearch.settings import split_names
 
 if TYPE_CHECKING:
     from advsearch.runs.results.attack import AttackSummary, SharedWork, VerifiedRate
@@ -42,6 +42,9 @@ def verdict(summary: AttackSummary) -> str:
     if ending == "already wrong":
         wrong = calls(summary.task, thing, summary.clean.label)
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
+    if verified is None and ending == "interrupted" and summary.adversarial:
+        says = calls(summary.task, thing, summary.adversarial.label)
+        return f"Interrupted after {count(summary.steps, 'step')}. The answer so far is not verified: the model {says}."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
     rate = rate_text(verified) + _each(summary)
@@ -63,7 +66,8 @@ def remarks(summary: AttackSummary) -> list[str]:
     missed = control.trials - control.correct if control else 0
     if control and missed and summary.ending != "already wrong" and not summary.minimises:
         apart = " They do not count." if summary.over else ""
-        said.append(f"The clean scene itself fails {missed} of its {control.trials} trials.{apart}")
+        nothing = f"; in {control.not_a_number} the answer is not a number" if control.not_a_number else ""
+        said.append(f"The clean scene itself fails {missed} of its {control.trials} trials{nothing}.{apart}")
     if summary.answer_from == "random" and own:
         said.append(
             "The random search beside it found a worse configuration than the policy did "
@@ -97,6 +101,19 @@ def goal_text(summary: AttackSummary) -> str:
     return "easier to recognise" if summary.minimises else ""
 
 
+def objective_text(summary: AttackSummary) -> str:
+    """Return what came of an objective that is no margin, over the trials; empty where there is nothing to say."""
+    tried = summary.tried_objective
+    if tried is None or summary.objective in SUCCESS_ABOVE_ZERO:
+        return ""
+    parts = [
+        f"{name} {one.mean:.3g} (from {one.low:.3g} to {one.high:.3g})"
+        for name, one in (("clean", tried.clean), ("answer", tried.answer))
+        if one is not None
+    ]
+    return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
+
+
 def over_text(summary: AttackSummary) -> str:
     """Return what varied by chance: ``camera and environment, drawn anew for every picture``."""
     return f"{' and '.join(summary.over)}, drawn anew for every picture" if summary.over else ""
@@ -122,6 +139,8 @@ def short_name(value: Any) -> str:
 
 def short_names(text: str) -> str:
     """Return the last parts of paths, of one or of several separated by commas: ``a.hdr, studio``."""
+    from advsearch.settings import split_names  # which is too heavy for a help
+
     return ", ".join(map(short_name, split_names(text)))
 
 
@@ -131,8 +150,25 @@ def interval_text(interval: Interval | None) -> str:
 
 
 def rate_text(rated: VerifiedRate) -> str:
-    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``."""
-    return f"{rated.successes} of {rated.trials} fresh renders (95 % interval {interval_text(rated.interval)})"
+    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many answers are not numbers."""
+    nothing = f"in {rated.not_a_number} its answer is not a number" if rated.not_a_number else ""
+    if nothing and not rated.successes:
+        return f"none of {rated.trials} fresh renders: {nothing}"
+    rate = f"{rated.successes} of {rated.trials} fresh renders (95 % interval {interval_text(rated.interval)})"
+    return f"{rate}, and {nothing}" if nothing else rate
+
+
+def no_numbers(count: int) -> str:
+    """Return what a table adds to a rate where answers are not numbers."""
+    return f", {count} not a number" if count else ""
+
+
+def tally(what: str, number: int, trials: int, not_a_number: int = 0) -> str:
+    """Return ``wrong in 20 of 20``; of answers that are not numbers, how many."""
+    nothing = f"not a number in {not_a_number} of {trials}"
+    if not not_a_number:
+        return f"{what} in {number} of {trials}"
+    return f"{what} in {number}, {nothing}" if number else nothing
 
 
 def seconds_text(seconds: Any) -> str:

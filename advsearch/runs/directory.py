@@ -7,8 +7,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
@@ -42,6 +42,9 @@ AOV_FOLDER = "aov"
 
 PARTS = "parts"
 """Runs that a study consists of."""
+
+ONLY_HERE = "only in Python"
+"""The note under which the store keeps, in words, what a run has that no file and no command can name."""
 
 BEGUN_WITH = "settings"
 """The note under which the store keeps what decides the run's numbers, as it was when the run began."""
@@ -190,6 +193,13 @@ class RunDirectory:
             raise
         return opened
 
+    @property
+    def again(self) -> str:
+        """What a person can do instead of going on with it."""
+        if self.store.note(ONLY_HERE) is not None:
+            return "start again where it was asked, in Python"
+        return f"start again with advsearch run {self.path / CONFIG}"
+
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
         before, now = self._begun_with(), config.deciding()
@@ -201,7 +211,7 @@ class RunDirectory:
         if changed:
             raise InputError(
                 f"{self.path}: cannot go on: {', '.join(changed)} now; set it back to what the run began with, or "
-                f"start again with advsearch run {self.path / CONFIG}"
+                f"{self.again}"
             )
 
     def _begun_with(self) -> JsonObject:
@@ -231,14 +241,20 @@ class RunDirectory:
         What decides the numbers is noted in the store too, so that a file that was edited since is noticed.
         """
         self.store.set_note(BEGUN_WITH, json.dumps(config.deciding()))
+        if config.only_here:
+            self.store.set_note(ONLY_HERE, json.dumps(config.only_here))
         self._note_sitting(config)
         return write_text(self.path / CONFIG, config.to_repeat().to_yaml())
 
     def _note_sitting(self, config: Config) -> None:
-        """Note what this sitting is made with, after those before it."""
+        """Note what this sitting is made with, after those before it; refuse files that are other ones now."""
         noted = self.store.noted(made_with.NOTE)
         before = noted if isinstance(noted, list) else []
         now = made_with.made_with(config.plain())
+        if changed := made_with.changed_file([one for one in before if isinstance(one, dict)], now):
+            raise InputError(
+                f"{self.path}: cannot go on: {changed} is another file now than it was; put that back, or {self.again}"
+            )
         if now not in before:
             self.store.set_note(made_with.NOTE, json.dumps([*before, now]))
 
@@ -331,6 +347,41 @@ class RunDirectory:
             self.close()
 
 
+@contextmanager
+def begun(config: Config) -> Iterator[Path | None]:
+    """Make the folder of a new run before anything else is done, so that whatever ends the block can be gone on with.
+
+    Yields its path, closed again: what the block does goes on with it. Where the block raises before anything was
+    evaluated, nothing is left of it. It is None for a run that takes the place of another one, which stays until then.
+
+    Args:
+        config: what the run is carried out with.
+
+    Raises:
+        InputError: as for `RunDirectory.create`.
+    """
+    place, overwrite = config.place
+    if overwrite and place is not None and is_run(run_path(place)):
+        yield None
+        return
+    home = HOME if place is None else run_path(place).parent
+    above = [one for one in (home, *home.parents) if not os.path.exists(one)]
+    with RunDirectory.create_for(config) as run:
+        path = run.path
+    try:
+        yield path
+    except BaseException:
+        try:
+            with suppress(AdvsearchError), RunDirectory.resume(path) as run:
+                run._began = True
+                raise
+            raise
+        finally:
+            with suppress(OSError):
+                for folder in above:
+                    folder.rmdir()
+
+
 def default_name(object_name: str, controls: Iterable[str]) -> str:
     """Return ``mug-texture`` for the object ``mug`` or ``data/mug.obj`` and the control ``texture``: a safe name."""
     words = [Path(object_name).stem, *controls]
@@ -373,6 +424,15 @@ def find_run(run: str | Path) -> Path:
             return folder
     known = (path.name for path in HOME.glob("*") if is_run(path))
     raise UnknownNameError("run", str(run), known, "Give a name in runs/ or the path of a run's folder.")
+
+
+def only_here(path: Path) -> list[str]:
+    """Return what a run has, in words, that existed only in the Python session that asked for it."""
+    if not (path / store.NAME).is_file():
+        return []
+    with store.Store(path / store.NAME, read_only=True) as results:
+        noted = results.noted(ONLY_HERE)
+    return [str(one) for one in noted] if isinstance(noted, list) else []
 
 
 def is_run(path: Path) -> bool:

@@ -28,7 +28,7 @@ FORMATS = ("csv", "json", "parquet")
 
 PAYLOAD = "payload"
 OWN = (
-    *("id", "kind", "step", "seed", "spp", "objective", "success", "correct", "margin"),
+    *("id", "kind", "step", "seed", "spp", "objective", "score", "success", "correct", "margin"),
     *("label", "label_index", "probability", PAYLOAD),
 )
 AFTER = ("renders", "machine", "seconds", "time")

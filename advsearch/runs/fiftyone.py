@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from advsearch.described import Value
+from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, JsonValue, read_bytes
 from advsearch.runs.files import placed_by, replacing, write_bytes, write_text
@@ -162,12 +162,13 @@ def _sample(one: Pictured, number: int, dataset: str, label: str, fields: _Value
     path = f"{DATA}/{one.name}{one.picture.suffix}"
     if not (out / path).exists():
         write_bytes(out / path, read_bytes(one.picture, "a picture of the run", LARGEST), durable=False)
+    said = row.label or NOT_A_NUMBER
     tags: list[JsonValue] = [] if row.correct is None else ["right" if row.correct else "wrong"]
     sample: JsonObject = {
         "_id": _identity(key), "_media_type": "image", "_rand": int(_digest(key)[:8], 16) / 2**32, "filepath": path,
         "tags": tags, "metadata": None, "kind": row.kind, "step": row.step, "correct": row.correct,
         "margin": row.margin, "objective": row.objective, "success": row.success,
-        PREDICTION: _label(key, "Classification", PREDICTION, label=row.label or "", confidence=row.probability),
+        PREDICTION: _label(key, "Classification", PREDICTION, label=said, confidence=row.probability),
     }  # fmt: skip
     boxes = _boxes(one)
     if boxes is not None:

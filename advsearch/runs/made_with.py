@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -26,6 +26,27 @@ def made_with(settings: Mapping[str, object]) -> dict[str, str]:
         with suppress(metadata.PackageNotFoundError):
             facts[name] = metadata.version(name)
     return {**facts, **file_digests(settings)}
+
+
+def changed_file(before: Sequence[Mapping[str, object]], now: Mapping[str, str]) -> str | None:
+    """Return the name of a file that is another one now than in every sitting before; None where all are the same.
+
+    A file may have been moved, so that its name alone tells it. That of a recipe is not read again.
+    """
+
+    def files(facts: Mapping[str, object]) -> dict[str, set[object]]:
+        found: dict[str, set[object]] = {}
+        for path, digest in facts.items():
+            if path not in ("python", *PACKAGES) and Path(path).suffix not in (".yaml", ".yml"):
+                found.setdefault(Path(path).name, set()).add(digest)
+        return found
+
+    seen = [files(one) for one in before]
+    for name, digests in files(now).items():
+        known = set().union(*(one[name] for one in seen if name in one))
+        if known and not digests <= known:
+            return name
+    return None
 
 
 def file_digests(settings: Mapping[str, object]) -> dict[str, str]:

@@ -95,6 +95,13 @@ MIGRATIONS = (
     -- What the row was evaluated on, by its name in the note "machines". NULL for the machine that wrote the row.
     ALTER TABLE evaluations ADD COLUMN machine TEXT;
     """,
+    """
+    -- What a task says of an answer, over 0 where it is what is sought. Before, `objective` held it in all rows but
+    -- those of searches, of which it is not known (NULL).
+    ALTER TABLE evaluations ADD COLUMN score REAL;
+    UPDATE evaluations SET score = objective, objective = NULL
+        WHERE kind <> 'baseline' AND substr(kind, 1, 6) <> 'search';
+    """,
 )
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
@@ -108,7 +115,9 @@ class Row:
         step: step of the search or number of the trial, from 0.
         seed: of the render.
         spp: samples per pixel of the render.
-        objective: what was maximised; stored as None when it is not a number.
+        objective: what is maximised, of this picture; stored as None when it is not a number, or nothing is maximised.
+        score: what the run's task says of the answer: over 0 where it is what is sought; stored as None when it is not
+            a number.
         success: whether the answer is what the attack is after; None where nothing is sought, as in a sweep.
         correct: whether the answer is right; None in rows of older runs.
         margin: how wrong it is, by the run's task, over 0 where it is not right; in classification the largest logit of
@@ -130,6 +139,7 @@ class Row:
     seed: int | None = None
     spp: int | None = None
     objective: float | None = None
+    score: float | None = None
     success: bool | None = None
     correct: bool | None = None
     margin: float | None = None

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from advsearch.described import Value
+from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, JsonValue, open_regular, parse_json, read_text
 from advsearch.runs.files import placed_by, replacing, write_bytes, write_text
@@ -78,7 +78,7 @@ class _Classes:
         self.seen: dict[str, int | None] = {}
 
     def add(self, row: Row) -> None:
-        self.seen.setdefault(row.label or "", row.label_index)
+        self.seen.setdefault(row.label or NOT_A_NUMBER, row.label_index)
 
     def names(self) -> list[str]:
         numbers = self._numbers()
@@ -88,7 +88,7 @@ class _Classes:
         return found
 
     def number(self, row: Row) -> int:
-        return self._numbers()[row.label or ""]
+        return self._numbers()[row.label or NOT_A_NUMBER]
 
     def _numbers(self) -> dict[str, int]:
         given = {name: number for name, number in self.seen.items() if number is not None}

@@ -24,7 +24,7 @@ from advsearch.runs.store import Row
 PACKAGES = {"mlflow": "mlflow", "tensorboard": "tensorboard.summary", "wandb": "wandb"}
 """The trackers, and what of each is imported."""
 
-NUMBERS = ("objective", "margin", "correct", "success", "probability")
+NUMBERS = ("objective", "score", "margin", "correct", "success", "probability")
 """Of a row."""
 
 PATIENCE = 10.0

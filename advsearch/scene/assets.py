@@ -15,6 +15,9 @@ from advsearch.errors import InputError
 
 Floats = npt.NDArray[np.float32]
 
+SLACK = 1e-3
+"""How far texture coordinates of a texture that does not repeat may lie beyond its edges."""
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -24,13 +27,24 @@ class Mesh:
         vertices: (V, 3) float32 positions, z up, in the author's units.
         faces: (F, 3) uint32 vertex indices, counter-clockwise seen from outside.
         normals: (V, 3) float32 unit shading normals, pointing outwards.
-        uvs: (V, 2) float32 in [0, 1]; v = 0 is the BOTTOM row of the texture image (the OBJ convention).
+        uvs: (V, 2) float32; v = 0 is the BOTTOM row of the texture image (the OBJ convention). In [0, 1], but for
+            meshes of Mitsuba scenes, whose textures may go on beyond their edges.
+        attributes: of meshes of Mitsuba scenes, further numbers, (V, n) or (F, n) float32, by Mitsuba's names, which
+            begin with "vertex_" or "face_".
+        materials: the faces (N,) int64 of each material that its file names, by that name; each face is in one at most.
     """
 
     vertices: Floats
     faces: npt.NDArray[np.uint32]
     normals: Floats
     uvs: Floats
+    attributes: Mapping[str, Floats] = field(default_factory=dict)
+    materials: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
+
+    @property
+    def repeats(self) -> bool:
+        """Whether its texture coordinates leave [0, 1], where a texture goes on beyond its edges."""
+        return not (self.uvs.min() >= -SLACK and self.uvs.max() <= 1.0 + SLACK)
 
     def __post_init__(self) -> None:
         count = len(self.vertices)

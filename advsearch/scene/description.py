@@ -20,7 +20,7 @@ from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
-from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part
+from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.photograph import Photograph, photograph_of
 
 Doubles = npt.NDArray[np.float64]
@@ -34,6 +34,8 @@ FRAME_FILL = 0.86
 """Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
 ORBIT_CAMERA = "orbit"
 """The camera that the settings `camera.*` describe: on a sphere around the object, looking at it."""
+ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
+"""Mitsuba's lights from everywhere, of which a scene can have one."""
 NO_MAP = "none"
 """What the environment of a scene without a map is called."""
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in settings.CHANNELS))
@@ -62,6 +64,7 @@ class SceneDescription:
         cameras: those with poses of their own, by name.
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
+        remarks: what a user should know of further files that controls have read.
     """
 
     object: ObjectAsset
@@ -78,6 +81,7 @@ class SceneDescription:
     cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
     camera: str = ORBIT_CAMERA
     metered: bool = True
+    remarks: tuple[str, ...] = ()
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part.
@@ -131,12 +135,18 @@ class SceneDescription:
     @property
     def cut_out(self) -> bool:
         """Whether a mesh has cut-outs."""
-        return any(one.opacity is not None for one in self.meshes.values())
+        return any(one.opacity is not None for one in self.meshes.values()) or self._has("mask")
 
     @property
     def normal_mapped(self) -> bool:
         """Whether a mesh has a normal map."""
-        return any(one.normal_map is not None for one in self.meshes.values())
+        return any(one.normal_map is not None for one in self.meshes.values()) or self._has("normalmap", "bumpmap")
+
+    def _has(self, *kinds: str) -> bool:
+        """Whether a surface in Mitsuba's words has a plugin of these."""
+        surfaces = [one.surface for one in self.meshes.values() if one.surface is not None]
+        plugins = [part.plugin for part in self.parts if isinstance(part, PluginPart)]
+        return any(one.get("type") in kinds for plugin in (*surfaces, *plugins) for one in plugins_in(plugin))
 
     @property
     def emits(self) -> bool:
@@ -166,8 +176,9 @@ class SceneDescription:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how object and environment were read."""
-        return (*self.object.notes, *(() if self.environment is None else self.environment.warnings))
+        """What a user should know of how object and environment were read, and what controls name."""
+        lit = () if self.environment is None else self.environment.warnings
+        return tuple(dict.fromkeys((*self.object.notes, *lit, *self.remarks)))
 
     @property
     def bundled_environment(self) -> str | None:
@@ -182,6 +193,7 @@ class SceneDescription:
             InputError: the scene has none.
         """
         if self.environment is None:
+            check_one_environment(self.parts, who)
             raise InputError(f"{who}: the scene has no environment map; give it one, or leave {who} out")
         return self.environment
 
@@ -277,8 +289,11 @@ def describe(
     else:
         around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
     shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
-    lit_by = environment_spec or (NO_MAP if any(shining) else DEFAULT_ENVIRONMENT)
+    alone = any(shining) or (mitsuba and around.object.emission is not None)
+    lit_by = environment_spec or (NO_MAP if alone else DEFAULT_ENVIRONMENT)
     check_ground(given or {}, lit_by)
+    if lit_by != NO_MAP:
+        check_one_environment(around.surroundings, f"`environment={_spec(lit_by)}`")
     if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given or {}):
         values = {**values, "ground.size": 0.0}
     asked = () if environment_spec is None else (ENVIRONMENT,)
@@ -310,6 +325,24 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
         mesh = settings.mesh_of(name)
         if mesh is not None and mesh not in scene.around:
             raise UnknownNameError("mesh around the object", mesh, scene.around, f"It stands in `set` {name}.")
+
+
+def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
+    """Refuse an environment, or what needs one that is a map of ours, beside one that a Mitsuba scene has of its own.
+
+    Args:
+        parts: of the scene.
+        who: asks for it, as it is written.
+
+    Raises:
+        InputError: there are two.
+    """
+    own = [one for one in parts if isinstance(one, PluginPart) and one.plugin.get("type") in ENVIRONMENTS]
+    if own:
+        raise InputError(
+            f"{who}: the Mitsuba scene has an environment of its own, {own[0].name} (a {own[0].plugin['type']}), and "
+            f"there can be one only; leave {who} out, or take {own[0].name} out of the scene"
+        )
 
 
 def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
@@ -357,7 +390,7 @@ def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
 def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
     if isinstance(spec, ObjectAsset):
         return spec
-    if _is_path(spec):
+    if is_path(spec):
         return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
     if up is not None:
         raise InputError(
@@ -371,11 +404,11 @@ def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset | None
         return spec
     if spec == NO_MAP:
         return None
-    if _is_path(spec):
+    if is_path(spec):
         return environments.import_environment(Path(spec))
     return library.load_environment(str(spec))
 
 
-def _is_path(spec: str | Path) -> bool:
+def is_path(spec: str | Path) -> bool:
     """A spec with a folder or a file ending is a path; a bare word is a bundled name."""
     return isinstance(spec, Path) or "/" in spec or "\\" in spec or Path(spec).suffix != ""

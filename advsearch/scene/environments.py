@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import OpenEXR
 
-from advsearch import files
-from advsearch.errors import AdvsearchError, FileFormatError, InputError
+from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.importing.files import damaged, looks_like, read_bytes, safe_name, shown
-from advsearch.scene.importing.images import LARGEST_PIXELS, area_average, banded_average
+from advsearch.scene.importing.exr import Plane, Planes, read_exr
+from advsearch.scene.importing.files import read_bytes, safe_name
+from advsearch.scene.importing.images import area_average, banded_average
 from advsearch.scene.importing.radiance import linear, read_radiance
 
 Floats = npt.NDArray[np.float32]
-Plane = npt.NDArray[np.floating]
-Planes = tuple[Plane, Plane, Plane]
 Bools = npt.NDArray[np.bool_]
 
 SUFFIXES = (".hdr", ".exr")
@@ -32,11 +26,38 @@ SUFFIXES = (".hdr", ".exr")
 LARGEST = (512, 1024)
 """Rows and columns of the largest environment kept; larger ones are averaged down."""
 
-LARGEST_EXR = 2 * LARGEST_PIXELS
-"""Pixels times channels of an OpenEXR file (8192 x 4096 with 4), before `advsearch.files.scaled`."""
-
 SMALLEST = (4, 8)
 """Rows and columns that a smaller environment is brought up to by repeating its texels; renderers need a few."""
+
+
+@dataclass(frozen=True, eq=False)
+class LightPicture:
+    """A picture in linear radiance.
+
+    Attributes:
+        size: rows and columns.
+        band: returns the rows from the first to before the second of its arguments, (n, W, 3) float32.
+        notes: clauses about what is left out.
+    """
+
+    size: tuple[int, int]
+    band: Callable[[int, int], Floats]
+    notes: tuple[str, ...]
+
+
+def read_light(path: Path, what: str = "environment") -> LightPicture:
+    """Read an ``.hdr`` or ``.exr`` picture of any shape.
+
+    Raises:
+        FileFormatError, InputError: as for `import_environment`.
+    """
+    data = read_bytes(path, what, SUFFIXES)
+    if path.suffix.lower() == ".hdr":
+        pixels, scale, notes = read_radiance(path, data)
+        return LightPicture(pixels.shape[:2], lambda top, end: linear(pixels[top:end]) * scale, tuple(notes))
+    planes, notes = read_exr(path, data)
+    _check_values(path, planes)
+    return LightPicture(planes[0].shape, lambda top, end: _stacked(planes, top, end), tuple(notes))
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
@@ -46,26 +67,20 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     light from each direction stays the same in the mean. Row 0 is up; columns stay in the file's order.
 
     Args:
-        path: a Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone (grey), in half or float.
+        path: a Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone (grey), in half or float;
+            see `advsearch.scene.importing.exr`.
 
     Raises:
         FileFormatError: the file is missing, of another kind, damaged, or lacks channels; the message names it.
         InputError: values that are negative, NaN or infinite; the message counts them and gives the first position.
     """
     file = Path(path)
-    data = read_bytes(file, "environment", SUFFIXES)
-    if file.suffix.lower() == ".hdr":
-        pixels = read_radiance(file, data)
-        radiance, size = _sized(lambda top, end: linear(pixels[top:end]), pixels.shape[:2]), pixels.shape[:2]
-    else:
-        planes = _read_exr(file, data)
-        _check_values(file, planes)
-        size = planes[0].shape
-        radiance = _sized(lambda top, end: _stacked(planes, top, end), size)
-    notes = []
-    height, width = size
+    picture = read_light(file)
+    notes = [f"{file.name}: {note}" for note in picture.notes]
+    height, width = picture.size
     if abs(width / (2 * height) - 1.0) > 0.01:
         notes.append(f"{file.name}: expected a map twice as wide as high, got {width} x {height}; it appears stretched")
+    radiance = _sized(picture.band, picture.size)
     if not radiance.any():
         notes.append(f"{file.name}: the environment is black everywhere; it lights nothing")
     return EnvironmentAsset(safe_name(file), radiance, source=str(file), warnings=tuple(notes), photographed=True)
@@ -95,7 +110,7 @@ def _check_values(file: Path, planes: Planes) -> None:
 
 
 def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
-    """Average a map down to at most `LARGEST`, or repeat its texels up to at least `SMALLEST`.
+    """Average a map down to at most `LARGEST`, and repeat its texels up to at least `SMALLEST`.
 
     Args:
         band: returns the map's rows from the first to before the second of its arguments, (n, W, 3) float32.
@@ -104,70 +119,12 @@ def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
     height, width = size
     scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)
     if scale == 1.0:
-        return band(0, height).repeat(-(-SMALLEST[0] // height), axis=0).repeat(-(-SMALLEST[1] // width), axis=1)
-    target = max(1, round(height * scale)), max(1, round(width * scale))
-    polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(np.pi / height)
-    angle = np.sin(polar)[:, None, None]
-    covered = area_average(angle, target[0], 1)
-    weighted = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target)
-    return np.asarray(weighted / covered, dtype=np.float32)
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Swallow what OpenEXR prints about damaged files: on Python's standard output and on the process's stream 2."""
-    with contextlib.ExitStack() as undo:
-        undo.enter_context(contextlib.redirect_stdout(io.StringIO()))
-        with contextlib.suppress(OSError):  # no error stream at all
-            kept = os.dup(2)
-            undo.callback(os.close, kept)
-            undo.callback(os.dup2, kept, 2)
-            with open(os.devnull, "wb") as nowhere:
-                os.dup2(nowhere.fileno(), 2)
-        yield
-
-
-def _read_exr(file: Path, data: bytes) -> Planes:
-    """Return red, green and blue of the first part of an OpenEXR file, each (H, W) in half or float."""
-    if not data.startswith(b"\x76\x2f\x31\x01"):
-        raise damaged(file, "an OpenEXR picture", looks_like(data))
-    try:
-        with _quiet():
-            with OpenEXR.File(io.BytesIO(data), separate_channels=True, header_only=True) as picture:
-                _check_exr_size(file, picture)
-            with OpenEXR.File(io.BytesIO(data), separate_channels=True) as picture:
-                channels = {name: channel.pixels for name, channel in picture.channels().items()}
-    except (AdvsearchError, MemoryError):
-        raise
-    except Exception as error:
-        raise FileFormatError(
-            f"{file}: cannot be read as OpenEXR; it is damaged or cut short, export it again"
-        ) from error
-    names = ("R", "G", "B") if "Y" not in channels or "R" in channels else ("Y", "Y", "Y")
-    missing = [name for name in dict.fromkeys(names) if name not in channels]
-    if missing or ("RY" in channels and names[0] == "Y"):
-        got = ", ".join(shown(name, quoted=False) for name in sorted(channels))
-        raise FileFormatError(
-            f"{file}: expected the channels R, G and B (or Y alone), got {got};"
-            " save the picture as plain RGB without layers"
-        )
-    planes = channels[names[0]], channels[names[1]], channels[names[2]]
-    if any(plane.dtype.kind != "f" or plane.shape != planes[0].shape or plane.ndim != 2 for plane in planes):
-        got = ", ".join(f"{name} {plane.dtype} {plane.shape}" for name, plane in zip(names, planes, strict=True))
-        raise FileFormatError(f"{file}: expected channels of equal size in half or float, got {got}; save it again")
-    return planes
-
-
-def _check_exr_size(file: Path, picture: Any) -> None:
-    """Refuse a picture, opened without its pixels, that takes too much memory or has other than plain pixels."""
-    values = 0
-    for part in picture.parts:
-        header = part.header
-        if "deep" in str(header.get("type", "")):
-            raise FileFormatError(f"{file}: expected one value a pixel, got a deep OpenEXR picture; flatten it")
-        low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
-        width, height = (int(extent) for extent in high - low + 1)
-        values += max(width, 0) * max(height, 0) * len(header["channels"])
-    most = files.scaled(LARGEST_EXR)
-    if values > most:
-        raise files.too_large(file, f"OpenEXR pictures of at most {most:,} pixels times channels", f"{values:,}")
+        found = band(0, height)
+    else:
+        target = max(1, round(height * scale)), max(1, round(width * scale))
+        polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(np.pi / height)
+        angle = np.sin(polar)[:, None, None]
+        covered = area_average(angle, target[0], 1)
+        found = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target) / covered
+    down, across = (-(-least // extent) for least, extent in zip(SMALLEST, found.shape[:2], strict=True))
+    return np.asarray(found.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32)

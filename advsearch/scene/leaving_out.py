@@ -2,7 +2,7 @@
 
 None of it changes what is computed: pictures and gradients with and without agree to within their noise, and where the
 random numbers are the same ones, to within rounding, which `advsearch plan` shows on the scene at hand. Bounces of
-light are another matter (`evaluation.bounces`): leaving those out has a bias, so only the search does it, within a
+light are another matter (`engine.path_length`): leaving those out has a bias, so only the search does it, within a
 measured bound, and the verification renders all of them.
 """
 

@@ -8,7 +8,7 @@ it. A part of another kind is a subclass, with a translation registered in `mits
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -20,7 +20,15 @@ from advsearch.scene.assets import Floats, Material, Mesh, ObjectAsset
 Doubles = npt.NDArray[np.float64]
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"
-"""Stands for the texture in a surface in Mitsuba's words."""
+"""The type that stands for the texture in a surface in Mitsuba's words."""
+
+
+def plugins_in(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
+    """Yield a plugin's dictionary and all within it."""
+    yield plugin
+    for inner in plugin.values():
+        if isinstance(inner, Mapping):
+            yield from plugins_in(inner)
 
 
 @dataclass(frozen=True, eq=False)

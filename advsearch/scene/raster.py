@@ -52,6 +52,32 @@ def pixels_near(corners: Doubles, shape: tuple[int, int], miss: float = MISS) ->
     return face[span], row[span], column
 
 
+def texels_read(corners: Doubles, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+    """Return the texels (h, w) that bilinear lookups anywhere in some triangles read; lookups repeat at the border.
+
+    Args:
+        corners: (F, 3, 2) column and row, as in `pixels_in`, at most half a texel outside of the texture.
+        shape: height and width of the texture.
+    """
+    moved = corners + 1.0  # a lookup between two texels is in the cell of the first; -1 is the last one again
+    low, high = np.floor(moved[..., 1].min(axis=1) - MISS), np.floor(moved[..., 1].max(axis=1) + MISS)
+    face, row = _ranges(low, high, shape[0] + 1, 0.0)
+    here, rows = moved[face], row[:, None]
+    edges = [_crossing(here, row + k, MISS) for k in (0, 1)]
+    within = (here[..., 1] >= rows - MISS) & (here[..., 1] <= rows + 1 + MISS)
+    left = np.where(within, here[..., 0], np.inf).min(axis=1)
+    right = np.where(within, here[..., 0], -np.inf).max(axis=1)
+    for begin, end in edges:
+        left = np.where(begin <= end, np.minimum(left, begin), left)
+        right = np.where(begin <= end, np.maximum(right, end), right)
+    span, column = _ranges(np.floor(left - MISS), np.floor(right + MISS), shape[1] + 1, 0.0)
+    read = np.zeros(shape, np.bool_)
+    for down in (0, 1):
+        for across in (0, 1):
+            read[(row[span] - 1 + down) % shape[0], (column - 1 + across) % shape[1]] = True
+    return read
+
+
 def weights_at(corners: Doubles, row: Ints | Doubles, column: Ints | Doubles) -> Doubles:
     """Return the barycentric weights (N, 3) of pixel centres in triangles (N, 3, 2); NaN where one has no area."""
     (ax, ay), (bx, by), (cx, cy) = (corners[:, number].T for number in range(3))

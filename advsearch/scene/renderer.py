@@ -12,7 +12,8 @@ get their derivative from a second one, which is the identity in the forward pas
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -129,17 +130,20 @@ class Renderer:
             spp: independent samples a pixel, 1 to 65,536.
 
         Returns:
-            (H, W, 3) float32, display-referred sRGB in [0, 1]; differentiable with respect to u.
+            (H, W, 3) float32, display-referred sRGB in [0, 1]; differentiable with respect to u, in
+            `torch.inference_mode` too (not in `torch.no_grad`).
 
         Raises:
-            InputError: u has another shape, or values outside [0, 1], or spp is out of range.
+            InputError: u has another shape, or values outside [0, 1], or spp is out of range; or u requires a
+                gradient and was made in `torch.inference_mode`.
         """
         self._check(u, spp)
-        image = self._picture(u, seed, spp)
-        if u.requires_grad and torch.is_grad_enabled() and self._differenced():
-            result: Tensor = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
-            return result
-        return image
+        with _outside_inference(u) as u:
+            image = self._picture(u, seed, spp)
+            if u.requires_grad and torch.is_grad_enabled() and self._differenced():
+                result: Tensor = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
+                return result
+            return image
 
     def radiance(self, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
         """Render linear radiance, denoised if the formation says so; arguments as for a call; (H, W, 3) float32.
@@ -147,7 +151,8 @@ class Renderer:
         Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not.
         """
         self._check(u, spp)
-        return self._radiance(self._through(u), seed, spp)
+        with _outside_inference(u) as u:
+            return self._radiance(self._through(u), seed, spp)
 
     def mask(self, u: Tensor) -> Tensor:
         """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.
@@ -185,10 +190,10 @@ class Renderer:
         Returns:
             The loss, without graph, and (d,) float32.
         """
-        at = u.detach().clone().requires_grad_()
         self._left_out = BY_DIFFERENCES if free else frozenset({"secant"})
         try:
-            with torch.enable_grad():
+            with torch.inference_mode(False), torch.enable_grad():
+                at = u.detach().clone().requires_grad_()
                 value = loss(self(at, seed, spp))
             found = torch.autograd.grad(value, at, allow_unused=True)[0] if value.requires_grad else None
         finally:
@@ -370,6 +375,22 @@ class Renderer:
                     if reached is not None and bool(reached[group.coordinates].any()):
                         routes[group.name].add(name)
         return {name: frozenset(found) for name, found in routes.items()}
+
+
+@contextmanager
+def _outside_inference(u: Tensor) -> Iterator[Tensor]:
+    """Leave `torch.inference_mode` inside the block, where derivatives are neither taken nor missed; yield u.
+
+    Raises:
+        InputError: u was made in that mode, and its derivative is asked for.
+    """
+    if u.is_inference() and u.requires_grad:
+        raise InputError(
+            "render: u was made in `torch.inference_mode()`, so that nothing can be differentiated with respect to it; "
+            "make it outside, or pass `u.detach()` for the picture alone"
+        )
+    with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+        yield u.clone() if u.is_inference() else u
 
 
 class _Radiance(torch.autograd.Function):

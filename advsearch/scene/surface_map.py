@@ -18,7 +18,7 @@ from scipy.sparse import csgraph
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Floats, Mesh
-from advsearch.scene.raster import doubled_areas, pixels_near
+from advsearch.scene.raster import doubled_areas, pixels_near, texels_read
 
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -68,7 +68,7 @@ class Charts:
         """Return the surface area (h, w) that each texel stands for, in squared mesh units; 0 where no chart is."""
         places = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         surface = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
-        texels = np.abs(doubled_areas(_in_texels(self.mesh, len(self.face))))
+        texels = np.abs(doubled_areas(_in_texels(self.mesh, self.covered.shape)))
         share = np.where(texels > 0.0, surface / np.maximum(texels, 1e-12), 0.0)
         return np.where(self.covered, share[self.face], 0.0).astype(np.float32)
 
@@ -92,30 +92,50 @@ def texel_positions(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Mask]:
     return charts.positions(), charts.normals(), charts.touched
 
 
-def texel_area(mesh: Mesh, resolution: int) -> Floats:
+def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Mask, float]:
+    """Return the texels (h, w) that bilinear lookups on some faces read and lookups on all others do not, and their
+    share of those that lookups on these faces read.
+
+    Args:
+        mesh: with texture coordinates.
+        faces: (N,) numbers of faces.
+        shape: height and width of the texture in texels.
+    """
+    corners, ours = _in_texels(mesh, shape), np.isin(np.arange(len(mesh.faces)), faces)
+    read = texels_read(corners[ours], shape)
+    alone = read & ~texels_read(corners[~ours], shape)
+    return alone, float(alone.sum()) / max(1, int(read.sum()))
+
+
+def texel_area(mesh: Mesh, shape: tuple[int, int]) -> Floats:
     """Return the surface area that each texel stands for, (h, w) in squared mesh units; 0 where no chart is."""
-    return rasterised(mesh, resolution).areas()
+    return rasterised(mesh, shape).areas()
 
 
-def rasterised(mesh: Mesh, resolution: int) -> Charts:
+def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights behind every texel centre.
 
     Where charts overlap, one of their faces wins.
 
+    Args:
+        mesh: with texture coordinates.
+        resolution: height and width of the texture in texels; one number for both.
+
     Raises:
         InputError: the texture coordinates cover no texel.
     """
-    corners = _in_texels(mesh, resolution)
-    face, row, column = pixels_near(corners, (resolution, resolution))
+    shape = (resolution, resolution) if isinstance(resolution, int) else resolution
+    corners = _in_texels(mesh, shape)
+    face, row, column = pixels_near(corners, shape)
     weights = _barycentric(corners[face], np.stack([column, row], axis=1))
     if len(face) == 0:
         raise InputError(
-            f"mesh texture coordinates: none of the {resolution} x {resolution} texels lies in a triangle; unwrap the "
-            "mesh again"
+            f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels lies in a triangle; unwrap the mesh "
+            "again"
         )
-    face_map = np.zeros((resolution, resolution), dtype=np.int64)
-    weight_map = np.zeros((resolution, resolution, 3))
-    covered = np.zeros((resolution, resolution), dtype=np.bool_)
+    face_map = np.zeros(shape, dtype=np.int64)
+    weight_map = np.zeros((*shape, 3))
+    covered = np.zeros(shape, dtype=np.bool_)
     face_map[row, column], weight_map[row, column], covered[row, column] = face, weights, True
     distance, nearest = ndimage.distance_transform_edt(~covered, return_indices=True)
     return Charts(mesh, face_map[tuple(nearest)], weight_map[tuple(nearest)], covered, distance)
@@ -225,10 +245,15 @@ def _face_neighbours(mesh: Mesh) -> Ints:
     return np.stack([owner[order][:-1][same], owner[order][1:][same]], axis=1)
 
 
-def _in_texels(mesh: Mesh, resolution: int) -> Doubles:
-    """Texture coordinates of the faces' corners, (F, 3, 2): column and row, integers at texel centres."""
+def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
+    """Texture coordinates of the faces' corners, (F, 3, 2): column and row, integers at texel centres.
+
+    Where a texture repeats, each face is moved by whole textures, so that its middle lies in the first one.
+    """
     uvs = mesh.uvs[mesh.faces].astype(np.float64)
-    return np.stack([uvs[..., 0] * resolution - 0.5, (1.0 - uvs[..., 1]) * resolution - 0.5], axis=-1)
+    if mesh.repeats:
+        uvs -= np.floor(uvs.mean(axis=1, keepdims=True))
+    return np.stack([uvs[..., 0] * shape[1] - 0.5, (1.0 - uvs[..., 1]) * shape[0] - 0.5], axis=-1)
 
 
 def _barycentric(corners: Doubles, points: Ints) -> Doubles:

@@ -7,7 +7,17 @@ from __future__ import annotations
 
 from advsearch.settings.configuration import FILES, Config
 from advsearch.settings.declaration import Clash, Setting, setting, setting_as_in, settings
-from advsearch.settings.values import all_finite, check_once, number_or_text, parse_assignment, split_names
+from advsearch.settings.values import (
+    all_finite,
+    as_python,
+    as_text,
+    check_once,
+    is_shallow,
+    number_or_text,
+    parse_assignment,
+    shown,
+    split_names,
+)
 from advsearch.settings.yaml_files import HEADER, read_yaml
 
 __all__ = [
@@ -17,12 +27,16 @@ __all__ = [
     "Config",
     "Setting",
     "all_finite",
+    "as_python",
+    "as_text",
     "check_once",
+    "is_shallow",
     "number_or_text",
     "parse_assignment",
     "read_yaml",
     "setting",
     "setting_as_in",
     "settings",
+    "shown",
     "split_names",
 ]

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, PrivateAttr, ValidationError, field_validator, model_validator
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.settings.command_line import as_flags
 from advsearch.settings.declaration import Clash, settings
-from advsearch.settings.values import all_finite, is_file, is_shallow, shown, split_names
+from advsearch.settings.values import all_finite, as_python, is_file, is_shallow, shown, split_names
 from advsearch.settings.yaml_files import HEADER, SCHEMA, put, read_yaml
 
 if TYPE_CHECKING:
@@ -55,6 +55,8 @@ class Config(BaseModel):
     free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")
     """Settings that decide no number, so that they may be changed before a run goes on."""
 
+    _only_here: tuple[str, ...] = PrivateAttr(())
+
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     def __init__(self, **data: Any) -> None:
@@ -62,7 +64,7 @@ class Config(BaseModel):
         if deep:
             raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
         try:
-            super().__init__(**data)
+            super().__init__(**as_python(data))
         except ValidationError as error:
             raise _settings_error(type(self), error.errors(include_url=False)) from None
 
@@ -136,10 +138,22 @@ class Config(BaseModel):
         """
         return cls(**{**cls.shared(other), **changes})
 
+    @property
+    def only_here(self) -> tuple[str, ...]:
+        """What it has, in words, that only this Python session has, and no file or command can name."""
+        return self._only_here
+
+    def with_only_here(self, what: Sequence[str]) -> Self:
+        """Return it with other things that only this Python session has."""
+        copy = self.model_copy()
+        copy._only_here = tuple(what)
+        return copy
+
     def to_yaml(self) -> str:
         """Return the YAML form; `from_yaml` of it gives an equal configuration."""
         data = {"schema": SCHEMA, "command": self.command, **self.plain()}
-        return HEADER + str(yaml.safe_dump(data, sort_keys=False))
+        note = f"# But it can't be: {self._in_words()}\n" if self._only_here else ""
+        return HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
 
     def plain(self) -> JsonObject:
         """Return every setting by the name it has in YAML, as JSON values."""
@@ -168,13 +182,24 @@ class Config(BaseModel):
         return {**given, **files}
 
     def command_line(self) -> str:
-        """Return the shell command that repeats this in a place of its own: all settings that are not the default."""
+        """Return the shell command that repeats this in a place of its own: all settings that are not the default.
+
+        Where there is no such command, it is a sentence that says so.
+        """
+        if self._only_here:
+            return f"No command repeats this: {self._in_words()}"
         words = ["advsearch", self.command]
         for one in settings(type(self)):
             value = getattr(self, one.field)
             if value != one.default and one.field not in PLACE:
                 words += as_flags(one, value)
         return shlex.join(words)
+
+    def _in_words(self) -> str:
+        """What only this Python session has, in a sentence."""
+        *first, last = map(shown, self._only_here)
+        listed = f"{', '.join(first)} and {last}" if first else last
+        return f"{listed} {'exist' if first else 'exists'} only in the Python session that asked."
 
 
 def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:

@@ -23,6 +23,33 @@ def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
     return levels >= 0 and all(is_shallow(one, levels - 1) for one in inner)
 
 
+def as_python(value: Any) -> Any:
+    """Return numbers and arrays of numpy and torch in `value`, which `is_shallow`, as Python's."""
+    if isinstance(value, Mapping):
+        return {as_python(name): as_python(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        inner = [as_python(one) for one in value]
+        return inner if isinstance(value, list) else tuple(inner)
+    return value.tolist() if hasattr(value, "tolist") and hasattr(value, "dtype") else value
+
+
+def as_text(value: Any, *, several: bool = False) -> Any:
+    """Return what names something as a text: a path, a number, or a list of such where there may be several.
+
+    Raises:
+        ValueError: it can't be a name, or there are several where one is expected.
+    """
+    parts = value if isinstance(value, (list, tuple)) else [value]
+    if not parts or not all(isinstance(one, (str, Path, int)) and not isinstance(one, bool) for one in parts):
+        return value
+    if len(parts) > 1 and not several:
+        raise ValueError("several")
+    text = ",".join(map(str, parts))
+    if not text.strip(" ,\t\n") or "\0" in text:
+        raise ValueError("an empty name")
+    return text
+
+
 def all_finite(value: Any) -> bool:
     """Return whether all numbers in `value`, which `is_shallow`, are finite; whole ones at most 2**63 - 1."""
     if isinstance(value, Mapping):

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
@@ -55,6 +56,7 @@ class Judgement:
         right: whether the answer is right. NaN is not right.
         answer: what the model says.
         payload: what else is kept of it in the run's rows, as JSON values (boxes, masks); None where there is nothing.
+        objective: what a search maximises, of this picture; None where nothing is searched.
     """
 
     score: float
@@ -62,11 +64,24 @@ class Judgement:
     right: bool
     answer: Answer
     payload: JsonValue = None
+    objective: float | None = None
+
+    @classmethod
+    def of(cls, score: float, margin: float, answer: Answer, payload: JsonValue = None) -> Judgement:
+        """Return the judgement of an output; where its margin is NaN or infinite, that it is not a number."""
+        if not math.isfinite(margin):
+            return cls(math.nan, math.nan, right=False, answer=Answer(NOT_A_NUMBER))
+        return cls(score, margin, margin <= 0.0, answer, payload)
 
     @property
     def success(self) -> bool:
         """Whether the output is what is sought."""
         return self.score > 0.0
+
+    @property
+    def not_a_number(self) -> bool:
+        """Whether the model answered with NaN or infinity, which is neither right nor a success."""
+        return self.answer.label == NOT_A_NUMBER
 
 
 @dataclass(frozen=True)
@@ -245,6 +260,30 @@ class Task(ABC):
         raise ValueError(f"expected a tensor with {count} rows, one for each picture")
 
     @property
+    def looks(self) -> bool:
+        """Whether the task is to be shown an answer to a clean picture of the scene (`seeing`) before it judges."""
+        return False
+
+    def seeing(self: Own, output: Output, truth: Truth | None) -> Own:
+        """Return the task with what its model's answer to a clean picture of the scene shows of how answers are read.
+
+        Args:
+            output: of one picture.
+            truth: of the scene; None where nobody knows it.
+        """
+        return self
+
+    @property
+    def unsaid(self) -> str:
+        """What has to be said for its model's answers to be read, as a message; empty where nothing has."""
+        return ""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences that a reader has to know about how answers are read."""
+        return ()
+
+    @property
     def reader(self) -> Callable[[Any, int], Output] | None:
         """What reads the outputs of its models; None where these are logits."""
         return None if self.reads_logits else self.read
@@ -284,6 +323,10 @@ class Task(ABC):
         margin = self.margin(output, truth)
         return -margin if self.minimise else margin
 
+    def answerable(self, output: Output, truth: Truth) -> Output:
+        """Return the output as objectives of logits take it: without what is no answer."""
+        return output
+
     def payloads(self, output: Output) -> Sequence[Any]:
         """Return what is kept of each of N outputs beside the words, as JSON values."""
         return [None] * len(output)
@@ -317,7 +360,7 @@ class Task(ABC):
         scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
         answers, payloads = self.answers(output), self.payloads(output)
         return [
-            Judgement(score, margin, margin <= 0.0, first, payload)
+            Judgement.of(score, margin, first, payload)
             for score, margin, (first, *_), payload in zip(scores, margins, answers, payloads, strict=True)
         ]
 

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TypeVar
 
 import torch
 
 from advsearch.errors import InputError
 from advsearch.models import Model, find_label_set
-from advsearch.models.labels import fitting_labels
+from advsearch.models.labels import fitting_labels, names_nothing
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Output, Task
 
 Labels = tuple[int, ...]
 Own = TypeVar("Own", bound="ClassTask")
+
+NO = "no "
+"""How an answer says that the object is not found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +98,14 @@ class ClassTask(Task):
         if both:
             raise InputError(f"target: expected classes that are not right answers, got {both}, which `label` has too")
         return right
+
+    @cached_property
+    def nothing(self) -> Labels:
+        """Indices of classes that stand for no thing, such as "background", but for what is sought: no answers."""
+        if not self.named:
+            return ()
+        sought = self.target or ()
+        return tuple(k for k, name in enumerate(self.labels) if k not in sought and names_nothing(name))
 
     @property
     def target_names(self) -> tuple[str, ...]:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
-from advsearch.tasks.base import Answer, Facts
+from advsearch.tasks.base import Answer, Facts, Judgement
 from advsearch.tasks.classes import ClassTask, Labels
 
 
@@ -29,20 +30,47 @@ class Classification(ClassTask):
         """See `ClassTask.right_classes`."""
         return self.right_classes(facts)
 
+    def answerable(self, output: Tensor, truth: Labels) -> Tensor:
+        """See `Task.answerable`: a class that stands for no thing has a logit of minus infinity, unless it is right or
+        there is no other wrong one."""
+        nothing = set(self.nothing) - set(truth)
+        if not nothing or len(nothing) + max(1, len(truth)) >= output.shape[1]:
+            return output
+        return output.index_fill(1, torch.tensor(sorted(nothing), device=output.device), -math.inf)
+
     def margin(self, output: Tensor, truth: Labels) -> Tensor:
         """See `wrong_lead`."""
-        return wrong_lead(output, truth)
+        return wrong_lead(self.answerable(output, truth), truth)
+
+    def score(self, output: Tensor, truth: Labels) -> Tensor:
+        """See `Task.score`."""
+        if self.target is not None:
+            return target_lead(self.answerable(output, truth), self.target)
+        return super().score(output, truth)
 
     def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
         """Return the likeliest classes of each picture; with a count of 1, the first of equal ones."""
+        return self._likeliest(self.answerable(output, ()), count)
+
+    def _likeliest(self, output: Tensor, count: int) -> list[tuple[Answer, ...]]:
         probabilities = output.detach().softmax(dim=1)
         if count == 1:
             indices = probabilities.argmax(dim=1, keepdim=True)
             values = probabilities.gather(1, indices)
         else:
             values, indices = probabilities.topk(min(count, output.shape[1]), dim=1)
-        rows = zip(indices.tolist(), values.tolist(), strict=True)
-        return [tuple(Answer(self.name_of(i), i, p) for i, p in zip(*row, strict=True)) for row in rows]
+        found = []
+        for row in zip(indices.tolist(), values.tolist(), strict=True):
+            listed = [Answer(self.name_of(i), i, p) for i, p in zip(*row, strict=True) if p > 0.0 or count == 1]
+            found.append(tuple(listed) if math.isfinite(row[1][0]) else (Answer(NOT_A_NUMBER),))
+        return found
+
+    def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
+        """See `Task.judge`."""
+        scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+        answers = self._likeliest(self.answerable(output, truth), 1)
+        rows = zip(scores, margins, answers, strict=True)
+        return [Judgement.of(score, margin, first) for score, margin, (first,) in rows]
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
         """Return the names of classes."""

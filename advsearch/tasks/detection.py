@@ -10,19 +10,33 @@ Boxes that come with their labels count as they are. Scores p are compared as lo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
+from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
-from advsearch.tasks.boxes import FORMS, Detections, detections_in, overlap, share_inside, strongest
-from advsearch.tasks.classes import ClassTask, Labels
+from advsearch.tasks.box_readings import UNITS, Reading, strongest_boxes, unit_in
+from advsearch.tasks.boxes import FORMS, overlap, share_inside, strongest
+from advsearch.tasks.classes import NO, ClassTask, Labels
+from advsearch.tasks.detector_answers import (
+    ORDERS,
+    Detections,
+    as_option,
+    ask_order,
+    checked_order,
+    detections_in,
+    numbers_of,
+    order_in,
+    settled,
+)
 
 GOALS = {
     "vanish": "no right box is found where the object is",
@@ -73,13 +87,19 @@ class Detection(ClassTask):
     Args:
         iou: least intersection over union with the true box.
         confidence: least score of a box that counts.
-        boxes: how the model gives a box, one of `FORMS`.
+        boxes: how the model gives a box, one of `FORMS`; "" for xyxy.
         suppression: intersection over union from which two boxes of a class are one thing, of which the better one is
             left; 1 where a model's own boxes should all count.
         unit: of these numbers: "fractions" of the picture's sides, or "pixels" of the model's input; "" for what the
-            boxes in a picture of noise look like.
+            boxes in a picture of noise look like, or in a clean picture of the scene where it finds none in noise.
+        order: of outputs without names, or of the columns of rows: "boxes labels scores", say, with "batch" for the
+            number of the picture; "" for what types and numbers show.
         seek: what an attack is after, one of `GOALS`.
         input_size: (height, width) of the model's input in pixels.
+        seen_unit, seen_order: what the model's own answers show; "" where they have not yet.
+        undecided: whether only numbers tell scores from classes in its answers.
+        fills_with_nan: whether rows of NaN stand where nothing is found, and not for an answer that is not a number.
+        doubts: what is odd about these.
 
     Raises:
         InputError: a value that is none of these.
@@ -91,10 +111,16 @@ class Detection(ClassTask):
     iou: float = 0.5
     confidence: float = 0.5
     suppression: float = 0.5
-    boxes: str = "xyxy"
+    boxes: str = ""
     unit: str = ""
+    order: str = ""
     seek: str = "vanish"
     input_size: tuple[int, int] = field(default=(1, 1), metadata=FROM_RUN)
+    seen_unit: str = field(default="", metadata=FROM_RUN)
+    seen_order: str = field(default="", metadata=FROM_RUN)
+    undecided: bool = field(default=False, metadata=FROM_RUN)
+    fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
+    doubts: str = field(default="", metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -106,7 +132,11 @@ class Detection(ClassTask):
             raise InputError(
                 f"task detection: suppression: expected a number over 0, up to 1, got {self.suppression!r}"
             )
-        for name, known in (("boxes", FORMS), ("unit", ("", "fractions", "pixels")), ("seek", tuple(GOALS))):
+        try:
+            checked_order(self.order or ORDERS[0])
+        except ValueError as error:
+            raise InputError(f"task detection: order: {error}") from None
+        for name, known in (("boxes", ("", *FORMS)), ("unit", ("", *UNITS)), ("seek", tuple(GOALS))):
             if getattr(self, name) not in known:
                 expected = ", ".join(filter(None, known))
                 raise InputError(f"task detection: {name}: expected one of {expected}, got {getattr(self, name)!r}")
@@ -118,19 +148,88 @@ class Detection(ClassTask):
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Detection:
         """See `Task.on`."""
         found = super().on(model, target=target, minimise=minimise)
-        return replace(found, input_size=model.input_size, unit=self.unit or _unit_of(model))
+        with torch.no_grad():
+            noise = torch.rand((1, *model.input_size, 3), generator=torch.Generator().manual_seed(0))
+            output = model(noise)
+        blank = any("blank" in one for one in output)
+        return replace(found, input_size=model.input_size, fills_with_nan=blank)._having_seen(output)
+
+    @property
+    def looks(self) -> bool:
+        """See `Task.looks`: unless all is said already, boxes are compared with the true one."""
+        return not (self.boxes and self.unit) or (self.undecided and not self.order)
+
+    def seeing(self, output: Sequence[Detections], truth: Place | None) -> Detection:
+        """See `Task.seeing`."""
+        found = self._having_seen(output)
+        reading, right = found._reading, strongest_boxes(output)[:0]
+        if truth is not None and truth.shares is not None:
+            each = [(one["boxes"], found._of(one, truth.labels)) for one in found._settled(output)]
+            right = torch.cat([raw[score >= LEAST] for raw, score in each])
+        if len(right) and truth is not None and truth.shares is not None:
+            better = reading.better(right, truth.shares, self.iou)
+            doubts = f"one of them is nearer to the object with {better}" if better else reading.fault(right)
+        else:
+            boxes = strongest_boxes(output)
+            doubts = reading.fault(boxes) and f"{reading.fault(boxes)}{reading.instead(boxes)}"
+        return replace(found, doubts=doubts)
+
+    def _having_seen(self, output: Sequence[Detections]) -> Detection:
+        """The task with what an answer of its model shows of orders and units."""
+        try:
+            order = order_in(output, len(self.labels) if self.named else None)
+        except ValueError as error:
+            raise InputError(f"task detection: {error}; {ask_order()}") from None
+        return replace(
+            self,
+            seen_unit=unit_in(strongest_boxes(output)) or self.seen_unit,
+            seen_order=order or self.seen_order,
+            undecided=self.undecided or any("either" in one for one in output),
+            fills_with_nan=self.fills_with_nan or any("blank" in one and len(one["boxes"]) for one in output),
+        )
+
+    @property
+    def unsaid(self) -> str:
+        """See `Task.unsaid`."""
+        if self.undecided and not (self.order or self.seen_order):
+            return f"order: expected what tells scores from classes, and no answer of the model does; {ask_order()}"
+        if not (self.unit or self.seen_unit):
+            return (
+                "unit: expected the unit of the model's boxes, and it finds nothing in noise and in the clean scene "
+                f"that shows it; say {as_option('unit: fractions')} or {as_option('unit: pixels')}, and `boxes` too "
+                "unless they are x0, y0, x1, y1"
+            )
+        return ""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `Task.remarks`."""
+        said = []
+        if self.undecided and self.seen_order and not self.order:
+            said.append(
+                "Scores and classes of the detector's boxes are told apart by their values: they are read as "
+                f"{as_option(f'order: {self.seen_order}')}."
+            )
+        if self.doubts:
+            said.append(f"The detector's boxes may be read wrongly: {self.doubts}.")
+        return tuple(said)
+
+    @property
+    def _reading(self) -> Reading:
+        return Reading(self.boxes or FORMS[0], self.unit or self.seen_unit or UNITS[1], self.input_size)
 
     def seeking(self, objective: str) -> Detection:
         """See `Task.seeking`: the objectives of detection say what counts as success."""
         return replace(self, seek=objective) if objective in GOALS else self
 
     def read(self, answer: Any, count: int) -> list[Detections]:
-        """See `Task.read`: what `advsearch.tasks.boxes.detections_in` takes."""
-        return detections_in(answer, count, self.boxes)
+        """See `Task.read`: what `advsearch.tasks.detector_answers.detections_in` takes."""
+        return detections_in(answer, count, self.order)
 
     def classes_in(self, output: Sequence[Detections]) -> int | None:
         """Return how many classes each box has a score of."""
-        return None if "labels" in output[0] else output[0]["scores"].shape[1]
+        scores = output[0].get("scores")
+        return scores.shape[1] if scores is not None and scores.ndim == 2 else None
 
     def check(self, facts: Facts) -> None:
         """See `Task.check`: the model must have such a class."""
@@ -153,7 +252,7 @@ class Detection(ClassTask):
         Of `create`: how far the best box where nothing is stands above it.
         """
         wrong = self._created if self.seek == "create" else self._missed
-        return torch.stack([wrong(self._left(one), truth) for one in output])
+        return self._each(output, lambda one: wrong(self._left(one), truth))
 
     def score(self, output: Sequence[Detections], truth: Place) -> Tensor:
         """Return how near each of N outputs is to what is sought, (N,), in log-odds: over 0 where it is a success."""
@@ -165,7 +264,12 @@ class Detection(ClassTask):
             "displace": self._displaced,
             "create": self._created,
         }[self.seek]
-        return torch.stack([reach(one, truth) for one in output])
+        return self._each(output, lambda one: reach(one, truth))
+
+    def _each(self, output: Sequence[Detections], value: Callable[[Detections], Tensor]) -> Tensor:
+        """A value of each picture, (N,); NaN where a number that counts is none."""
+        read = self._read(output)
+        return torch.stack([one["scores"].sum() * math.nan if self._broken(one) else value(one) for one in read])
 
     def _missed(self, one: Detections, truth: Place) -> Tensor:
         at = self._overlap(one, truth)
@@ -201,6 +305,40 @@ class Detection(ClassTask):
 
     # ---- boxes and scores of one picture ----------------------------------------------------------------------------
 
+    def _settled(self, output: Sequence[Detections]) -> list[Detections]:
+        """What the model answered, with scores and classes told apart, boxes as they came."""
+        try:
+            return [settled(one, self.seen_order) for one in output]
+        except ValueError as error:
+            raise InputError(f"task detection: {error}") from None
+
+    def _read(self, output: Sequence[Detections]) -> list[Detections]:
+        """What the model answered, with boxes as shares of the picture; what names no thing has a score of 0."""
+        found, reading = list[Detections](), self._reading
+        nothing = torch.tensor(self.nothing, dtype=torch.long)
+        for one in self._settled(output):
+            boxes, scores = reading.fractions(one["boxes"]), one["scores"]
+            if "labels" in one:
+                scores = scores.masked_fill(torch.isin(one["labels"], nothing.to(scores.device)), 0.0)
+            elif len(nothing):
+                scores = scores.index_fill(1, nothing.to(scores.device), 0.0)
+            read = {**one, "boxes": boxes, "scores": scores}
+            there = boxes.detach().isfinite().all(dim=1) | ~(numbers_of(read) < self._least).all(dim=1)
+            if not bool(there.all()):
+                read = {name: part if name == "blank" else part[there] for name, part in read.items()}
+            found.append(read)
+        return found
+
+    @property
+    def _least(self) -> float:
+        """The least score of a box that anybody looks at."""
+        return min(LEAST, self.confidence)
+
+    def _broken(self, one: Detections) -> bool:
+        """Whether a score, or the place of what has one, is not a number; or all rows are NaN that do not fill up."""
+        blank = "blank" in one and not len(one["boxes"]) and not self.fills_with_nan
+        return blank or not all(bool(one[name].detach().isfinite().all()) for name in ("boxes", "scores"))
+
     def _left(self, one: Detections) -> Detections:
         """What suppression leaves of boxes with a score of every class: the score of one that it removes is 0.
 
@@ -209,8 +347,8 @@ class Detection(ClassTask):
         """
         if "labels" in one or self.suppression == 1.0 or not len(one["boxes"]):
             return one
-        scores, boxes = one["scores"].detach(), self._fractions(one).detach()
-        rows, classes = (scores >= min(LEAST, self.confidence)).nonzero(as_tuple=True)
+        scores, boxes = one["scores"].detach(), one["boxes"].detach()
+        rows, classes = (scores >= self._least).nonzero(as_tuple=True)
         removed = torch.zeros_like(scores, dtype=torch.bool)
         for label in classes.unique().tolist():
             mine = rows[classes == label]
@@ -219,22 +357,17 @@ class Detection(ClassTask):
                 removed[mine[strongest(boxes[mine], scores[mine, label], len(mine), self.suppression)], label] = False
         return {**one, "scores": torch.where(removed, 0.0, one["scores"])}
 
-    def _fractions(self, one: Detections) -> Tensor:
-        """Boxes as shares of width and height, (D, 4)."""
-        height, width = self.input_size if self.unit == "pixels" else (1, 1)
-        return one["boxes"] / one["boxes"].new_tensor([width, height] * 2)
-
     def _overlap(self, one: Detections, truth: Place) -> Tensor | None:
         """Intersection over union with the true box, (D,); None where the object is not seen."""
         shares = truth.shares
-        return None if shares is None else overlap(self._fractions(one), shares.to(one["boxes"]))
+        return None if shares is None else overlap(one["boxes"], shares.to(one["boxes"]))
 
     def _elsewhere(self, one: Detections, truth: Place) -> Tensor:
         """Boxes of which most is not on the object, and that do not frame it, (D,) bool."""
         shares = truth.shares
         if shares is None:
             return torch.ones(len(one["boxes"]), dtype=torch.bool, device=one["boxes"].device)
-        boxes, place = self._fractions(one), shares.to(one["boxes"])
+        boxes, place = one["boxes"], shares.to(one["boxes"])
         return (share_inside(boxes, place) < 0.5) & (overlap(boxes, place) < self.iou)
 
     @staticmethod
@@ -262,9 +395,10 @@ class Detection(ClassTask):
     def answers(self, output: Sequence[Detections], count: int = 1) -> list[tuple[Answer, ...]]:
         """Return the names of the best boxes of each picture with their scores; of boxes that overlap, the best one."""
         found = []
-        for one in output:
-            listed = [Answer(self.name_of(label), label, score) for _, label, score in self._listed(one, count, 0.0)]
-            found.append(tuple(listed) or (Answer("nothing"),))
+        for one in self._read(output):
+            rows = [] if self._broken(one) else self._listed(one, count, SMALLEST)
+            listed = [Answer(self.name_of(label), label, score) for _, label, score in rows]
+            found.append(tuple(listed) or (Answer(NOT_A_NUMBER if self._broken(one) else "nothing"),))
         return found
 
     def judge(self, output: Sequence[Detections], truth: Place) -> list[Judgement]:
@@ -272,9 +406,14 @@ class Detection(ClassTask):
         with torch.no_grad():
             scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
             return [
-                Judgement(score, margin, margin <= 0.0, self._answer(self._left(one), truth), self._payload(one, truth))
-                for score, margin, one in zip(scores, margins, output, strict=True)
+                Judgement.of(score, margin, *self._said(one, truth))
+                for score, margin, one in zip(scores, margins, self._read(output), strict=True)
             ]
+
+    def _said(self, one: Detections, truth: Place) -> tuple[Answer, JsonValue]:
+        if self._broken(one):
+            return Answer(NOT_A_NUMBER), None
+        return self._answer(self._left(one), truth), self._payload(one, truth)
 
     def _answer(self, one: Detections, truth: Place) -> Answer:
         """What a model says of the object, with the score of the box that says so."""
@@ -302,7 +441,7 @@ class Detection(ClassTask):
 
     def _listed(self, one: Detections, count: int, least: float) -> list[tuple[Box, int, float]]:
         """The best boxes, of a class and a place one: shares of width and height, class, score."""
-        boxes, scores = self._fractions(one).detach(), one["scores"].detach()
+        boxes, scores = one["boxes"].detach(), one["scores"].detach()
         best, places = scores.flatten().topk(min(LOOKED_AT, scores.numel()))
         each = 1 if "labels" in one else scores.shape[1]
         rows = places // each
@@ -324,7 +463,7 @@ class Detection(ClassTask):
                 "label": self.name_of(label),
                 "score": round(score, 3),
             }
-            for box, label, score in self._listed(one, MOST, min(LEAST, self.confidence))
+            for box, label, score in self._listed(one, MOST, self._least)
         ]
         return {"box": None if truth.box is None else list(truth.box), "found": found}
 
@@ -333,8 +472,8 @@ class Detection(ClassTask):
         height, width = truth.size
         true = [] if truth.box is None else [Mark(" or ".join(self.names(truth.labels)), True, box=truth.box)]
         found = []
-        for one in output:
-            listed = self._listed(one, MOST, self.confidence)
+        for one in self._read(output):
+            listed = [] if self._broken(one) else self._listed(one, MOST, self.confidence)
             found.append(true + [
                 Mark(f"{self.name_of(label)} {score:.2f}", False, box=(a * width, b * height, c * width, d * height))
                 for (a, b, c, d), label, score in listed
@@ -342,16 +481,8 @@ class Detection(ClassTask):
         return found
 
 
-ELSEWHERE, NO = "elsewhere", "no "
-"""How an answer says that a box is not where the object is, or that there is none."""
-
-
-def _unit_of(model: Model) -> str:
-    """The unit of a model's boxes, by those in a picture of noise: pixels where there are none."""
-    with torch.no_grad():
-        noise = torch.rand((1, *model.input_size, 3), generator=torch.Generator().manual_seed(0))
-        boxes = model(noise)[0]["boxes"]
-    return "fractions" if len(boxes) and float(boxes.abs().mean()) < 2.0 else "pixels"
+ELSEWHERE = "elsewhere"
+"""How an answer says that a box is not where the object is."""
 
 
 def log_odds(shares: Tensor) -> Tensor:

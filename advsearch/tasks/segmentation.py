@@ -11,9 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
-from advsearch.tasks.classes import ClassTask, Labels
+from advsearch.tasks.classes import NO, ClassTask, Labels
 from advsearch.tasks.classification import members, target_lead, wrong_lead
 
 EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
@@ -136,7 +137,8 @@ class Segmentation(ClassTask):
         if pixels is None:
             return self._unseen(output)
         values = lead(pixels, labels).reshape(len(output), -1)
-        return values.kthvalue(math.ceil(self.accuracy * values.shape[1]), dim=1).values
+        deciding = values.kthvalue(math.ceil(self.accuracy * values.shape[1]), dim=1).values
+        return torch.where(values.isfinite().all(dim=1), deciding, math.nan)
 
     @staticmethod
     def _pixels(output: Tensor, truth: Region) -> Tensor | None:
@@ -152,24 +154,28 @@ class Segmentation(ClassTask):
     # ---- in words ---------------------------------------------------------------------------------------------------
 
     def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
-        """Return the classes of most pixels of each picture, with the shares that they have."""
+        """Return the things that most pixels of each picture are given, with the shares that they have."""
         found = []
-        for classes in output.detach().argmax(dim=1):
-            shares, indices = classes.flatten().bincount(minlength=output.shape[1]).topk(min(count, output.shape[1]))
+        for one in output.detach():
+            said = one[:, (one.isfinite() | (one == -math.inf)).all(dim=0)].argmax(dim=0)
+            counts = said.bincount(minlength=len(one))
+            counts[list(self.nothing)] = 0
+            shares, indices = counts.topk(min(count, len(one)))
             rows = zip(indices.tolist(), shares.tolist(), strict=True)
-            found.append(tuple(Answer(self.name_of(i), i, n / classes.numel()) for i, n in rows if n))
+            listed = tuple(Answer(self.name_of(i), i, n / one[0].numel()) for i, n in rows if n)
+            found.append(listed or (Answer("nothing" if len(said) else NOT_A_NUMBER),))
         return found
 
     def judge(self, output: Tensor, truth: Region) -> list[Judgement]:
         """See `Task.judge`.
 
-        The answer is the class of most of the object's pixels; a wrong one where too few are right. Its probability is
-        the share of the object's pixels that are right.
+        The answer is the class of most of the object's pixels; a wrong one where too few are right, and "no bottle"
+        where most of these are background. Its probability is the share of the object's pixels that are right.
         """
         with torch.no_grad():
             scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
             return [
-                Judgement(score, margin, margin <= 0.0, *self._said(one, truth, right=margin <= 0.0))
+                Judgement.of(score, margin, *self._said(one, truth, right=margin <= 0.0))
                 for score, margin, one in zip(scores, margins, output, strict=True)
             ]
 
@@ -186,7 +192,10 @@ class Segmentation(ClassTask):
         accuracy = float(hits[mask].float().mean())
         shares = {self.name_of(i): round(n / len(pixels), 4) for i, n in enumerate(counts.tolist()) if n}
         payload = {"accuracy": round(accuracy, 4), "iou": round(float((hits & mask).sum() / (hits | mask).sum()), 4)}
-        return Answer(self.name_of(first), first, accuracy), {**payload, "pixels": shares}
+        said = Answer(self.name_of(first), first, accuracy)
+        if not right and first in self.nothing:
+            said = Answer(f"{NO}{self.name_of(truth.labels[0])}", None, accuracy)
+        return said, {**payload, "pixels": shares}
 
     @staticmethod
     def _correct(logits: Tensor, truth: Region) -> Tensor:

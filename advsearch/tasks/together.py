@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -82,13 +83,9 @@ class Together(Task):
 
     def _together(self, each: Sequence[Judgement]) -> Judgement:
         payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
-        return Judgement(
-            score=min(one.score for one in each) if all(one.score == one.score for one in each) else float("nan"),
-            margin=max(one.margin for one in each) if all(one.margin == one.margin for one in each) else float("nan"),
-            right=all(one.right for one in each),
-            answer=_joined([one.answer for one in each]),
-            payload=payloads if any(one is not None for one in payloads.values()) else None,
-        )
+        said = _joined([one.answer for one in each]), payloads if any(map(_there, payloads.values())) else None
+        margin = math.nan if any(one.not_a_number for one in each) else max(one.margin for one in each)
+        return Judgement.of(min(one.score for one in each), margin, *said)
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
         """See `Task.marks`: what is true once, and what each model says under its name."""
@@ -103,6 +100,10 @@ class Together(Task):
     def _each(self, output: Sequence[Outputs], truth: Truths) -> list[tuple[Any, Any, Any]]:
         """The task, the output and the truth of each model."""
         return list(zip(self.tasks, of_each(output), truth, strict=True))
+
+
+def _there(payload: object) -> bool:
+    return payload is not None
 
 
 def _joined(answers: Sequence[Answer]) -> Answer:

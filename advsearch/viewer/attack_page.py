@@ -17,7 +17,7 @@ from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.failures import FAILURE_HEADS, answered_text, failure_rows, failures_text, range_text
 from advsearch.report.markup import Html, element, join
 from advsearch.report.method import PLAN_HEADS, method_facts, plan_rows, plan_text
-from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text, objective_label
+from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, is_command, marks_text, objective_label
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, FoundValue, UsualAnswer
@@ -181,24 +181,25 @@ def _rates(summary: AttackSummary) -> Html:
     control, average, baseline = summary.clean.control, summary.average, summary.baseline
     success, rows = wording.success(summary), []
     if control:
-        rows.append(("Clean scene (control group)", "right", control.correct, control.trials, control.interval))
+        clean = control.correct, control.trials, control.interval, control.not_a_number
+        rows.append(("Clean scene (control group)", "right", *clean))
     random = f"{baseline.policy.capitalize()} search" if baseline else ""
     for name, rated in (("Adversarial", summary.verified), (random, baseline.verified if baseline else None)):
         if rated:
-            rows.append((name, success, rated.successes, rated.trials, rated.interval))
+            rows.append((name, success, rated.successes, rated.trials, rated.interval, rated.not_a_number))
     if average:
         average_case = "Average case (random configurations)"
-        rows.append((average_case, "right", average.correct, average.configurations, average.interval))
+        rows.append((average_case, "right", average.correct, average.configurations, average.interval, 0))
     lines = [
         element(
             "tr",
             element("th", name, scope="row"),
             element("td", what),
-            element("td", f"{number} of {trials}", class_="number"),
+            element("td", wording.tally("", number, trials, nothing).removeprefix(" in "), class_="number"),
             element("td", wording.interval_text(interval), class_="number"),
             element("td", _bar(number / trials, interval), class_="hide-small"),
         )
-        for name, what, number, trials, interval in rows
+        for name, what, number, trials, interval, nothing in rows
     ]
     if not lines:
         return Html("")
@@ -255,6 +256,7 @@ def _cost(summary: AttackSummary) -> Html:
         "Policy": f"{summary.policy}, {wording.count(summary.steps, 'step')}",
         "Goal": wording.goal_text(summary),
         "Budget": wording.budget_text(summary),
+        "Objective": wording.objective_text(summary),
         "Over": wording.over_text(summary),
         "Smallest epsilon": wording.smallest_text(summary),
         "Renders": wording.renders_text(summary),
@@ -278,13 +280,17 @@ def _method(summary: AttackSummary) -> Html:
 
 
 def _repeat(data: RunData) -> Html:
-    commands = [shlex.join(["advsearch", "run", f"{data.summary.run or data.path}/{directory.CONFIG}"])]
-    if data.summary.command_line:
-        commands.append(data.summary.command_line)
+    commands = [data.summary.command_line] if data.summary.command_line else []
+    if is_command(data.summary.command_line):
+        commands.insert(0, shlex.join(["advsearch", "run", f"{data.summary.run or data.path}/{directory.CONFIG}"]))
     recipe = None
     if data.recipe:
         recipe = element("details", element("summary", "All settings"), element("pre", data.recipe, class_="wrap"))
-    return join(element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe)
+    on: list[Html] = []
+    if data.summary.goes_on:
+        resume = shlex.join(["advsearch", "resume", str(data.summary.run or data.path)])
+        on = [element("h2", "Go on, and verify the answer"), element("pre", resume, class_="wrap")]
+    return join(*on, element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe)
 
 
 def _section(heading: str, figures: Iterable[Html | None], css: str = "", note: str = "") -> Html:

@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.described import Value
+from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.files import JsonObject
 from advsearch.runs.store import NAME, Row, Store
 
@@ -151,7 +151,7 @@ def columns_of(rows: Iterable[Row]) -> Columns:
     for number, row in enumerate(rows):
         steps.append(row.step)
         margins.append(math.nan if row.margin is None else row.margin)
-        answers.add(row.label or "")
+        answers.add(row.label or ("" if row.correct is None else NOT_A_NUMBER))
         share = row.probability
         shares.append(NO_PROBABILITY if share is None else round(10_000 * min(max(share, 0.0), 1.0)))
         right.append(UNKNOWN if row.correct is None else int(row.correct))

@@ -17,7 +17,7 @@ from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
-from advsearch.report.phrases import percent
+from advsearch.report.phrases import beside_text, is_command, percent
 from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
@@ -174,6 +174,8 @@ def verdict(summary: SweepSummary) -> str:
     """Return what a sweep came to, in one sentence."""
     if not summary.configurations:
         return "No configuration was looked at."
+    if summary.beside and summary.beside.pairs:
+        return " ".join(beside_text(summary.beside.answer, one) for one in summary.beside.pairs)
     share = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
     ended = "" if summary.configurations == summary.planned else f" so far, of {summary.planned} planned"
     return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share})."
@@ -235,7 +237,9 @@ def _worst_text(summary: SweepSummary) -> str:
         return ""
     where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
     told, rate = f"{where}: the model answers {worst.claimed.label}", worst.verified
-    return f"{told}; wrong in {rate.successes} of {rate.trials} fresh renders." if rate else f"{told}."
+    if rate is None:
+        return f"{told}."
+    return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."
 
 
 def _figure(file: Path, caption: str, *, wide: bool = False) -> Html | None:
@@ -267,7 +271,9 @@ def _cost(path: Path, summary: SweepSummary) -> Html:
         "Samples a pixel": str(summary.spp),
         "Image formation": wording.formation_text(summary.image_formation) if summary.image_formation else "",
         "Seed": str(summary.seed),
-        "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"]),
+        "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"])
+        if is_command(summary.command_line)
+        else "",
         "Command": summary.command_line,
     }
     return join(element("h2", "Cost and conditions"), facts_table(facts))

@@ -13,9 +13,13 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.api.attack import budget_of, problem_from_config
+from advsearch.cli.attack import answer as answer_text
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.progress import NullProgress
+from advsearch.runs.listing import listed
 from advsearch.runs.store import Row, Store
 
 SIZE = 32
@@ -287,3 +291,60 @@ def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
     looks = [row for row in rows if row.step >= summary.steps]
     assert len(rows) - len(looks) == 12 and {row.spp for row in rows} == {4}
     assert 8 <= len(looks) <= 4 * (2 + 4) and len(rows) == summary.renders["search"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "steps", "draws"),
+    [
+        ({"controls": "texture"}, 40, 1),
+        ({"controls": "texture", "over": "camera"}, 400, 8),
+        ({"controls": "texture", "over": "camera", "specialise": False}, 150, 4),
+        ({"controls": "texture", "over": "haze"}, 150, 4),
+        ({"controls": "pose", "over": "camera"}, 40, 4),
+        ({"controls": "pose", "over": "camera", "steps": 7}, 7, 4),
+        ({"controls": "texture", "over": "camera", "draws": 3}, 400, 3),
+    ],
+)
+def test_a_search_is_as_long_as_what_is_asked_needs(asked: dict[str, Any], steps: int, draws: int) -> None:
+    config = AttackConfig(object="mug", resolution=8, threads=1, **asked)
+    problem, _ = problem_from_config(config)
+    assert (budget_of(config, problem).steps, problem.draws) == (steps, draws)
+
+
+def test_a_search_over_conditions_says_how_long_it_is(scene: advsearch.Scene, level: float) -> None:
+    told: list[str] = []
+
+    class Told(NullProgress):
+        def message(self, text: str) -> None:
+            told.append(text)
+
+    small: dict[str, Any] = {**FAST, "resolution": (8, 8), "baseline": False, "trials": 6, "controls": "pose"}
+    asked = {**small, "over": {"light": {"power": [0, 1]}}, "steps": 2}
+    advsearch.attack(scene, model(level + 0.02), **asked, progress=Told())
+    assert any(
+        text.startswith("One answer for many conditions: 2 steps, each over 4 conditions; `steps`") for text in told
+    )
+    told.clear()
+    advsearch.attack(scene, model(level + 0.02), **asked, draws=1, progress=Told())
+    assert not any("many conditions" in text for text in told)
+
+
+def test_an_answer_whose_check_is_interrupted_is_told_and_verified_later(
+    scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, wrong = tmp_path / "run", model(level + 0.02)
+    asked: dict[str, Any] = {**FAST, "controls": {"light": {"power": [0, 40]}}, "baseline": False, "run": run}
+
+    def stopped(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("advsearch.engine.verifier.choose_spp", stopped)
+        first = advsearch.attack(scene, wrong, **asked)
+    said = "The answer so far is not verified: the model calls this mug a vase."
+    assert first.summary.ending == "interrupted" and first.summary.verified is None and first.search is not None
+    assert said in answer_text(first.summary) and said in (run / "report.html").read_text()
+    assert "advsearch resume" in (run / "report.html").read_text()
+    assert listed(tmp_path)[0].answer == "vase, unverified"
+    done = advsearch.attack(scene, wrong, **asked, resume=True)
+    assert done.found and torch.equal(done.u, first.u) and listed(tmp_path)[0].answer == "6/6"

@@ -90,10 +90,11 @@ def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[Attack
 
 @pytest.mark.parametrize("several", [{"object": "mug,bowl"}, {"object": "mug", "epsilon": (0.1, 0.2)}])
 def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
-    several: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    several: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    run = str(tmp_path / "it")
     monkeypatch.setattr(studies, "curve_from_config", lambda config, **more: samples.curve(run=config.run))
-    assert carry_out(AttackConfig(**several, run="it")) == samples.curve(run="it")
+    assert carry_out(AttackConfig(**several, run=run)) == samples.curve(run=run)
 
 
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:

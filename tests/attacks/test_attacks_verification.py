@@ -24,6 +24,8 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.region import GrownBox
+from advsearch.attacks.sample_count import most_samples
+from advsearch.attacks.trials import paired_difference
 from advsearch.attacks.verification import EASIER, LEAST_RATE, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.config import FEWEST_SAMPLES, FEWEST_TRIALS
 from advsearch.errors import InputError
@@ -109,6 +111,29 @@ def test_trials_have_a_rate_and_its_interval() -> None:
 # ---- sample counts
 
 
+@pytest.mark.parametrize(
+    ("counts", "low", "high"),
+    [((20, 2, 12, 16), 0.0562, 0.3292), ((36, 2, 12, 0), 0.0569, 0.3404), ((20, 12, 2, 16), -0.3292, -0.0562)],
+)
+def test_the_difference_of_pairs_is_that_of_the_paper(
+    counts: tuple[int, int, int, int], low: float, high: float
+) -> None:
+    """Newcombe's own examples for his method 10."""
+    difference, interval = paired_difference(*counts)
+    assert difference == pytest.approx((counts[2] - counts[1]) / sum(counts))
+    assert interval == pytest.approx((low, high), abs=6e-5)
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.3, 0.1), (0.05, 0.05)])
+def test_the_interval_of_pairs_covers_the_difference(first: float, second: float) -> None:
+    """Of 60 pairs in which the two go together in half of all."""
+    rng, true, covered = np.random.default_rng(0), second - first, 0
+    for counts in rng.multinomial(60, [0.5, first, second, 0.5 - first - second], size=2000).tolist():
+        low, high = paired_difference(*counts)[1]
+        covered += low <= true <= high
+    assert 0.94 < covered / 2000 < 0.99
+
+
 def drifting(limit: float, bias: float, noise: float) -> Callable[[int, int], float]:
     """A margin as Monte Carlo noise makes it: bias and variance fall with the sample count."""
 
@@ -123,8 +148,8 @@ def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
     assert (choice.spp, choice.converged, choice.renders) == (16, True, 16), "the first look is enough"
     assert [(r.name, r.spp) for r in choice.table] == [
         ("clean", 4),
-        ("adversarial", 4),
         ("clean", 16),
+        ("adversarial", 4),
         ("adversarial", 16),
     ]
     assert math.isnan(choice.table[0].drift)
@@ -162,7 +187,44 @@ def test_noise_alone_is_no_proof_that_nothing_drifts(seed: int) -> None:
 
 def test_a_margin_at_zero_never_settles_and_says_so() -> None:
     choice = choose_spp({"adversarial": drifting(0.0, 0.0, 0.3)}, seed=0, ladder=(16, 64, 256))
-    assert (choice.spp, choice.converged, choice.renders) == (256, False, 24)
+    assert (choice.spp, choice.converged) == (256, False)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_has_settled_is_not_rendered_with_more_samples(seed: int) -> None:
+    spent: dict[str, list[int]] = {"adversarial": [], "clean": []}
+
+    def counted(name: str, margin: Callable[[int, int], float]) -> Callable[[int, int], float]:
+        return lambda spp, seed: spent[name].append(spp) or margin(spp, seed)  # type: ignore[func-returns-value]
+
+    margins = {"adversarial": drifting(3.0, 1.0, 0.3), "clean": drifting(-6.0, 0.0, 0.1)}
+    choice = choose_spp({name: counted(name, margin) for name, margin in margins.items()}, seed=seed)
+    assert choice.converged and choice.spp == max(spent["adversarial"]) >= 64
+    assert max(spent["clean"]) == 16 and choice.renders == sum(map(len, spent.values()))
+
+
+def test_a_decision_that_no_rung_can_settle_is_seldom_rendered_up_to_the_last() -> None:
+    """At the decision the noise of 256 samples would have to be far less than what that of 16 and 64 foretells."""
+    spent: list[int] = []
+
+    def at_the_decision(spp: int, seed: int) -> float:
+        spent.append(spp)
+        return drifting(0.0, 0.0, 0.5)(spp, seed)
+
+    for seed in range(20):
+        choice = choose_spp({"adversarial": at_the_decision, "clean": drifting(-6.0, 0.0, 0.1)}, seed=seed)
+        assert (choice.spp, choice.converged) == (256, False)
+        assert {rung.name for rung in choice.table} == {"adversarial"}, "the other one decides nothing any more"
+    assert sum(spent) < 0.7 * 20 * most_samples(1)
+
+
+@pytest.mark.parametrize(("limit", "bias", "noise"), [(1.0, 1.0, 0.1), (3.0, 3.0, 0.5), (-2.0, -2.0, 0.2)])
+def test_a_margin_that_drifts_across_the_decision_is_followed_to_where_it_stands(
+    limit: float, bias: float, noise: float
+) -> None:
+    """At 16 samples it is zero; how far it has moved says that it may move on."""
+    choices = [choose_spp({"adversarial": drifting(limit, bias, noise)}, seed=seed) for seed in range(20)]
+    assert all(one.converged and one.spp == 256 for one in choices)
 
 
 def test_every_render_of_a_sample_count_has_its_own_seed_and_both_groups_share_them() -> None:

@@ -491,6 +491,31 @@ def test_region_takes_scene_and_controls_from_the_run_that_it_goes_around(
     assert (config.seed, config.run, config.around, config.set_) == (9, None, "first", {"camera.azimuth": 20.0})
 
 
+@pytest.mark.parametrize("grid", [True, False])
+def test_a_sweep_takes_scene_and_model_from_the_run_whose_answer_it_sweeps(
+    api: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    theirs = AttackConfig(
+        object="bowl", environment="noon", set_={"camera.azimuth": 20}, label="bowl", epsilon=0.3, steps=9, spp=4,
+        over={"pose": {"yaw": [0, 90]}}, run="runs/first",
+    )  # fmt: skip
+    with RunDirectory.create_for(theirs):
+        pass
+    given: list[Any] = []
+    api(noting(given, samples.sweep()))
+    assert (
+        main(f"sweep --answer-of first --environment dusk {'--grid pose.yaw=0,90' if grid else ''} --quiet".split())
+        == 0
+    )
+    (config,) = given
+    assert (config.object, config.environment, config.label, config.set_, config.spp) == (
+        "bowl", "dusk", "bowl", {"camera.azimuth": 20.0}, None,
+    )  # fmt: skip
+    assert config.answer_of == "first" and config.run is None
+    assert config.controls == ({} if grid else {"pose": {"yaw": [0, 90]}})
+
+
 def test_region_needs_an_object_or_a_run(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["region"]) == 2
     assert "advsearch region: expected --object NAME, or --around RUN" in capsys.readouterr().err

@@ -80,6 +80,14 @@ def test_labels_are_listed_from_the_file_alone(
     assert "none of the 9 labels is like 'xyzzy'; leave the word out" in capsys.readouterr().err
 
 
+def test_what_stands_for_no_thing_is_no_label_to_choose(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["labels", "--labels", "coco91"]) == 0
+    out = capsys.readouterr().out
+    assert "background" not in out and "N/A" not in out and out.splitlines()[0].split() == ["#1", "person"]
+    assert main(["labels", "background", "--labels", "voc"]) == 0, "unless it is asked for"
+    assert capsys.readouterr().out.split() == ["#0", "background"]
+
+
 def test_labels_of_the_bundled_model(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["labels", "pan"]) == 0
     assert capsys.readouterr().out.split()[1:] == ["frying", "pan"]

@@ -180,6 +180,37 @@ def test_a_cluster_is_an_address_a_file_or_this_machine(tmp_path: Path) -> None:
     assert set(CLASSES.values()) == {"dask_jobqueue", "dask_kubernetes.operator"}
 
 
+SCRIPTS = {
+    "ask()": False,
+    "with open(__file__):\n    ask()": False,
+    "def main():\n    ask()\nmain()": False,
+    "import threading\none = threading.Thread(target=ask)\none.start()\none.join()": False,
+    "if __name__ == '__main__':\n    ask()": True,
+    "def main():\n    ask()\nif '__main__' == __name__:\n    main()": True,
+    "if __name__ != '__main__':\n    raise SystemExit\nask()": True,
+}
+
+
+@pytest.mark.parametrize("text", SCRIPTS)
+def test_a_script_that_every_worker_would_run_again_is_told_what_to_do(tmp_path: Path, text: str) -> None:
+    script = tmp_path / "script.py"
+    begin = "from advsearch.cluster.opening import place_of\ndef ask():\n    place_of(2, None)\n"
+    script.write_text(begin + text, encoding="utf-8")
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environ, check=False)
+    last = done.stderr.strip().rpartition("\n")[2]
+    wanted = f'workers: expected {script} to ask under `if __name__ == "__main__":`, got a call outside of it, in line'
+    assert (wanted in last) is not SCRIPTS[text], done.stderr
+    assert SCRIPTS[text] or done.stderr.count("\n") < 20
+
+
+def test_a_script_that_comes_through_a_pipe_has_no_workers() -> None:
+    script = "from advsearch.cluster.opening import place_of; place_of(2, None)"
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable], input=script, capture_output=True, text=True, env=environ, check=False)
+    assert "expected a script that they can import, got <stdin>; put it into a file" in done.stderr
+
+
 def test_without_dask_the_message_is_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"needs Dask; pip install 'advsearch\[dask\]'"):

@@ -56,7 +56,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "epsilon": ("nan", "expected a number greater than 0 and at most 1e+06, got nan"),
     "seconds": (0, "expected a number greater than 0 and at most 1e9, got 0"),
-    "target": ([3], "expected names of classes or their numbers, separated by commas, got [3]"),
+    "target": ([3.5], "expected names of classes or their numbers, separated by commas, got [3.5]"),
     "minimise": ("maybe", "expected true or false, got maybe"),
     "smallest": (2, "expected true or false, got 2"),
     "over": ({"camera": 3}, "expected names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}, got camera=3"),
@@ -121,6 +121,40 @@ def of_command_line(line: str, config: type[Given] = AttackConfig) -> Given:  # 
     flags.add_settings(parser, config=config)
     args = parser.parse_args(shlex.split(line)[2:])
     return flags.config_from(args, config)
+
+
+def test_a_run_of_an_older_version_says_its_draws_also_where_there_are_none(tmp_path: Path) -> None:
+    (tmp_path / "run.yaml").write_text("object: mug\nsteps: 40\ndraws: 4\nover: {}\n")
+    assert AttackConfig.from_yaml(tmp_path / "run.yaml").steps == 40
+
+
+@pytest.mark.parametrize("flag", ["control", "over"])
+def test_several_controls_with_settings_may_stand_in_one_flag(flag: str) -> None:
+    written = 'pose, camera={azimuth: [0, 90], elevation: 20}, environment={which: [a, "b, {c"]},texture'
+    config = of_command_line(f"advsearch attack --object mug --control light --{flag} {shlex.quote(written)}")
+    expected = {
+        "pose": {},
+        "camera": {"azimuth": [0, 90], "elevation": 20},
+        "environment": {"which": ["a", "b, {c"]},
+        "texture": {},
+    }
+    assert (config.over if flag == "over" else config.controls) == (
+        expected if flag == "over" else {"light": {}, **expected}
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "camera={azimuth: [0, 90]} pose={yaw: 20}",
+        "camera={azimuth: [0, 90]; pose={yaw: 20}",
+        "pose,camera={azimuth=[0, 90]},texture",
+        "camera={azimuth: [0, 90],pose={yaw: 20}",
+    ],
+)
+def test_settings_in_braces_that_cannot_be_read_say_how_they_are_written(text: str) -> None:
+    with pytest.raises(InputError, match=r"--control camera: expected \{PARAMETER: .* a colon and a space behind each"):
+        of_command_line(f"advsearch attack --object mug --control {shlex.quote(text)}")
 
 
 @pytest.mark.parametrize("setting", settings(AttackConfig), ids=lambda setting: setting.name)

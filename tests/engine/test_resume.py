@@ -110,6 +110,32 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("trials", [5, 13, 16])
+def test_an_interrupt_of_the_check_keeps_the_answer_and_going_on_verifies_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials: int
+) -> None:
+    """In the first of what finds the samples, in the control group, and in the trials of the answer."""
+    config = configuration().model_copy(update={"verify_spp": None if trials == 5 else 8})
+    whole, rendered, once = carry_out(tmp_path / "whole", config), 0, StandInProblem.trial
+
+    def trial(self: Any, *args: Any, **settings: Any) -> Any:
+        nonlocal rendered
+        rendered += 1
+        if rendered == trials:
+            raise KeyboardInterrupt
+        return once(self, *args, **settings)
+
+    monkeypatch.setattr(StandInProblem, "trial", trial)
+    stopped = carry_out(tmp_path / "run", config)
+    assert stopped.interrupted and stopped.verification is None
+    assert stopped.search is not None and whole.search is not None
+    assert torch.equal(stopped.search.best_u, whole.search.best_u)
+    resumed = carry_out(tmp_path / "run", config, resume=True)
+    assert resumed.verification is not None and whole.verification is not None
+    assert resumed.verification.adversarial == whole.verification.adversarial
+    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
+
+
 def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         problem: Any = StandInProblem()

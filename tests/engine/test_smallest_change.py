@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -13,25 +16,22 @@ from advsearch.attacks import Block, Domain, Ending, SearchResult
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.engine.smallest_change import CONFIRMED, find_smallest
 
+DOMAIN = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
 
-def test_on_the_way_a_few_trials_do_and_at_the_end_it_is_all() -> None:
-    """What is wrong in every trial passes on 6, what is wrong in none fails on the second, and the end has 40."""
-    domain, tried = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),)), Counter[str]()
+
+def finding(trial: Callable[[str, int, Tensor], Any]) -> Any:
+    """Look for the smallest change with these trials, of searches that answer with the largest; return the findings,
+    also where one of the trials is interrupted."""
 
     def search(kind: str, policy: Any, steps: int, seed: int, *, domain: Domain, ranked: bool) -> SearchResult:
         assert ranked, "it was rendered"
         u = domain.project(torch.ones(2))
         return SearchResult(u, 1.0, 1.0, 1.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
 
-    def trial(kind: str, number: int, u: Tensor) -> Any:
-        tried[kind] += 1
-        score = float(u[0]) - 0.6
-        return SimpleNamespace(score=score, success=score > 0.0)
-
     def said(*_: Any, **__: Any) -> None:
         pass
 
-    problem = SimpleNamespace(domain=domain, seed=0, rule=WORST_CASE)
+    problem = SimpleNamespace(domain=DOMAIN, seed=0, rule=WORST_CASE)
     findings = SimpleNamespace(transport=None, smallest=None, search=None)
     budget = SimpleNamespace(steps=1, trials=20)
     searches: Any = SimpleNamespace(
@@ -39,8 +39,43 @@ def test_on_the_way_a_few_trials_do_and_at_the_end_it_is_all() -> None:
     )
     progress = SimpleNamespace(progress=SimpleNamespace(advance=said))
     verifier: Any = SimpleNamespace(begin=said, trial=trial, stages=progress)
-    find_smallest(searches, verifier)
+    with suppress(KeyboardInterrupt):
+        find_smallest(searches, verifier)
+    return findings
+
+
+def outcome(u: Tensor) -> Any:
+    score = float(u[0]) - 0.6
+    return SimpleNamespace(score=score, success=score > 0.0)
+
+
+def test_on_the_way_a_few_trials_do_and_at_the_end_it_is_all() -> None:
+    """What is wrong in every trial passes on 6, what is wrong in none fails on the second, and the end has 40."""
+    tried = Counter[str]()
+
+    def trial(kind: str, number: int, u: Tensor) -> Any:
+        tried[kind] += 1
+        return outcome(u)
+
+    findings = finding(trial)
     assert findings.smallest.closed and findings.smallest.confirmed
     last = [f"check {findings.smallest.checks - one}" for one in (1, 2)]
     assert sum(tried[kind] for kind in last) == CONFIRMED
     assert {tried[kind] for kind in tried if kind not in last} == {6, 2}
+
+
+@pytest.mark.parametrize("stop", [1, 7, 30])
+def test_an_interrupt_on_the_way_keeps_the_smallest_answer_so_far(stop: int) -> None:
+    tried, passed = Counter[str](), [DOMAIN.project(torch.ones(2))]
+
+    def trial(kind: str, number: int, u: Tensor) -> Any:
+        if sum(tried.values()) == stop - 1:
+            raise KeyboardInterrupt
+        tried[kind] += 1
+        if tried[kind] == 6 and outcome(u).success:
+            passed.append(u)
+        return outcome(u)
+
+    findings = finding(trial)
+    assert findings.smallest is None and torch.equal(findings.search.best_u, passed[-1])
+    assert (len(passed) > 2) == (stop == 30)

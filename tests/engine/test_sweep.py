@@ -23,6 +23,7 @@ from conftest import ROOT
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
+from samples import attack as attack_result
 from samples import sweep as swept
 from torch import Tensor, nn
 
@@ -35,7 +36,7 @@ from advsearch.cli.flags import READERS, help_text, with_flags
 from advsearch.cli.main import main
 from advsearch.cli.question import QuestionCommand
 from advsearch.cli.sweep import answer
-from advsearch.config import SweepConfig
+from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.domains import domain_of
@@ -44,8 +45,9 @@ from advsearch.engine.sweeps.axes import axis_values, on_grid, read_axes
 from advsearch.engine.sweeps.batch import KIND
 from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.points import BINS, Points
-from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.errors import AdvsearchError, InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
+from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import plain
 from advsearch.runs.results.sweep import SweepSummary
@@ -133,6 +135,7 @@ COMPARED = (
     "seed",
     "spp",
     "objective",
+    "score",
     "success",
     "correct",
     "margin",
@@ -515,8 +518,8 @@ def test_the_worst_is_the_largest_margin_and_is_rendered_again(tmp_path: Path) -
     rows = list(result.rows())
     worst = result.summary.worst
     assert worst is not None and worst.verified is not None
-    best = max(rows, key=lambda row: row.objective or -math.inf)
-    assert worst.configuration == best.step and worst.claimed.margin == best.objective
+    best = max(rows, key=lambda row: row.score or -math.inf)
+    assert worst.configuration == best.step and worst.claimed.margin == best.score
     assert plain(worst.values) == best.values and worst.seed == best.seed and worst.claimed.label == "vase"
     checked = worst.verified
     assert (checked.successes, checked.trials, checked.spp) == (7, 7, 36) and checked.labels == {"vase": 7}
@@ -638,10 +641,11 @@ def test_answers_that_are_not_finite_are_counted_and_not_right() -> None:
 
     victim = advsearch.load_model(Fails(), labels=LABELS, input_size=SIZE, name="fails")
     result = advsearch.sweep("mug", victim, {"pose.yaw": "0:360:40"}, trials=0)
-    bad = [row for row in result.rows() if row.objective is None]
+    bad = [row for row in result.rows() if row.score is None]
     assert bad and all((row.correct, row.margin) == (False, None) for row in bad)
     assert result.summary.not_finite == len(bad)
-    assert any("not finite; they count as not right" in text for text in result.summary.warnings)
+    assert any("not numbers; they count as not right" in text for text in result.summary.warnings)
+    assert all((row.label, row.label_index) == (None, None) for row in bad)
     assert result.summary.worst is not None and math.isfinite(result.summary.worst.claimed.margin)
 
 
@@ -693,7 +697,7 @@ def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     assert rows_of(path) == rows
     assert timeless(again.summary) == summary
     rendered_again = FakeRenderer.calls - before - (WHOLE - stops_at)
-    assert 0 <= rendered_again < (4 if stops_at < PICTURES else 9)  # a batch; or what chose the sample count
+    assert 0 <= rendered_again < (5 if stops_at < PICTURES else 9)  # a look and a batch; or what chose the sample count
 
 
 def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path) -> None:
@@ -908,13 +912,13 @@ def test_a_small_sweep_really_rendered_is_repeatable(tmp_path: Path) -> None:
     assert rows_of(tmp_path / "a") == rows_of(tmp_path / "b")
     assert timeless(first.summary) == timeless(second.summary)
     rows = list(first.rows())
-    assert len({row.objective for row in rows}) == 4
+    assert len({row.score for row in rows}) == 4
     scene = advsearch.load_scene("mug", settings={"pose.yaw": 180.0, "camera.elevation": 60.0})
     render = scene.renderer({"pose": {"yaw": [0, 360]}}, resolution=16)
     with torch.no_grad():
         picture = render(render.start, seed=rows[3].seed or 0, spp=1)
         logits = model()((picture * 255.0).round() / 255.0)
-    assert float(logits[0, 1] - logits[0, 0]) == pytest.approx(rows[3].objective, abs=0.2)
+    assert float(logits[0, 1] - logits[0, 0]) == pytest.approx(rows[3].score, abs=0.2)
 
 
 @pytest.mark.parametrize("keep", ["all", "wrong", "none"])
@@ -933,3 +937,111 @@ def test_pictures_are_kept_as_asked(tmp_path: Path, keep: Literal["all", "wrong"
 def test_pictures_without_a_run_have_no_place() -> None:
     with pytest.raises(InputError, match=r"keep_pictures.*run"):
         advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, keep_pictures="all")
+
+
+# ---- the answer of a run beside the clean scene ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over the pose, whose answer is put in by hand."""
+    folder = tmp_path_factory.mktemp("runs") / "turned"
+    controls = {"pose": {"yaw": [0, 180]}, "light": {"power": [0, 40]}}
+    config = AttackConfig(object="mug", controls=controls, over={"camera": {"elevation": [5, 60]}}, run=str(folder))
+    with RunDirectory.create_for(config) as run:
+        run.write_summary(attack_result(run=str(folder), ending="interrupted", verified=None))
+        write_answer(run.path, np.array([0.5, 0.25], dtype=np.float32))
+    return folder
+
+
+def test_an_answer_has_the_draws_and_the_noise_of_the_clean_scene(attacked: Path, tmp_path: Path) -> None:
+    result = advsearch.sweep(
+        model=model(), answer_of=attacked, grid={"camera.azimuth": [0, 90]}, controls="corruption", samples=3, batch=2,
+        sampler="random", trials=0, run=tmp_path / "run",
+    )  # fmt: skip
+    rows = list(result.rows())
+    clean, answer = rows[:6], rows[6:]
+    assert [row.values["answer"]["value"] for row in rows] == ["clean"] * 6 + ["turned"] * 6
+    assert [row.seed for row in clean] == [row.seed for row in answer] and len({row.seed for row in clean}) == 6
+    for one, other in zip(clean, answer, strict=True):
+        drawn = {name: value for name, value in one.values.items() if name.startswith(("camera.", "corruption."))}
+        assert len(drawn) > 1 and drawn == {name: other.values[name] for name in drawn}
+        assert not any(name.startswith(("pose", "light")) for name in (*one.values, *other.values)), "these stand still"
+
+
+class Turned(FakeRenderer):
+    """Brighter the further the object is turned."""
+
+    def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        yaw = float(self.space.describe(u)["pose.yaw"]["value"])
+        return 0.6 * super().__call__(u, seed, spp) + yaw / 400.0
+
+
+def test_both_rates_stand_side_by_side_with_what_the_pairs_say(
+    attacked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(swept_scene, "make_renderer", Turned)
+    two = [model(0.5, "one"), model(0.55, "two")]
+    result = advsearch.sweep(model=two, answer_of=attacked, samples=40, trials=0, run=tmp_path / "run")
+    beside, rows = result.summary.beside, list(result.rows())
+    assert beside is not None and beside.answer == "turned" and [one.model for one in beside.pairs] == ["one", "two"]
+    assert result.summary.controls == ["camera"], "what the attack was over"
+    for number, pair in enumerate(beside.pairs):
+        right = [bool(row.correct) for row in rows[number::2]]
+        pairs = list(zip(right[:40], right[40:], strict=True))
+        assert pair.both == pairs.count((True, True)) and pair.neither == pairs.count((False, False))
+        assert pair.clean_only == pairs.count((True, False)) and pair.answer_only == pairs.count((False, True))
+        assert pair.clean.correct == sum(right[:40]) and pair.answer.correct == sum(right[40:])
+        assert pair.difference == pytest.approx((sum(right[40:]) - sum(right[:40])) / 40)
+    assert beside.pairs[0].clean_only > 0
+    said = answer(result.summary)
+    assert f"one is right in {beside.pairs[0].clean.correct} of 40" in said and "with the answer of turned" in said
+    assert "two is right in" in (tmp_path / "run" / "report.html").read_text()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FakeRenderer, "stops_at", FakeRenderer.calls + 60)
+        stopped = advsearch.sweep(model=two, answer_of=attacked, samples=40, trials=0, run=tmp_path / "stopped")
+    assert stopped.summary.ending == "interrupted" and stopped.summary.beside is not None
+    again = advsearch.sweep(model=two, answer_of=attacked, samples=40, trials=0, run=tmp_path / "stopped")
+    assert again.summary.beside == beside and rows_of(tmp_path / "stopped") == rows_of(tmp_path / "run")
+
+
+def test_what_is_rendered_with_an_answer_is_the_answer_really_rendered(attacked: Path) -> None:
+    grid = {"camera.azimuth": [20, 110]}
+    small: dict[str, Any] = {"resolution": SIZE, "spp": 4, "trials": 0, "denoise": "none"}
+    both = advsearch.sweep(model=model(), answer_of=attacked, grid=grid, **small)
+    margins = [row.margin or 0.0 for row in both.rows()]
+    clean, answer = margins[:2], margins[2:]
+    turned = advsearch.load_scene("mug", settings={"pose.yaw": 90.0})
+    found = advsearch.sweep(turned, model(), {**grid, "light.power": [10.0]}, **small)
+    plain = advsearch.sweep("mug", model(), {**grid, "light.power": [0.0]}, **small)
+    assert clean == pytest.approx([row.margin for row in plain.rows()], abs=1e-3)
+    assert answer == pytest.approx([row.margin for row in found.rows()], abs=1e-3)
+    assert abs(clean[0] - answer[0]) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"grid": {"pose.yaw": [0, 90]}}, "answer_of: the answer of .*turned says what pose is already; leave it out"),
+        ({"grid": {"camera.azimuth": [0]}, "answer_of": "nowhere"}, "unknown run 'nowhere'"),
+    ],
+)
+def test_an_answer_that_cannot_be_swept_is_refused(attacked: Path, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(AdvsearchError, match=message):
+        advsearch.sweep(model=model(), **{"answer_of": attacked, **settings})
+
+
+def test_an_answer_needs_a_run_that_has_one(tmp_path: Path, attacked: Path) -> None:
+    config = AttackConfig(object="mug", controls={"pose": {}}, run=str(tmp_path / "none"))
+    with RunDirectory.create_for(config) as run:
+        run.write_summary(attack_result(ending="already wrong", adversarial=None, verified=None))
+    with pytest.raises(InputError, match="none ended with 'already wrong', so that there is no answer to sweep"):
+        advsearch.sweep(model=model(), answer_of=tmp_path / "none", grid={"camera.azimuth": [0, 9]})
+    write_answer(attacked, np.array([0.5], dtype=np.float32))
+    try:
+        with pytest.raises(InputError, match="answer_of: the answer of turned has 1 numbers, and mug takes 2"):
+            advsearch.sweep(model=model(), answer_of=attacked, grid={"camera.azimuth": [0, 9]})
+    finally:
+        write_answer(attacked, np.array([0.5, 0.25], dtype=np.float32))
+    with pytest.raises(InputError, match="scene: expected what load_scene returns or takes"):
+        advsearch.sweep(grid={"camera.azimuth": [0, 9]})

@@ -302,8 +302,61 @@ def images(random: Random) -> Case:
     )
 
 
+def looks(random: Random) -> Case:
+    """Samplers, transforms of textures, colours of vertices, sparse accessors and strips, with hostile numbers."""
+    header, binary = parts(box_glb())
+    what = random.choice(("sampler", "transform", "colors", "sparse", "mode", "quantized", "alpha", "many"))
+    primitive, material = header["meshes"][0]["primitives"][0], header["materials"][0]
+    accessor = header["accessors"][primitive["attributes"][random.choice(("POSITION", "TEXCOORD_0"))]]
+    numbers = (*HOSTILE, *INTEGERS)
+    if what == "sampler":
+        wraps = (10497, 33648, 33071, *INTEGERS, "x")
+        header["samplers"] = [{"wrapS": random.choice(wraps), "wrapT": random.choice(wraps), "magFilter": 9728}]
+        for texture in header["textures"]:
+            texture["sampler"] = random.choice((0, 0, 0, 1))
+    if what in ("sampler", "transform"):
+        moved = {"offset": [random.choice(numbers)] * 2, "scale": [random.choice(numbers), 1.0]}
+        moved |= random.choice(({}, {"rotation": random.choice(numbers)}, {"texCoord": random.choice(INTEGERS)}))
+        uses = (material["pbrMetallicRoughness"]["baseColorTexture"], material["normalTexture"])
+        for use in random.sample(uses, random.choice((1, 2))):
+            use["extensions"] = {"KHR_texture_transform": moved}
+    elif what == "colors":
+        primitive["attributes"]["COLOR_0"] = random.randrange(len(header["accessors"]))
+    elif what == "sparse":
+        given = {
+            "bufferView": random.randrange(len(header["bufferViews"])),
+            "byteOffset": random.choice((0, *INTEGERS)),
+        }
+        count = random.choice((0, 1, 4, 10**7, *INTEGERS))
+        accessor["sparse"] = {"count": count, "values": given, "indices": {**given, "componentType": 5121}}
+        accessor["count"] = random.choice((accessor["count"], 10**7, 8 * 10**7))
+        if random.random() < 0.5:
+            del accessor["bufferView"]
+    elif what == "mode":
+        primitive["mode"] = random.choice((0, 3, 5, 6, 6, 7))
+        primitive.pop("indices" if random.random() < 0.5 else "material", None)
+    elif what == "quantized":
+        accessor |= {
+            "componentType": random.choice((5120, 5121, 5122, 5123, 5125)),
+            "normalized": random.random() < 0.5,
+        }
+        accessor["byteOffset"] = random.choice((0, 1, 3, 1000))
+    elif what == "alpha":
+        material |= {"alphaMode": random.choice(("MASK", "BLEND", "mask", 1)), "alphaCutoff": random.choice(numbers)}
+        material["pbrMetallicRoughness"]["baseColorFactor"] = [random.choice(numbers)] * 4
+    else:  # materials and primitives that share all they have
+        header["samplers"] = [{"magFilter": 9728, "wrapS": 33648}]
+        for texture in header["textures"]:
+            texture["sampler"] = 0
+        header["materials"] *= 1_000
+        header["meshes"][0]["primitives"] = [{**primitive, "material": number} for number in range(1_000)]
+    return case(random, f"looks: {what}", header, binary)
+
+
 MAKERS: tuple[Maker, ...] = (
     bytes_damaged,
+    looks,
+    looks,
     types_confused,
     counts,
     trees,

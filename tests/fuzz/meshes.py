@@ -12,7 +12,19 @@ from fuzz.case import OUTSIDE, Case, Maker, Random
 from fuzz.mutations import NUMBERS, damaged
 from fuzz.pictures import sample
 
-MTL = b"newmtl paint\nKd .2 .4 .6\nNs 20\nillum 2\nmap_Kd wood.png\nnewmtl plain\nKd 1 0 0\n"
+MTL = b"""newmtl paint # the first
+Kd .2 .4 .6
+Ns 20
+illum 2
+map_Kd -s 2 2 1 -o .1 .2 -mm 0 1 -clamp on wood.png
+map_Pr -imfchan r wood.png
+bump -bm .5 -t 1 1 1 wood.png
+newmtl plain
+Kd 1 0 0
+Tr .5
+Pm .3
+Ke 0 .1 0
+"""
 
 
 @cache
@@ -23,7 +35,38 @@ def box_obj() -> bytes:
     lines += [f"vt {x + 0.5} {y + 0.5}" for x, y, _ in box.vertices]
     lines += [f"vn {x} {y} {z}" for x, y, z in box.vertex_normals]
     faces = ["f " + " ".join(f"{k + 1}/{k + 1}/{k + 1}" for k in face) for face in box.faces]
-    return "\n".join(["mtllib thing.mtl", *lines, "usemtl paint", *faces[:6], "usemtl plain", *faces[6:], ""]).encode()
+    rest = ["s off", "usemtl plain", *faces[6:], "f 1 2 3 4 5 6 7 8", "f -1 -2 -3#", "l 1 2", "curv2 1 2", ""]
+    return "\n".join(["mtllib thing.mtl", *lines, "usemtl paint", *faces[:6], *rest]).encode()
+
+
+@cache
+def mapped_ply(order: str) -> bytes:
+    """Return an L-shaped face and a strip, with texture coordinates of corners, two textures and colours."""
+    scalars = {"vertex": "float x,float y,float z,ushort red,ushort green,ushort blue,float quality".split(",")}
+    header = f"ply\nformat {'binary_little_endian' if order else 'ascii'} 1.0\ncomment TextureFile wood.png\n"
+    header += "comment TextureFile wood.png\nelement vertex 6\n"
+    header += "".join(f"property {one}\n" for one in scalars["vertex"])
+    header += "element face 2\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
+    header += "property int texnumber\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    points = ((0, 0, 0), (2, 0, 0), (2, 1, 0), (1, 1, 0), (1, 2, 0), (0, 2, 0))
+    rows = [("3f3Hf", [*map(float, point), 65535, 0, 300, 0.5]) for point in points]
+    for face, number in ((range(6), 1), (range(3), 0)):
+        uvs = [0.1 * k for k in range(2 * len(face))]
+        rows.append((f"B{len(face)}iB{len(uvs)}fi", [len(face), *face, len(uvs), *uvs, number]))
+    rows.append(("6i", [5, 0, 1, 2, -1, 3]))
+    if order:
+        return header.encode() + b"".join(struct.pack(order + kinds, *values) for kinds, values in rows)
+    return (header + "".join(" ".join(map(str, values)) + "\n" for _, values in rows)).encode()
+
+
+@cache
+def coloured_stl(head: bytes) -> bytes:
+    """Return a box with colours of its facets."""
+    data = bytearray(box_file("stl"))
+    data[: len(head)] = head
+    for place in range(84, len(data), 50):
+        data[place + 48 : place + 50] = struct.pack("<H", 0x801C if place % 100 else 0x7000)
+    return bytes(data)
 
 
 @cache
@@ -83,6 +126,24 @@ def hostile_obj(random: Random) -> Case:
             + number
             + b"\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3\n"
         ),
+        "faces that cross themselves": lambda: (
+            vertices
+            + b"".join(
+                b"f " + b" ".join(b"%d" % (k * k * s % 50 + 1) for k in range(400)) + b"\n" for s in range(1, 40)
+            )
+        ),
+        "a comb of 2,000 teeth": lambda: (
+            b"".join(b"v %d %d 0\n" % (k, k % 2 * 9) for k in range(4000))
+            + b"v 4000 -1 0\nv 0 -1 0\nf "
+            + b" ".join(b"%d" % k for k in range(1, 4003))
+        ),
+        "a million options": lambda: b"mtllib thing.mtl\n" + vertices + b"usemtl plain\nf 1 2 3\n",
+        "5,000 material files": lambda: (
+            b"mtllib " + b" ".join(b"m%d.mtl" % k for k in range(5000)) + b"\n" + vertices + b"f 1 2 3\n"
+        ),
+        "smoothing for every face": lambda: (
+            vertices + b"".join(b"s %d\nf 1 2 %d\n" % (k, k % 40 + 3) for k in range(5000))
+        ),
         "continued lines": lambda: vertices + b"f 1 \\\n" * 100_000 + b"2 3\n",
         "escapes in names": lambda: b"mtllib \x1b]0;owned\x07.mtl\n" + vertices + b"usemtl \x1b[31mred\nf 1 2 3\n",
         "every face the same": lambda: vertices + b"f 1 2 3\n" * 50_000,
@@ -91,7 +152,8 @@ def hostile_obj(random: Random) -> Case:
         ),
     }
     what = random.choice(sorted(kinds))
-    files = {"thing.obj": kinds[what](), "thing.mtl": MTL, "wood.png": sample("PNG")}
+    mtl = MTL + b"map_Ka " + b"-s 1 1 1 " * 200_000 if "options" in what else MTL
+    files = {"thing.obj": kinds[what](), "thing.mtl": mtl, "wood.png": sample("PNG")}
     return Case(f"obj: {what}", "object", "thing.obj", files)
 
 
@@ -158,8 +220,9 @@ def special(random: Random) -> Case:
 def ply(random: Random) -> Case:
     """A damaged PLY."""
     encoding = random.choice(("ascii", "binary"))
-    what, data = damaged(random, box_file("ply", encoding))
-    return Case(f"ply: {encoding} {what}", "object", "thing.ply", {"thing.ply": data})
+    whole = random.choice((box_file("ply", encoding), mapped_ply("<" if encoding == "binary" else "")))
+    what, data = damaged(random, whole)
+    return Case(f"ply: {encoding} {what}", "object", "thing.ply", {"thing.ply": data, "wood.png": sample("PNG")})
 
 
 def hostile_ply(random: Random) -> Case:
@@ -178,6 +241,8 @@ def hostile_ply(random: Random) -> Case:
             "comment TextureFile wood.png\n",
             "element edge 1000000000\nproperty int vertex1\nproperty int vertex2\n",
             "element none 1000000000\n",
+            "element tristrips 1000000000\nproperty list uchar int vertex_indices\n",
+            "property list double double big\n",
         )
     )
     header = f"ply\nformat {kind} 1.0\nelement vertex {count}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -200,7 +265,8 @@ def hostile_ply(random: Random) -> Case:
 def stl(random: Random) -> Case:
     """A damaged STL."""
     encoding = random.choice(("ascii", "binary"))
-    what, data = damaged(random, box_file("stl", encoding))
+    binary = (box_file("stl", "binary"), coloured_stl(b"COLOR=\x10\x20\x30\xff"), coloured_stl(b"solid"))
+    what, data = damaged(random, box_file("stl", encoding) if encoding == "ascii" else random.choice(binary))
     return Case(f"stl: {encoding} {what}", "object", "thing.stl", {"thing.stl": data})
 
 

@@ -151,7 +151,12 @@ class _Worker:
         home = self._folder / "home"
         home.mkdir(exist_ok=True)
         here = Path(__file__).resolve().parents[1]
-        environment = {**os.environ, "HOME": str(home), "PYTHONPATH": str(here), "PYTHONDONTWRITEBYTECODE": "1"}
+        environment = {
+            **os.environ,
+            "HOME": str(home),
+            "PYTHONPATH": f"{here}{os.pathsep}{here.parent}",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
         self._process = subprocess.Popen(
             [sys.executable, "-m", "fuzz.worker", str(self._folder), self._loaders],
             stdin=subprocess.PIPE,

@@ -9,7 +9,7 @@ import sys
 import types
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -373,6 +373,28 @@ def test_a_probability_of_zero_keeps_a_finite_gradient() -> None:
 def test_log_probabilities_are_logits_already() -> None:
     model = load_model(Answering(lambda z: z.log_softmax(1)), input_size=8)
     assert not model.probabilities
+
+
+def test_percentages_are_probabilities_times_100() -> None:
+    with pytest.warns(ModelWarning, match=r"answers with percentages that sum to 100\. Their logarithm is used"):
+        model = load_model(Answering(lambda z: 100.0 * z.softmax(1)), input_size=8)
+    torch.testing.assert_close(model(images()).softmax(1), tiny()(images()).softmax(1))
+    with pytest.warns(ModelWarning, match=r"percentages"):
+        load_model(Answering(lambda z: 100.0 * z.softmax(1) + 0.02), input_size=8)
+
+
+@pytest.mark.parametrize(
+    ("function", "text"),
+    [
+        (torch.sigmoid, r"scores in \[0, 1\] that do not sum to 1, as after a sigmoid .* They are taken for logits"),
+        (lambda z: -z.log_softmax(1), r"costs, of which the least is meant"),
+    ],
+)
+def test_scores_that_are_neither_logits_nor_probabilities_are_warned_of(
+    function: Callable[[Tensor], Tensor], text: str
+) -> None:
+    with pytest.warns(ModelWarning, match=text):
+        assert not load_model(Answering(function), input_size=8).probabilities
 
 
 def test_a_random_model_is_named_as_such() -> None:

@@ -210,6 +210,19 @@ def test_every_bundled_recipe_takes_an_environment_of_ones_own(tmp_path: Path, n
     assert runs and carrying_out._check_runs(runs).keys() == {one.part for one in runs}
 
 
+@pytest.mark.parametrize("name", names())
+def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> None:
+    described = read_recipe(name)
+    config = RecipeConfig(recipe=name, object="mug", task="detection={overlap: 0.4}", label="cup")
+    runs = planned(described, config)
+    assert runs and all(one.config.task == {"name": "detection", "overlap": 0.4} for one in runs)
+    if name != "texture-shape":
+        carrying_out._check(described, config)
+        return
+    with pytest.raises(InputError, match="task: texture-shape asks whether answers are classes of the texture"):
+        carrying_out._check(described, config)
+
+
 def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(TINY.replace("spp: 1", "spp: 1, model: 'os.path:join'"))

@@ -106,13 +106,25 @@ def test_colours_are_converted_for_a_printer(tmp_path: Path) -> None:
     ("piece", "paper", "message"),
     [
         (Piece("p", noise(8, 8), (1.0, 1.0)), "a7", "paper: expected one of a4, a3, letter, got 'a7'"),
-        (Piece("p", noise(8, 8), (1e4, 1.0)), "a4", "more than 200 sheets"),
-        (Piece("p", noise(4000, 8), (100.0, 100.0)), "a4", "more than 200 sheets"),
+        (Piece("p", noise(8, 8), (1e4, 1.0)), "a4", "size: a pixel of it is larger than a sheet"),
+        (Piece("p", noise(4000, 8), (100.0, 100.0)), "a4", "size: it would take more than 10000 sheets"),
+        (Piece("p", noise(200, 8), (100.0, 100.0)), "a4", r"takes 800 sheets of a4, and up to 200 .*`sheets=800`"),
     ],
 )
 def test_what_cannot_be_printed_is_refused(tmp_path: Path, piece: Piece, paper: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         write_sheets(tmp_path / "a.pdf", [piece], "t", paper=paper)
+
+
+def test_more_sheets_than_usual_are_written_when_they_are_asked_for(tmp_path: Path) -> None:
+    large = Piece("p", noise(2, 3), (100.0, 150.0))
+    with pytest.raises(InputError, match=r"sheets: it takes 6 sheets of a4, and up to 5 are written"):
+        write_sheets(tmp_path / "a.pdf", [large], "t", most=5)
+    assert not (tmp_path / "a.pdf").exists()
+    with pytest.raises(InputError, match="sheets: expected a whole number from 1 to 10000, got 0"):
+        write_sheets(tmp_path / "a.pdf", [large], "t", most=0)
+    assert write_sheets(tmp_path / "a.pdf", [large], "t", most=6) == 7
+    assert len(pypdf.PdfReader(tmp_path / "a.pdf").pages) == 7
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +173,8 @@ def test_the_command_writes_a_pdf_and_says_what_it_needs(
         (["--format", "print", "--size", "95"], "--out"),
         (["--format", "print", "--out", str(out), "--size", "0"], "size: expected the object's longest side"),
         (["--format", "csv", "--size", "95"], "--size: belongs to --format print"),
+        (["--format", "csv", "--sheets", "9"], "--sheets: belongs to --format print"),
+        (["--format", "print", "--out", str(out), "--size", "9900"], "or give a larger --paper or a smaller --size"),
     ):
         assert main(["export", run, *wrong]) == 2
         assert message in capsys.readouterr().err

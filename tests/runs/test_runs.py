@@ -205,16 +205,18 @@ def test_a_sweep_of_version_2_says_what_was_correct_and_an_attack_keeps_its_succ
     db = sqlite3.connect(path)
     db.executescript(f"BEGIN; {MIGRATIONS[0]} {MIGRATIONS[1]} PRAGMA user_version = 2; COMMIT;")
     given = [("sweep", 0, 1.5, 1), ("sweep", 1, -0.5, 0), ("sweep", 2, None, None), ("verification", 0, 2.0, 1)]
+    given += [("baseline verification", 0, 3.0, 1), ("search 1", 0, 4.0, 1), ("baseline", 0, 5.0, 1)]
     with db:
         columns = "kind, step, objective, success, values_json, time"
         db.executemany(f"INSERT INTO evaluations ({columns}) VALUES (?, ?, ?, ?, '{{}}', 0)", given)
     db.close()
-    expected = [(None, False, 1.5), (None, True, -0.5), (None, False, None), (True, None, None)]
+    expected = [(None, False, 1.5), (None, True, -0.5), (None, False, None), *[(True, None, None)] * 4]
     for read_only in (True, False):
         with Store(path, read_only=read_only) as store:
             rows = list(store.rows())
         assert [(row.success, row.correct, row.margin) for row in rows] == expected
-    assert [row.objective for row in rows] == [1.5, -0.5, None, 2.0]
+    assert [row.score for row in rows] == [1.5, -0.5, None, 2.0, 3.0, None, None]
+    assert [row.objective for row in rows] == [None, None, None, None, None, 4.0, 5.0], "only searches maximised it"
 
 
 def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> None:
@@ -259,7 +261,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
     with sqlite3.connect(path) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(FileFormatError, match=r"expected version 5 of the results, got 99; use a newer advsearch"):
+    with pytest.raises(FileFormatError, match=r"expected version 6 of the results, got 99; use a newer advsearch"):
         Store(path)
 
 
@@ -697,7 +699,7 @@ def filled(run: RunDirectory) -> Store:
 
 
 COLUMNS = [
-    "id", "kind", "step", "seed", "spp", "objective", "success", "correct", "margin", "label", "label_index",
+    "id", "kind", "step", "seed", "spp", "objective", "score", "success", "correct", "margin", "label", "label_index",
     "probability", "payload",
     "pose.yaw [degrees]", "camera.target[0] [sizes]", "camera.target[1] [sizes]", "backdrop.which",
     "renders", "machine", "seconds", "time",

@@ -221,7 +221,7 @@ def test_emission_by_other_coordinates_than_the_base_color_is_left_out_and_said(
     made.visual.material.baseColorTexture = Image.new("RGB", (4, 4), (200, 100, 50))
     file = written(tmp_path, made, emissiveTexture={"index": 1, "texCoord": 1})
     asset = import_object(file)
-    words = "lamp.glb: the emission with texture coordinates of its own of 1 material is left out"
+    words = "lamp.glb: 1 emission texture with other coordinates than the base colour: left out, with the emission"
     assert asset.emission is None and asset.warnings == (words,)
 
 

@@ -28,7 +28,7 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import objects, unwrap
 from advsearch.scene.importing.images import area_average, display_image
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.texture import sampled
+from advsearch.scene.importing.texture import filtered, sampled
 from advsearch.scene.importing.upright import guess_up
 
 DATA = conftest.DATA / "objects"
@@ -63,6 +63,10 @@ def picture(folder: Path, name: str = "wood.png", size: int = 16) -> np.ndarray:
 def exported(folder: Path, name: str, mesh: trimesh.Trimesh | trimesh.Scene, **options: Any) -> Path:
     """Write a mesh with trimesh and return its path."""
     return written(folder, name, mesh.export(file_type=Path(name).suffix[1:], **options))
+
+
+DEFAULT = ": 1 mesh without material: of white metal with roughness 1, the default of glTF"
+"""What is said of a mesh that trimesh wrote as glTF without a material."""
 
 
 def face_normals(mesh: Mesh) -> np.ndarray:
@@ -196,7 +200,7 @@ def test_what_does_not_tell_which_way_is_up_stays_as_it_is(tmp_path: Path) -> No
     assert note.startswith("cube.stl: z is taken for up, because its shape does not tell, as it rests as well either")
     upright = trimesh.Trimesh([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]], process=False)  # no area from above
     assert import_object(exported(tmp_path, "flat.ply", upright)).up is not None
-    assert import_object(exported(tmp_path, "cube.glb", trimesh.creation.box())).notes == ()
+    assert import_object(exported(tmp_path, "cube.glb", trimesh.creation.box())).notes == ("cube.glb" + DEFAULT,)
 
 
 def test_scene_graph_is_applied_and_parts_are_joined(tmp_path: Path) -> None:
@@ -208,7 +212,7 @@ def test_scene_graph_is_applied_and_parts_are_joined(tmp_path: Path) -> None:
     scene.add_geometry(trimesh.creation.cone(0.5, 1.0), transform=mirror)
     asset = import_object(exported(tmp_path, "two.glb", scene), up="z")
     check_sound(asset)
-    assert asset.warnings == ()
+    assert asset.warnings == ("two.glb" + DEFAULT.replace("mesh", "meshes").replace("1", "2", 1),)
     extent = asset.mesh.vertices.max(axis=0) - asset.mesh.vertices.min(axis=0)
     assert extent[:2] == pytest.approx(np.array([2.0, 4.0]) / 4.0, abs=1e-4)
     assert volume(asset.mesh) * 4.0**3 == pytest.approx(2.0 + np.pi / 12, abs=0.01)
@@ -221,14 +225,14 @@ def test_a_mirrored_part_keeps_the_normals_of_its_file(tmp_path: Path) -> None:
     scene.add_geometry(sphere, transform=np.diag([-1.0, 2.0, 1.0, 1.0]))
     asset = import_object(exported(tmp_path, "egg.glb", scene, include_normals=True), up="z")
     check_sound(asset)
-    assert asset.warnings == ()
+    assert asset.warnings == ("egg.glb" + DEFAULT,)
     points = (asset.mesh.vertices - [0.0, 0.0, 0.25]) * 4.0
     gradient = points / np.array([1.0, 4.0, 1.0])
     gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
     assert asset.mesh.normals == pytest.approx(gradient, abs=1e-4)
 
 
-@pytest.mark.parametrize("suffix", ["stl", "ply", "glb"])
+@pytest.mark.parametrize("suffix", ["stl", "ply"])
 def test_a_cylinder_is_smooth_with_sharp_rims(tmp_path: Path, suffix: str) -> None:
     cylinder = trimesh.creation.cylinder(radius=0.5, height=1.0, sections=32)
     asset = import_object(exported(tmp_path, f"tin.{suffix}", cylinder), up="z")
@@ -334,13 +338,19 @@ def sphere_with(folder: Path, normals: Callable[[np.ndarray], np.ndarray]) -> Ob
 def test_normals_that_all_point_inwards_are_turned_around(tmp_path: Path) -> None:
     asset = sphere_with(tmp_path, lambda normals: -normals)
     check_sound(asset)
-    assert asset.warnings == ("ball.glb: its normals pointed inwards and were turned around",)
+    assert asset.warnings == (
+        "ball.glb" + DEFAULT,
+        "ball.glb: its normals pointed inwards and were turned around",
+    )
 
 
 def test_contradictory_normals_are_computed_anew(tmp_path: Path) -> None:
     asset = sphere_with(tmp_path, lambda normals: normals * np.where(np.arange(len(normals)) % 2, 1.0, -1.0)[:, None])
     check_sound(asset)
-    assert asset.warnings == ("ball.glb: its normals contradict its faces and were computed anew",)
+    assert asset.warnings == (
+        "ball.glb" + DEFAULT,
+        "ball.glb: its normals contradict its faces and were computed anew",
+    )
 
 
 def test_normals_of_an_open_sheet_decide_its_front(tmp_path: Path) -> None:
@@ -532,12 +542,12 @@ def test_plain_material_color(tmp_path: Path) -> None:
     assert asset.base_color == pytest.approx(np.broadcast_to([0.2, 0.3, 0.7], (8, 8, 3)))
 
 
-@pytest.mark.parametrize(
-    "material", ["newmtl paint\nNs 10\n", "newmtl paint\nKd # white\n", "newmtl paint\nKd nan 0 0\n"]
-)
-def test_material_without_color_is_neutral_grey(tmp_path: Path, material: str) -> None:
-    asset = painted_quad(tmp_path, material)
-    assert asset.warnings == ()
+@pytest.mark.parametrize("line", ["Ns 10", "Kd # white", "Kd nan 0 0", "Kd 0,8 0,1 0,1", "Kd spectral red.rfl"])
+def test_material_without_color_is_neutral_grey(tmp_path: Path, line: str) -> None:
+    asset = painted_quad(tmp_path, f"newmtl paint\n{line}\n")
+    words = line.removeprefix("Kd ").removesuffix("# white")
+    said = f"quad.obj: the Kd {words!r} of the material 'paint' is no colour; neutral grey is used instead"
+    assert asset.warnings == ((said,) if "Kd" in line else ())
     assert (asset.base_color == 0.5).all()
 
 
@@ -607,14 +617,16 @@ def test_several_materials_are_baked_into_one_texture(tmp_path: Path) -> None:
             text += "f " + " ".join(f"{v}/{k + 1}" if name == "wood" else v for k, v in enumerate(face.split())) + "\n"
     asset = import_object(written(tmp_path, "cube.obj", text))
     check_sound(asset)
-    assert asset.warnings == ("cube.obj: the colours of its 3 parts were baked into one texture",)
+    assert asset.warnings == (
+        "cube.obj: the colours of its 3 materials were baked into one texture (512 x 512 texels)",
+    )
     assert overlap(asset.mesh) == 0
     got = color_at(asset, np.array([[0.0, -0.5, 0.5], [0.0, 0.0, 0.0]]))
     assert got == pytest.approx(np.array([[0.9, 0.1, 0.1], [0.0, 0.0, 1.0]]), abs=1e-5)
     top = asset.mesh.vertices[asset.mesh.faces][:, :, 2].min(axis=1) > 0.99
     for face in asset.mesh.faces[top]:  # the top's texture runs along x and y
         at, uv = asset.mesh.vertices[face].mean(axis=0)[:2] + 0.5, asset.mesh.uvs[face].mean(axis=0)
-        expected = sampled(pixels, at[None].astype(np.float64))
+        expected = filtered(pixels, at[None].astype(np.float64))
         assert sampled(asset.base_color, uv[None].astype(np.float64)) == pytest.approx(expected, abs=0.03)
 
 
@@ -631,9 +643,9 @@ def glb(folder: Path, material: PBRMaterial | None, **attributes: np.ndarray) ->
 
 def test_gltf_color_is_linear(tmp_path: Path) -> None:
     asset = import_object(glb(tmp_path, PBRMaterial(baseColorFactor=[0.2, 0.5, 1.0, 0.3])))
-    expected = linear_to_srgb(np.round(np.array([0.2, 0.5, 1.0], np.float32) * 255) / np.float32(255))
-    assert asset.base_color == pytest.approx(np.broadcast_to(expected, (8, 8, 3)), abs=1e-6)
-    assert asset.material == Material() and asset.warnings == ()
+    expected = linear_to_srgb(np.array([0.2, 0.5, 1.0], np.float32))
+    assert asset.base_color == pytest.approx(np.broadcast_to(expected, (8, 8, 3)), abs=2e-3)  # trimesh: 8 bits
+    assert asset.material == Material(roughness=1.0, metallic=1.0) and asset.warnings == ()
 
 
 def test_gltf_texture_times_factor_with_roughness_and_metallic(tmp_path: Path) -> None:
@@ -649,8 +661,10 @@ def test_gltf_texture_times_factor_with_roughness_and_metallic(tmp_path: Path) -
     assert asset.warnings == ()
 
 
-def test_gltf_without_material_is_neutral_grey(tmp_path: Path) -> None:
-    assert (import_object(glb(tmp_path, None)).base_color == 0.5).all()
+def test_gltf_without_material_is_white_metal_as_the_format_says(tmp_path: Path) -> None:
+    asset = import_object(glb(tmp_path, None))
+    assert asset.base_color.min() > 0.999 and asset.material == Material(roughness=1.0, metallic=1.0)
+    assert asset.warnings == ("quad.glb" + DEFAULT,)
 
 
 def test_gltf_roughness_texture_is_replaced_by_its_mean(tmp_path: Path) -> None:
@@ -671,7 +685,8 @@ def test_several_roughnesses_are_replaced_by_their_mean(tmp_path: Path) -> None:
         scene.add_geometry(box, transform=trimesh.transformations.translation_matrix([3.0 * k, 0.0, 0.0]))
     asset = import_object(exported(tmp_path, "boxes.glb", scene))
     assert asset.material.roughness == pytest.approx(0.2 * 0.2 + 0.8 * 0.7)
-    assert asset.warnings == ("boxes.glb: the roughness and metallic of its materials are replaced by their means",)
+    told = "the roughness and metallic of its materials are replaced by their means (0.6 and 1)"
+    assert asset.warnings == (f"boxes.glb: {told}",)
     assert asset.base_color == pytest.approx(np.broadcast_to([1.0, 0.0, 0.0], (8, 8, 3)))
 
 
@@ -715,7 +730,7 @@ def test_vertex_colors_are_baked(tmp_path: Path) -> None:
     box.visual.vertex_colors = np.where(box.vertices[:, 2:] > 0.0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
     asset = import_object(exported(tmp_path, "box.ply", box))
     check_sound(asset)
-    assert asset.warnings == ("box.ply: its vertex or face colours were baked into a texture",)
+    assert asset.warnings == ("box.ply: its vertex or face colours were baked into a texture (512 x 512 texels)",)
     got = color_at(asset, np.array([[0.0, 0.1, 1.0], [0.0, 0.1, 0.0]]))
     assert got == pytest.approx(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), abs=1e-5)
 
@@ -799,11 +814,6 @@ def glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 NOISE = np.random.default_rng(0).bytes(3000)
-INTEGER_UVS = {
-    "asset": {"version": "2.0"},
-    "accessors": [{"componentType": 5123, "count": 3, "type": "VEC2"}],
-    "meshes": [{"primitives": [{"attributes": {"TEXCOORD_0": 0}}]}],
-}
 BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "directory": (lambda folder: folder, r": expected a file with an object, got a directory; name a file inside it"),
     "missing": (lambda folder: folder / "no.obj", r"no\.obj: no such object file\. Check the path"),
@@ -842,12 +852,15 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "index zero": (obj(CUBE + "f 0 1 2\n"), r"indices that count from 1 in the face on line 15, got '0'"),
     "index before start": (obj(CUBE + "f -9 1 2\n"), r"indices that count from 1 in the face on line 15, got '-9'"),
     "index not a number": (obj(CUBE + "f a b c\n"), r"whole numbers in the face on line 15, got 'a'"),
-    "word in a vertex": (obj("v 0 0 x\n" + CUBE), r"is not readable OBJ \(.*\); it is damaged or cut short"),
+    "word in a vertex": (obj("v 0 0 x\n" + CUBE), r"expected numbers after 'v' on line 1, got '0 0 x'; export"),
     "cut ply header": (cut("t.ply", 0.1), r"expected a PLY file with a complete header, got half of one"),
-    "cut ply": (cut("t.ply", 0.8), r"is not readable PLY \(PLY is unexpected length!\); it is damaged or cut short"),
+    "cut ply": (
+        cut("t.ply", 0.8),
+        r"expected 12 rows of 'face', as the PLY header says, got fewer; the file is cut",
+    ),
     "cut ascii ply": (
         cut("t.ply", 0.9, encoding="ascii"),
-        r"expected 20 lines after the PLY header, got 1\d; the file is",
+        r"expected 12 rows of 'face', as the PLY header says, got fewer; the file is cut",
     ),
     "cut glb": (cut("t.glb", 0.8), r"expected \d+ bytes, as its header says, got \d+; the file is cut short"),
     "cut glb header": (raw("t.glb", b"glTF\2\0"), r"expected a binary glTF file, got the first few bytes of one"),
@@ -859,10 +872,6 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "compressed": (
         raw("t.glb", glb_of({"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]})),
         r"needs KHR_draco_mesh_compression, which is not supported; export it without that option",
-    ),
-    "quantized": (
-        raw("t.glb", glb_of(INTEGER_UVS)),
-        r"expected floats, got TEXCOORD_0 values that are not 32-bit floats",
     ),
     "old gltf": (
         raw("t.gltf", b'{"asset": {"version": "1.0"}}'),
@@ -984,22 +993,23 @@ def test_pictures_that_run_programs_or_take_gigabytes_are_not_decoded(
     path = written(tmp_path, "thing.obj", "mtllib thing.mtl\nusemtl paint\n" + QUAD)
     eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n%%EndComments\nshowpage\n%%EOF\n"
     contents = {
-        "expected a picture such as PNG or JPEG, got EPS; convert it": eps,
-        "expected a picture of at most 67,108,864 pixels, got 20000 x 20000; if you trust it, ADVSEARCH_LIMITS=10 in": (
+        "which cannot be read as a picture": eps,
+        "which is not read (expected a picture of at most 67,108,864 pixels, got 20000 x 20000; if": (
             plain_png(20_000, 20_000, 1, 0)
         ),
     }
     for reason, content in contents.items():
         written(tmp_path, "wood.png", content)
         (warning,) = import_object(path).warnings
-        assert warning.startswith(f"thing.obj: thing.mtl names the texture 'wood.png', which is not read ({reason}")
+        assert warning.startswith(f"thing.obj: thing.mtl names the texture 'wood.png', {reason}")
     assert started == []
 
 
 def test_textures_have_a_limit_in_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    picture(tmp_path)
+    for k in range(3):
+        picture(tmp_path, f"wood{k}.png")
     monkeypatch.setattr("advsearch.scene.importing.pictures.LARGEST_SUM", 512)  # two of the three
-    materials = "".join(f"newmtl m{k}\nKd 0.2 0.3 0.7\nmap_Kd wood.png\n" for k in range(3))
+    materials = "".join(f"newmtl m{k}\nKd 0.2 0.3 0.7\nmap_Kd wood{k}.png\n" for k in range(3))
     written(tmp_path, "thing.mtl", materials)
     faces = "".join(f"usemtl m{k}\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n" for k in range(3))
     warnings = import_object(written(tmp_path, "thing.obj", "mtllib thing.mtl\n" + QUAD_V + QUAD_UV + faces)).warnings
@@ -1103,8 +1113,18 @@ GLTF_CHANGES: dict[str, tuple[list[Any], Any, str]] = {
     ),
     "index past the end": (["meshes", 0, "primitives", 0, "indices"], 99, r"glTF with 100 accessors, as it refers to"),
     "huge count": (["accessors", 0, "count"], 10**9, r"geometry and pictures of at most 268,435,456 bytes, got"),
-    "no values": (["accessors", 0], {"componentType": 5123, "count": 9, "type": "SCALAR"}, r"got one without values"),
-    "sparse": (["accessors", 0, "sparse"], {"count": 1}, r"has sparse accessors, which are not supported"),
+    "sparse": (
+        ["accessors", 0, "sparse"],
+        {"count": 1},
+        r"expected glTF with accessors\[0\]\.sparse\.indices, got nothing",
+    ),
+    "short view": (["bufferViews", 0, "byteLength"], 4, r"expected a view of at least \d+ bytes, got 4"),
+    "short buffer": (
+        ["bufferViews", 0, "byteOffset"],
+        10**6,
+        r"a buffer of at least 1,000,\d+ bytes, got \d+; the file is",
+    ),
+    "fewer normals": (["accessors", 1, "count"], 3, r"expected faces of its own vertices, got a face that refers to"),
     "nan": (["nodes", 0, "matrix"], [float("nan")] * 16, r"matrix\[0\] is a finite number, got 'NaN'"),
     "cycle": (["nodes"], [{"children": [1], "mesh": 0}, {"children": [0]}], r"nodes that form trees, got a cycle"),
     "two parents": (["nodes"], [{"children": [2]}, {"children": [2]}, {"mesh": 0}], r"one parent each, got two for"),
@@ -1159,7 +1179,7 @@ def test_up_must_be_an_axis(tmp_path: Path) -> None:
 def test_parts_without_faces_are_left_out(tmp_path: Path) -> None:
     scene = trimesh.Scene([trimesh.creation.box(), trimesh.PointCloud(np.eye(3))])
     asset = import_object(exported(tmp_path, "mixed.glb", scene))
-    assert asset.warnings == ("mixed.glb: 1 parts without faces (points, lines) are left out",)
+    assert asset.warnings == ("mixed.glb: 1 parts without faces (points, lines) are left out", "mixed.glb" + DEFAULT)
 
 
 def with_header(folder: Path, change: Callable[[dict[str, Any]], None], name: str = "changed.glb") -> Path:
@@ -1201,8 +1221,14 @@ def _morphed(header: dict[str, Any]) -> None:
     ("change", "notes"),
     [
         (
-            lambda header: header.update(extensionsUsed=["KHR_texture_transform"]),
-            [" moves its textures with KHR_texture_transform, which is not applied"],
+            lambda header: header["meshes"][0]["primitives"][0]["attributes"].update(
+                _CUSTOM=0, COLOR_1=0, TEXCOORD_1=0
+            ),
+            [f": attribute '{name}' is left out" for name in ("_CUSTOM", "COLOR_1", "TEXCOORD_1")],
+        ),
+        (
+            lambda header: header["materials"][0].update(shininess=3, extras={"glow": 1}),
+            [": entry of a material 'shininess' is left out", ": entry of a material 'extras' is left out"],
         ),
         (
             lambda header: header.update(
@@ -1233,10 +1259,14 @@ def _morphed(header: dict[str, Any]) -> None:
             _painted,
             [
                 ": 1 mesh with an opacity in vertex colours, which is left out",
-                ": its vertex or face colours were baked into a texture",
+                ": its vertex or face colours were baked into a texture (512 x 512 texels)",
             ],
         ),
         (_elsewhere, [": 1 further scene: left out", ": 2 nodes with a mesh outside of its scene: left out"]),
+        (
+            lambda header: header["materials"][0].update(alphaMode="mask"),
+            [": 1 material with an alphaMode that glTF does not have: opaque"],
+        ),
         (_occluded, [": 1 occlusion map: left out"]),
         (_morphed, [": 1 mesh with morph targets, which are left out"]),
         (
@@ -1251,28 +1281,6 @@ def test_what_a_gltf_has_and_is_not_carried_over_is_said(
 ) -> None:
     path = with_header(tmp_path, change)
     assert import_object(path).warnings == tuple(f"changed.glb{note}" for note in notes)
-
-
-@pytest.mark.parametrize(
-    ("wrap", "reach", "said"),
-    [(33071, 1.0, False), (33071, 1.5, True), (33648, 3.0, True), (10497, 3.0, False)],
-)
-def test_textures_that_end_at_their_edges_are_said_where_that_is_seen(
-    tmp_path: Path, wrap: int, reach: float, said: bool
-) -> None:
-    picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
-    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
-    uv = np.array([[0, 0], [reach, 0], [reach, reach], [0, reach]])
-    square.visual = trimesh.visual.TextureVisuals(uv=uv, material=PBRMaterial(baseColorTexture=picture))
-    header, rest = glb_parts(square.export(file_type="glb"))
-    header["samplers"] = [{"wrapS": wrap}]
-    header["textures"][0]["sampler"] = 0
-    warnings = import_object(written(tmp_path, "edge.glb", glb_of(header, rest))).warnings
-    expected = "edge.glb has textures that are not to repeat beyond their edges; here they do"
-    assert (expected in warnings) is said
-    header["textures"][0]["sampler"] = 3
-    with pytest.raises(FileFormatError, match="expected glTF with 4 samplers, as it refers to, got 1"):
-        import_object(written(tmp_path, "edge.glb", glb_of(header, rest)))
 
 
 def test_a_mesh_that_does_not_come_out_whole_is_refused_by_the_name_of_its_file(
@@ -1335,7 +1343,8 @@ def test_real_objects(name: str, up: Any, faces: int) -> None:
 def test_real_banana_is_yellow_all_over() -> None:
     asset = import_object(DATA / "banana.obj")
     check_sound(asset)
-    assert asset.warnings == () and asset.base_color.shape == (1024, 1024, 3)
+    reduced = "banana.obj: the texture 'texture_map.png' of 4,096 x 4,096 texels is averaged down to 1,024 x 1,024"
+    assert asset.warnings == (reduced,) and asset.base_color.shape == (1024, 1024, 3)
     uvs = asset.mesh.uvs[asset.mesh.faces].mean(axis=1).astype(np.float64)
     red, green, blue = sampled(asset.base_color, uvs).T  # an upside-down texture would show its black background
     assert (np.minimum(red, green) > blue + 0.15).mean() > 0.95

@@ -79,7 +79,7 @@ def test_the_object_stands_and_the_rest_is_kept(box: Path) -> None:
     assert isinstance(floor, PluginPart)
     matrix = np.asarray(floor.plugin["to_world"])
     np.testing.assert_allclose((matrix @ (0, 0, 0, 1))[2], 0.0, atol=1e-6)  # the box stands on the floor
-    assert found.object.surface == {"type": "diffuse", "reflectance": "base color"}
+    assert found.object.surface == {"type": "diffuse", "reflectance": {"type": "base color"}}
 
 
 @pytest.mark.parametrize("typed", ["large-box", "LargeBox", "large_box"])
@@ -165,6 +165,7 @@ LAUGHS = "".join(f'<default name="v{n}" value="{f"$v{n - 1}" * 10}"/>' for n in 
             "name of",
         ),
         ('<scene version="3.0.0"><shape type="serialized"><string name="filename" value="a"/></shape></scene>', "only"),
+        ('<scene version="3.0.0"><texture type="bitmap"/></scene>', "a filename in each bitmap"),
         ('<scene version="0.5.0"/>', "version"),
         ('<scene version="3.0.0"><float name="a" value="nan"/></scene>', "finite"),
         ('<scene version="3.0.0"><float name="a" value="$b"/></scene>', "no value"),

@@ -11,11 +11,13 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks.objectives import check_objective, get_objective
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
 from advsearch.tasks import Answer, Detection, Facts, Judgement, Sight
-from advsearch.tasks.boxes import corners, detections_in, overlap, share_inside, strongest
+from advsearch.tasks.boxes import corners, overlap, share_inside, strongest
 from advsearch.tasks.detection import GOALS, Place, log_odds
+from advsearch.tasks.detector_answers import detections_in
 
 NAMES = ("cup", "bowl", "dog")
 HERE, NEAR, AWAY = [0.2, 0.2, 0.6, 0.6], [0.3, 0.2, 0.7, 0.6], [0.7, 0.7, 0.9, 0.9]
@@ -89,7 +91,7 @@ class Output:
     ],
 )
 def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
-    found = detections_in(answer, 2, "xyxy")
+    found = detections_in(answer, 2)
     assert [sorted(one) for one in found] == [["boxes", "scores"]] * 2
     for k, one in enumerate(found):
         assert one["boxes"].equal(BOXES[k]) and one["scores"].equal(SCORES[k])
@@ -100,21 +102,20 @@ def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
     [
         (BOXES, LABELS, ONE),
         (BOXES, ONE, LABELS),
-        (BOXES, LABELS.float(), ONE),
         {"boxes": BOXES, "labels": LABELS, "scores": ONE},
         [{"boxes": BOXES[k], "labels": LABELS[k], "scores": ONE[k]} for k in range(2)],
         [(BOXES[k], LABELS[k], ONE[k]) for k in range(2)],
     ],
 )
 def test_one_label_a_box_is_read_in_every_form(answer: Any) -> None:
-    for k, one in enumerate(detections_in(answer, 2, "xyxy")):
+    for k, one in enumerate(detections_in(answer, 2)):
         assert one["boxes"].equal(BOXES[k]) and one["labels"].equal(LABELS[k]) and one["scores"].equal(ONE[k])
 
 
 def test_one_picture_may_come_without_its_dimension_and_none_may_be_found() -> None:
-    (one,) = detections_in((BOXES[0], LABELS[0], ONE[0]), 1, "xyxy")
+    (one,) = detections_in((BOXES[0], LABELS[0], ONE[0]), 1)
     assert one["labels"].equal(LABELS[0])
-    first, second = detections_in([*sparse((HERE, 1, 0.5)), *sparse()], 2, "xyxy")
+    first, second = detections_in([*sparse((HERE, 1, 0.5)), *sparse()], 2)
     assert len(first["scores"]) == 1 and second["boxes"].shape == (0, 4)
 
 
@@ -133,7 +134,7 @@ def test_one_picture_may_come_without_its_dimension_and_none_may_be_found() -> N
 )
 def test_what_is_no_detection_is_refused(answer: Any, text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        detections_in(answer, 2, "xyxy")
+        detections_in(answer, 2)
 
 
 # ---- suppression ----------------------------------------------------------------------------------------------------
@@ -284,7 +285,7 @@ def test_where_nothing_of_the_object_is_seen_nothing_is_missed() -> None:
 
 def test_a_score_that_is_no_number_is_neither_right_nor_a_success() -> None:
     found = judged_anyway(dense((HERE, [math.nan, 0.1, 0.1])))
-    assert not found.right and not found.success and found.answer == Answer("no cup")
+    assert not found.right and not found.success and found.answer == Answer(NOT_A_NUMBER)
 
 
 def judged_anyway(output: list[dict[str, Tensor]]) -> Judgement:
@@ -342,7 +343,7 @@ class Pixels(nn.Module):
 def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
     model = load_model(Pixels(), input_size=(8, 16), read=Detection().reader, labels=NAMES)
     task = Detection().on(model)
-    assert (task.labels, task.named, task.unit, task.input_size) == (NAMES, True, "pixels", (8, 16))
+    assert (task.labels, task.named, task.seen_unit, task.input_size) == (NAMES, True, "pixels", (8, 16))
     assert model.differentiable
     output = model(torch.full((8, 16, 3), 0.9))
     at = Place((0,), (4, 8, 12, 24), (32, 32))
@@ -366,9 +367,11 @@ class Listed(nn.Module):
         return [{"boxes": none.reshape(0, 4), "labels": none.long(), "scores": none} for _ in x]
 
 
-def test_a_list_of_mappings_is_in_pixels_and_needs_names() -> None:
+def test_a_list_of_mappings_needs_names() -> None:
     model = load_model(Listed(), input_size=8, read=Detection().reader, labels=NAMES)
-    assert Detection().on(model).unit == "pixels" and len(model(torch.zeros(3, 8, 8, 3))) == 3
+    task = Detection().on(model)
+    assert task.looks and task.seen_unit == "" and "unit: pixels" in task.unsaid, "nothing shows in noise"
+    assert len(model(torch.zeros(3, 8, 8, 3))) == 3
     with pytest.raises(InputError, match="labels: expected a file with the names of the classes of model Listed"):
         Detection().on(load_model(Listed(), input_size=8, read=Detection().reader))
     with pytest.raises(ModelError, match=r"model Sequential: expected boxes \(N, D, 4\)"):

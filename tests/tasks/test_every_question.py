@@ -68,6 +68,28 @@ def photographed(taker: Photographs, run: Path, name: str, shift: int = 0) -> li
     return [bool(row.payload["photo"]["right"]), bool(row.correct)]
 
 
+RECIPE = """
+title: Is the mug found?
+settings: {object: mug, environment: [studio, noon], resolution: 32, spp: 2}
+parts:
+  views:
+    command: sweep
+    settings: {controls: {camera: {azimuth: [0, 90]}}, samples: 2, sampler: random, trials: 0}
+figures:
+  - {figure: bars, by: environment}
+"""
+
+
+@ALSO_SLOWLY
+def test_a_recipe_is_carried_out(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(RECIPE)
+    found = answer(capsys, "recipe", str(tmp_path / "mine.yaml"), "--run", str(tmp_path / "run"), *asked)
+    (bars,) = found["figures"]
+    assert [one["configurations"] for one in bars["bars"]] == [2, 2] and sum(one["correct"] for one in bars["bars"]) > 0
+    (part,) = (tmp_path / "run" / "parts").iterdir()
+    assert json.loads((part / "summary.json").read_text())["task"] == task_of(asked)
+
+
 SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none"]
 
 

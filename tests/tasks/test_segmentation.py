@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks.objectives import get_objective
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.tasks import Answer, Facts, Segmentation, Sight
@@ -35,10 +36,10 @@ ALL, HALF, QUARTER = of([0, 1, 1, 0], [0, 1, 1, 0]), of([0, 1, 0, 0], [0, 2, 1, 
     [
         (ALL, 0.5, True, Answer("bottle", 1, 1.0)),
         (HALF, 0.5, True, Answer("bottle", 1, 0.5)),
-        (HALF, 0.51, False, Answer("background", 0, 0.5)),
+        (HALF, 0.51, False, Answer("no bottle", None, 0.5)),
         (QUARTER, 0.5, False, Answer("chair", 2, 0.25)),
         (QUARTER, 0.25, True, Answer("bottle", 1, 0.25)),
-        (HALF, 1.0, False, Answer("background", 0, 0.5)),
+        (HALF, 1.0, False, Answer("no bottle", None, 0.5)),
         (of([0, 0, 0, 0], [0, 0, 0, 0], sure=0.0), 1.0, True, Answer("bottle", 1, 1.0)),
     ],
 )
@@ -106,7 +107,8 @@ def test_a_mask_follows_the_size_of_the_output() -> None:
 
 
 def test_answers_are_the_classes_of_most_pixels() -> None:
-    assert TASK.answers(ALL, 5) == [(Answer("background", 0, 0.5), Answer("bottle", 1, 0.5))]
+    assert TASK.answers(ALL, 5) == [(Answer("bottle", 1, 0.5),)], "background is none"
+    assert replace(TASK, target=(0,)).answers(ALL, 5) == [(Answer("background", 0, 0.5), Answer("bottle", 1, 0.5))]
     true, said = TASK.marks(QUARTER, TRUTH)[0]
     assert true.true and true.mask is MASK and not said.true and said.mask is not None
     assert said.mask.int().tolist() == [[1, 1, 0, 1], [1, 0, 0, 1]]
@@ -164,3 +166,13 @@ def test_a_segmenter_of_probabilities_is_warned_about() -> None:
     load_model(network, input_size=8, read=TASK.reader, labels=NAMES)  # warnings are errors
     with pytest.warns(ModelWarning, match="probabilities for each pixel: .* remove the final softmax"):
         load_model(nn.Sequential(network, nn.Softmax(dim=1)), input_size=8, read=TASK.reader, labels=NAMES)
+
+
+def test_pixels_that_are_not_numbers_are_no_answer() -> None:
+    broken = ALL.clone()
+    broken[0, 1, 1, 1] = math.nan
+    for output in (broken, torch.full_like(ALL, math.nan), torch.where(broken.isnan(), math.inf, broken)):
+        (found,) = TASK.judge(output, TRUTH)
+        assert found.answer == Answer(NOT_A_NUMBER) and found.not_a_number and not found.right and not found.success
+    assert TASK.answers(torch.full_like(ALL, math.nan)) == [(Answer(NOT_A_NUMBER),)]
+    assert TASK.answers(torch.zeros_like(ALL)) == [(Answer("nothing"),)], "background everywhere"

@@ -58,6 +58,41 @@ def test_an_answer_is_the_largest_logit_in_words_with_its_probability() -> None:
     assert [one.right for one in judged] == [True, True, False, True] and judged[0].payload is None
 
 
+@pytest.mark.parametrize("logits", [[math.nan, 0.0, 1.0], [math.nan] * 3, [1.0, math.inf, 0.0], [math.inf, 0.0, 0.0]])
+def test_an_answer_that_is_not_a_number_is_called_that(logits: list[float]) -> None:
+    output = torch.tensor([logits])
+    for task in (NAMED, replace(NAMED, target=(2,)), replace(NAMED, minimise=True)):
+        (found,) = task.judge(output, (0,))
+        assert found.answer == Answer("not a number", None, None) and found.not_a_number
+        assert not found.right and not found.success and math.isnan(found.score) and math.isnan(found.margin)
+    assert NAMED.answers(output, 3) == [(Answer("not a number"),)]
+    (found,) = NAMED.judge(torch.tensor([[1.0, 0.0, -math.inf]]), (0,))
+    assert found.right and found.answer.label == "mug", "a class that is ruled out is a number"
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_background_is_no_rival_of_a_class_and_no_answer(place: int) -> None:
+    labels, logits = ["mug", "bowl"], [1.0, 0.5]
+    labels.insert(place, "Background")
+    logits.insert(place, 9.0)
+    task, output = Classification(labels=tuple(labels)), torch.tensor([logits])
+    right = (labels.index("mug"),)
+    (found,) = task.judge(output, right)
+    assert found.right and found.margin == -0.5 and found.answer.label == "mug" and found.answer.probability < 0.7  # type: ignore[operator]
+    assert [one.label for one in task.answers(output, 5)[0]] == ["mug", "bowl"]
+    for name, kind in OBJECTIVE_KINDS.items():
+        if kind.plain is not None and name != "dlr":  # which needs three classes
+            value = get_objective(name, task)(output, torch.zeros(1, 2, 2, 3), right)
+            beside = output[:, [labels.index("mug"), labels.index("bowl")]]
+            assert value.tolist() == kind.plain(beside, torch.zeros(1, 2, 2, 3), (0,)).tolist(), name
+    sought = replace(task, target=(place,))
+    assert sought.judge(output, right)[0].success and sought.answers(output, 1)[0][0].label == "Background"
+    two = Classification(labels=("mug", "none"))
+    assert two.judge(torch.tensor([[0.0, 1.0]]), (0,))[0].answer.label == "none", "there is no other wrong answer"
+    honest = Classification(labels=("mug", "none of the above", "bowl"))
+    assert not honest.judge(torch.tensor([[0.0, 1.0, 0.0]]), (0,))[0].right
+
+
 def test_a_target_must_be_wrong_and_there_is_none_to_minimise() -> None:
     with pytest.raises(InputError, match=r"target: expected classes that are not right answers, got \[1\]"):
         replace(NAMED, target=(1, 2)).truth(Facts("mug", "mug,bowl"))

@@ -344,7 +344,14 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
             {"ending": "already wrong", "clean": {**ATTACK["clean"], "label": "vase"}},
             "The model already calls this mug a vase: nothing was changed and nothing counts as found.",
         ),
-        ({"ending": "interrupted", "verified": None}, "Interrupted after 40 steps; nothing is verified."),
+        (
+            {"ending": "interrupted", "verified": None},
+            "Interrupted after 40 steps. The answer so far is not verified: the model calls this mug a vase.",
+        ),
+        (
+            {"ending": "interrupted", "verified": None, "adversarial": None, "steps": 0},
+            "Interrupted after 0 steps; nothing is verified.",
+        ),
         ({"ending": "interrupted", "steps": 1}, f"Interrupted; so far the model is wrong about this mug in {ALL}"),
         ({"ending": "stalled", "verified": None, "steps": 1}, "Stalled after 1 step; nothing is verified."),
         (TARGET, f"The model calls this mug a vase in {ALL}"),
@@ -532,7 +539,7 @@ def test_the_page_says_how_the_search_worked(tmp_path: Path) -> None:
     text = page_of(make_run(tmp_path / "run", attack(**METHOD))).text
     for said in (
         "The search's claim margin 4.5 in the render that won, 3.25 when rendered again",
-        "Sample count 64 a pixel in the verification; the margin still moved there",
+        "Sample count 64 a pixel in the verification; that the margin stands still there is not shown",
         "Light transport a matrix predicted 37 pictures; at the last comparison with a traced one it was off by 0.812 "
         "of 255 levels of the picture's change (root mean square) and an unknown amount of the objective; made anew 1 "
         "time; it and the comparisons took 2.0 s",

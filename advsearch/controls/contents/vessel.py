@@ -183,6 +183,7 @@ def _section(mesh: Mesh, height: float) -> tuple[Ints, Doubles, Doubles]:
 def _color(asset: ObjectAsset, faces: Ints) -> Doubles:
     """Mean linear reflectance (3,) of the texture at the middles of some faces."""
     middle = asset.mesh.uvs[asset.mesh.faces[faces].astype(np.int64)].mean(axis=1)
+    middle -= np.floor(middle) if asset.mesh.repeats else 0.0
     height, width = asset.base_color.shape[:2]
     column = np.clip((middle[:, 0] * width).astype(np.int64), 0, width - 1)
     row = np.clip(((1.0 - middle[:, 1]) * height).astype(np.int64), 0, height - 1)

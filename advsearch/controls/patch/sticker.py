@@ -22,6 +22,7 @@ import torch.nn.functional as F
 from scipy import spatial
 from torch import Tensor
 
+from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -82,6 +83,11 @@ class Sticker:
 
     def __init__(self, scene: SceneDescription, resting: Mapping[str, float], side: int) -> None:
         mesh = scene.object.mesh
+        if mesh.repeats:
+            raise InputError(
+                "`controls` patch: the object's texture repeats on it, and so would a patch that is painted into it; "
+                "leave patch out, or search the whole texture"
+            )
         self._shape = _shape(mesh)
         self._resting, self._side = resting, side
         self._surface = MeshSurface(mesh)

@@ -108,7 +108,7 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     check_instance(f"`grid` {name}", late or early, colon or early_colon)
     if parameter_name not in known:
         raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In `grid` {name}.")
-    parameter = control.parameters[known.index(parameter_name)]
+    parameter = control.declared({parameter_name: given})[known.index(parameter_name)]
     if not issubclass(control, NumberControl) or parameter.shape != ():
         raise InputError(
             f"`grid` {name}: expected a parameter that is one number or name, got one that is many numbers; draw it "

@@ -121,7 +121,7 @@ class Batches:
         view, before = self.open(scene), scene * self._per_scene
         points = next(iter(view.points.values()))
         picks = points.picks(numbers.start - before, len(numbers), before)
-        return picks, view.look(picks, [self._seeds(number) for number in numbers])
+        return picks, view.look(picks, [self._seeds(points.draw(number)) for number in numbers])
 
     def _is_kept(self, seen: Iterable[Judgement]) -> bool:
         """Whether the thumbnail of a picture of which the models say this is kept."""

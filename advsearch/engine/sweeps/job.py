@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
+import torch
+from torch import Tensor
+
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
 from advsearch.engine.answers import Looked, check_truth, facts_of
@@ -29,19 +32,26 @@ class NamedScene:
         object: as it is called.
         environment: likewise.
         scene: loaded.
+        held: controls that stay where `u` has them; with the answer of a run, or as they are without it.
+        u: (d,) of these; None leaves the scene as it is.
+        answer: what the place is called beside the same one without the answer; empty where there is no such.
     """
 
     object: str
     environment: str
     scene: Scene
+    held: tuple[Control, ...] = ()
+    u: Tensor | None = None
+    answer: str = ""
 
     @property
     def values(self) -> dict[str, Value]:
         """What is stored of it with every configuration."""
-        return {
+        named: dict[str, Value] = {
             "object": {"value": self.object, "unit": ""},
             "environment": {"value": self.environment, "unit": ""},
         }
+        return {**named, "answer": {"value": self.answer, "unit": ""}} if self.answer else named
 
 
 @dataclass(frozen=True)
@@ -108,12 +118,25 @@ class Job:
             InputError: the scene cannot take one of them.
         """
         description = framed(place.scene.description, size)
-        controls = on_grid(self.controls, self.axes, description)
-        return make_space(controls, description) if controls else Space((), None)
+        controls = (*place.held, *on_grid(self.controls, self.axes, description))
+        if not controls:
+            return Space((), None)
+        space = make_space(controls, description)
+        if not place.held:
+            return space
+        start = torch.cat([bound.start for bound in space.controls[: len(place.held)]])
+        if place.u is not None and len(place.u) != len(start):
+            raise InputError(
+                f"answer_of: the answer of {place.answer} has {len(place.u)} numbers, and {place.object} takes "
+                f"{len(start)}: it is another object, or it has changed since; do the run again"
+            )
+        return space.holding(start if place.u is None else place.u)
 
     def points(self, space: Space) -> Points:
-        """The configurations of a space."""
-        return Points(space, domain_of(space.controls), self.axes, self.samples, self.sampler, self.pictures.seed)
+        """The configurations of a space; those with an answer have the draws of those without it."""
+        scenes = len(self.places) // 2 if self.places[0].answer else 0
+        domain = domain_of(space.controls)
+        return Points(space, domain, self.axes, self.samples, self.sampler, self.pictures.seed, scenes)
 
     def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
         """What is true of a configuration, as the task of a model needs it.

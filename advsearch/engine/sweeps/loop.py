@@ -1,9 +1,10 @@
 """The loop of a sweep: have batches carried out (`batch`), store and count what comes of them, sum it up.
 
-Configurations are numbered: scenes (object, environment), then the grid with its last axis fastest, then the draws of a
-point of the grid, then the models. Models are shown the same pictures, so that they can be compared, and one is
-rendered once. A batch begins at a multiple of its size and is stored in one transaction, each row in the place of its
-number, so that a sweep that was stopped, or whose batches come in another order, ends bit for bit as one that was not.
+Configurations are numbered: scenes (object, environment; beside an answer first all without it), then the grid with its
+last axis fastest, then the draws of a point of the grid, then the models. Models are shown the same pictures, so that
+they can be compared, and one is rendered once. A batch begins at a multiple of its size and is stored in one
+transaction, each row in the place of its number, so that a sweep that was stopped, or whose batches come in another
+order, ends bit for bit as one that was not.
 """
 
 from __future__ import annotations
@@ -11,13 +12,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
 from advsearch.cluster.executor import Done, Executor, InProcess
 from advsearch.described import Value
+from advsearch.engine.going_on import finite, same
 from advsearch.engine.machines import Machines
+from advsearch.engine.memory import Memory
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import LOST, judgement_of, lost_remarks, trial_row
@@ -40,6 +44,7 @@ from advsearch.runs.images import write_layers
 from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import (
+    BesideAnswer,
     SurfaceMap,
     SweepSummary,
     WorstClaim,
@@ -99,8 +104,18 @@ class Sweep:
         objects, environments = (
             list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
         )
-        self._outer = [("object", objects), ("environment", environments), ("model", [one.name for one in job.models])]
-        self._places = [(objects.index(one.object), environments.index(one.environment)) for one in job.places]
+        answers = list(dict.fromkeys(place.answer for place in job.places))
+        self._outer = [
+            ("object", objects),
+            ("environment", environments),
+            ("answer", answers),
+            ("model", [one.name for one in job.models]),
+        ]
+        self._places = [
+            (objects.index(one.object), environments.index(one.environment), answers.index(one.answer))
+            for one in job.places
+        ]
+        self._pairs = self.total // 2 if len(answers) > 1 else 0
 
     def carry_out(self, first: int | None = None) -> SweepResult:
         """Do what is left and return the answer.
@@ -110,6 +125,7 @@ class Sweep:
         """
         tally = self._counted()
         ending, worst = FINISHED, None
+        self._check_answers()
         for text in self.job.warnings:
             self.stages.progress.message(text)
         try:
@@ -218,21 +234,41 @@ class Sweep:
         shown: tuple[bool, int] = (False, 1),
         **more: Any,
     ) -> store.Row:
-        """What is stored of a configuration; a predicted picture has no seed of its own."""
+        """What is stored of a configuration: what varies; a predicted picture has no seed of its own."""
         place, (predicted, traced) = self.job.places[number // self.per_scene], shown
         lit_by = self.points.lit_by(values)
         named = place.values
         if lit_by is not None:
             named["environment"] = {"value": lit_by, "unit": ""}
-        named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **values}
+        still = {control.name for control in place.held}
+        varied = {name: value for name, value in values.items() if name.partition(".")[0] not in still}
+        named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **varied}
         step = number * self.models + model
         more |= {"id": step + 1, "renders": traced if self._is_first_of_size(model) else 0}
-        row = trial_row(KIND, step, self._seeds(number), self.samples, trial, named, sought=False, **more)
+        row = trial_row(
+            KIND, step, self._seeds(self.points.draw(number)), self.samples, trial, named, sought=False, **more
+        )
         return replace(row, seed=None, spp=BASIS_SPP) if predicted else row
 
     def _is_first_of_size(self, model: int) -> bool:
         """Whether no model before it is shown the same pictures."""
         return self.job.sizes[model] not in self.job.sizes[:model]
+
+    def _check_answers(self) -> None:
+        """Look again at the first picture that is stored, where there is more to come here.
+
+        Raises:
+            InputError: a model says something else of it now than it did.
+        """
+        row = None if self.run is None else next(self.run.store.rows(KIND), None)
+        if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
+            return
+        number, model = divmod(row.step, self.models)
+        batches = Batches(self.job, self.per_scene)  # another one: what is done here decides no row
+        look = partial(batches, range(number, number + 1))
+        now = finite(look().judgements[model][0].margin)
+        if not same([row.margin], [now]) and same([now], [finite(look().judgements[model][0].margin)]):
+            raise Memory(self.run).other_answers({"margin": (row.margin, now)})
 
     def _tell(self, count: int, tally: Tally) -> None:
         self._untold += count
@@ -250,7 +286,7 @@ class Sweep:
 
     def _counted(self) -> Tally:
         """Counts of the rows that are stored already, read one after the other."""
-        tally = Tally(self._outer, self.job.axes, self._shown)
+        tally = Tally(self._outer, self.job.axes, self._shown, self._pairs)
         self._traced = self._predicted = self._lost = 0
         key, picks = (-1, -1), self.points.picks(0, 0)
         for row in self._kept if self.run is None else self.run.store.rows(KIND):
@@ -304,7 +340,7 @@ class Sweep:
         return WorstConfiguration(
             configuration=index,
             values={name: DescribedValue.of(value) for name, value in row.values.items()},
-            seed=self._seeds(picks.number),
+            seed=self._seeds(points.draw(picks.number)),
             label_set=list(task.truth_names(truth)),
             claimed=WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload),
             verified=None,
@@ -352,6 +388,7 @@ class Sweep:
             answers=tally.frequent(),
             axes=tally.table(),
             cells=tally.map(),
+            beside=self._beside(tally),
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
@@ -378,18 +415,25 @@ class Sweep:
             write_page(self.run.path, summary)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
 
+    def _beside(self, tally: Tally) -> BesideAnswer | None:
+        """The clean scene and the answer of a run, where there is one."""
+        if not self._pairs:
+            return None
+        models = [one.name for one in self.job.models]
+        return BesideAnswer(answer=self.job.places[-1].answer, pairs=tally.beside(models))
+
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""
         remarks = lost_remarks(self._lost)
         remarks += self._machines.remarks
         if tally.not_finite:
-            remarks.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
+            remarks.append(f"{tally.not_finite} answers of the model are not numbers; they count as not right.")
         if self._not_finite:
             remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:
             remarks.append(
-                f"The worst margin still moved with the sample count at {checked.spp} samples a pixel, the most "
-                "that was tried: noise may take part in it."
+                f"It is not shown that the worst margin stands still at {checked.spp} samples a pixel, the most that a "
+                "check takes: noise may take part in it."
             )
         return remarks
 

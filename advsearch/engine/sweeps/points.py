@@ -1,7 +1,8 @@
 """From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept.
 
 Within a scene, pictures are numbered along the grid, and the draws of one point of the grid follow each other. Every
-picture of a sweep has a draw of its own, also where the grid is the same, so that pictures are independent.
+picture of a sweep has a draw of its own, also where the grid is the same, so that pictures are independent; only what
+is compared in pairs, without an answer and with it, has the same ones.
 """
 
 from __future__ import annotations
@@ -86,6 +87,7 @@ class Points:
         samples: pictures at each point of the grid.
         sampler: of the draws.
         seed: root.
+        scenes: number of scenes after which the draws come again, so that what is compared has the same; 0 for never.
 
     Attributes:
         grid: sizes of the axes and the number of points.
@@ -95,10 +97,11 @@ class Points:
     """
 
     def __init__(
-        self, space: Space, domain: Domain, axes: Sequence[Axis], samples: int, sampler: str, seed: int
+        self, space: Space, domain: Domain, axes: Sequence[Axis], samples: int, sampler: str, seed: int, scenes: int = 0
     ) -> None:
         self.grid = Product(tuple(len(axis.values) for axis in axes))
         self.samples, self.count = samples, self.grid.count * samples
+        self._again = scenes * self.count
         self._space, self._domain, self._axes = space, domain, tuple(axes)
         self._start = domain.start.numpy().astype(np.float64)
         self._lower, self._upper = domain.lower.numpy(), domain.upper.numpy()
@@ -163,9 +166,13 @@ class Points:
     def picks(self, first: int, count: int, before: int = 0) -> Picks:
         """Return the pictures from number `first` of the scene on; `before` is how many the scenes before it have."""
         digits = [self.grid.digits(number // self.samples) for number in range(first, first + count)]
-        shares = self._draws.points(before + first, count)
+        shares = self._draws.points(self.draw(before + first), count)
         parts = np.minimum((shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1)
         return Picks(before + first, digits, shares, parts.tolist())
+
+    def draw(self, number: int) -> int:
+        """Return the number of the draw, and of the noise, of the picture with this number in the whole sweep."""
+        return number % self._again if self._again else number
 
     def configurations(self, picks: Picks) -> Tensor:
         """Return u of the pictures, (n, d) float32."""
@@ -175,7 +182,7 @@ class Points:
         for block, part, columns in self._small:
             u[:, part] = self._placed(block, part, picks.shares[:, columns])
         if self._large:
-            noise = self._noise.points(picks.number, len(picks.digits))
+            noise = self._noise.points(self.draw(picks.number), len(picks.digits))
             for block, part, columns in self._large:
                 u[:, part] = self._placed(block, part, noise[:, columns])
         return torch.from_numpy(np.clip(u.astype(np.float32), self._lower, self._upper))

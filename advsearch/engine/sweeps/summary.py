@@ -1,4 +1,7 @@
-"""Counting what a sweep finds, in memory that does not grow, and its summary (docs/sweeps.md, "What it says")."""
+"""Counting what a sweep finds, and its summary (docs/sweeps.md, "What it says").
+
+The memory that this takes does not grow, but for a byte a configuration where pairs are compared.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from advsearch.attacks import clopper_pearson
+from advsearch.attacks.trials import paired_difference
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.cells import Cells
 from advsearch.engine.sweeps.points import Drawn, Picks
-from advsearch.runs.results.sweep import AxisRow, CountedAnswers, SweepMap
+from advsearch.runs.results.sweep import AxisRow, CountedAnswers, PairedRates, SweepMap
 from advsearch.tasks import Judgement
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
 """How a sweep ends."""
+
+WRONG, RIGHT = 1, 2
+"""Of a configuration of a pair; 0: not seen yet."""
 
 MOST_ANSWERS = 20
 """Wrong answers that the summary lists, the most frequent first."""
@@ -73,6 +82,7 @@ class Tally:
         outer: name and values of the axes outside the scene: object, environment, model.
         axes: of the grid.
         drawn: what the table shows of the draws.
+        pairs: configurations without an answer, each of which comes again with it, so many numbers later; 0 for none.
 
     Attributes:
         seen: configurations.
@@ -83,8 +93,13 @@ class Tally:
     """
 
     def __init__(
-        self, outer: Sequence[tuple[str, Sequence[str]]], axes: Sequence[Axis], drawn: Sequence[Drawn]
+        self,
+        outer: Sequence[tuple[str, Sequence[str]]],
+        axes: Sequence[Axis],
+        drawn: Sequence[Drawn],
+        pairs: int = 0,
     ) -> None:
+        self._verdicts = [bytearray(pairs), bytearray(pairs)]
         self.seen = self.correct = self.not_finite = 0
         self.worst: tuple[int, Judgement] | None = None
         self.answers: Counter[str] = Counter()
@@ -106,9 +121,10 @@ class Tally:
             picks: the pictures it belongs to.
             place: its place among them.
             trial: what was seen.
-            label: the answer.
         """
         right = trial.right
+        if pairs := len(self._verdicts[0]):
+            self._verdicts[index // pairs][index % pairs] = RIGHT if right else WRONG
         self.seen += 1
         self.correct += right
         for count, digit in zip(self._outer, outer, strict=True):
@@ -125,6 +141,33 @@ class Tally:
             self.not_finite += 1
         elif self.worst is None or trial.margin > self.worst[1].margin:
             self.worst = index, trial
+
+    def beside(self, models: Sequence[str]) -> list[PairedRates]:
+        """Return both rates of each model, of the pairs of which both are known."""
+        clean, answer = (np.frombuffer(one, np.uint8).reshape(-1, len(models)) for one in self._verdicts)
+        found = []
+        for number, name in enumerate(models):
+            known = (clean[:, number] > 0) & (answer[:, number] > 0)
+            before, after = clean[known, number] == RIGHT, answer[known, number] == RIGHT
+            if not len(before):
+                continue
+            counts = [int(one.sum()) for one in (before & after, before & ~after, ~before & after, ~before & ~after)]
+            both, clean_only, answer_only, neither = counts
+            difference, interval = paired_difference(*counts)
+            found.append(
+                PairedRates(
+                    model=name,
+                    clean=rate(both + clean_only, len(before)),
+                    answer=rate(both + answer_only, len(before)),
+                    both=both,
+                    clean_only=clean_only,
+                    answer_only=answer_only,
+                    neither=neither,
+                    difference=difference,
+                    interval=interval,
+                )
+            )
+        return found
 
     def table(self) -> list[AxisRow]:
         """Return accuracy by axis and value; axes with a single value are left out."""

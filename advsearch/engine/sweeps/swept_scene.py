@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -178,4 +177,4 @@ class SweptScene:
 
 
 def _finite(seen: Judgement) -> Judgement:
-    return seen if math.isfinite(seen.margin) else replace(seen, score=math.nan, margin=math.nan, right=False)
+    return Judgement.of(seen.score, seen.margin, seen.answer, seen.payload)

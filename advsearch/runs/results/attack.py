@@ -42,6 +42,7 @@ class ControlGroup(Fields):
     trials: int
     rate: float
     interval: Interval
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
 class CleanAnswer(CleanScene, UsualAnswer):
@@ -61,6 +62,23 @@ class VerifiedRate(Fields):
     spp: int = Field(description="samples a pixel")
     labels: dict[str, int] = Field(description="how often each wrong answer was given")
     margin: Number = Field(description="mean over the trials, in logits")
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+
+
+class ObjectiveValues(Fields):
+    """The objective over some trials, in its own unit."""
+
+    mean: Number
+    deviation: Number = Field(description="standard deviation of one trial")
+    low: Number = Field(description="the least")
+    high: Number = Field(description="the most")
+
+
+class TriedObjective(Fields):
+    """What the search maximised, over the trials of the verification, which have other seeds and 8 bits."""
+
+    clean: ObjectiveValues | None = Field(description="of the clean scene; null where it was not tried")
+    answer: ObjectiveValues | None = Field(description="of the answer; null where nothing was verified")
 
 
 class BaselineSearch(Fields):
@@ -137,7 +155,7 @@ class VerificationSamples(Fields):
     """The sample count of the verification."""
 
     spp: int
-    converged: bool = Field(description="whether the margins stood still there")
+    converged: bool = Field(description="whether the margins are shown to stand still there")
 
 
 class SearchClaim(Fields):
@@ -276,6 +294,7 @@ class AttackSummary(SceneResult):
     clean: CleanAnswer
     adversarial: UsualAnswer | None = Field(description="on the search's answer; null if nothing was searched")
     verified: VerifiedRate | None = Field(description="trials of the answer; null if nothing was verified")
+    tried_objective: TriedObjective | None = Field(default=None, description="the objective over these trials")
     baseline: BaselineSearch | None = Field(default=None, description="the random search; absent without `baseline`")
     answer_from: str | None = Field(default=None, description="`random` where the random search's answer is the run's")
     policy_verified: VerifiedRate | None = Field(default=None, description="of the policy's own answer then")
@@ -307,5 +326,7 @@ class AttackSummary(SceneResult):
 
     @property
     def brief(self) -> str:
-        """The verified rate."""
-        return f"{self.verified.successes}/{self.verified.trials}" if self.verified else ""
+        """The verified rate; of a run that was interrupted before, the answer so far."""
+        if self.verified is None:
+            return f"{self.adversarial.label}, unverified" if self.goes_on and self.adversarial else ""
+        return f"{self.verified.successes}/{self.verified.trials}"

@@ -115,6 +115,27 @@ class SurfaceMap(Fields):
     tables: list[SurfaceTable] = Field(description="for every object, model and kind of part")
 
 
+class PairedRates(Fields):
+    """The same configurations without and with an answer, which one model was shown with the same noise."""
+
+    model: str
+    clean: CountedAnswers = Field(description="without the answer")
+    answer: CountedAnswers = Field(description="with it")
+    both: int = Field(description="pairs that are right in both")
+    clean_only: int = Field(description="pairs that are right without it alone")
+    answer_only: int = Field(description="pairs that are right with it alone")
+    neither: int = Field(description="pairs that are right in none")
+    difference: float = Field(description="accuracy with the answer less that without")
+    interval: Interval = Field(description="of that difference, 95 %, of pairs")
+
+
+class BesideAnswer(Fields):
+    """The clean scene and the answer of a run under the same draws."""
+
+    answer: str = Field(description="the run")
+    pairs: list[PairedRates] = Field(description="for each model")
+
+
 class SweepSummary(CountedAnswers, RunResult):
     """How often the model is right over configurations that were not searched for."""
 
@@ -130,6 +151,10 @@ class SweepSummary(CountedAnswers, RunResult):
     axes: list[AxisRow] = Field(description="a row for every value of every axis")
     cells: SweepMap | None = Field(
         description="over the first two axes with several values; null where there are fewer, or more than 4096 pairs"
+    )
+    beside: BesideAnswer | None = Field(
+        default=None,
+        description="the clean scene beside [an answer](#an-answer-beside-the-clean-scene); absent without",
     )
     worst: WorstConfiguration | None
     grid: dict[str, int] = Field(description="how many values each axis of the grid has")
@@ -155,5 +180,8 @@ class SweepSummary(CountedAnswers, RunResult):
 
     @property
     def brief(self) -> str:
-        """The accuracy."""
+        """The accuracy; beside an answer, that without and with it."""
+        if self.beside and self.beside.pairs:
+            rates = self.beside.pairs[0]
+            return f"accuracy {rates.clean.accuracy:.1%}, {rates.answer.accuracy:.1%} with {self.beside.answer}"
         return "" if self.accuracy is None else f"accuracy {self.accuracy:.1%}"

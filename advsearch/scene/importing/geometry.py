@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh
-from advsearch.scene.importing.parts import ImportedPart
+from advsearch.scene.importing.imported_part import ImportedPart
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -45,7 +45,8 @@ class Soup:
         part: (F,) int64, the part of the file that the face belongs to.
         normals: (F, 3, 3) float64 unit normals of the corners; NaN where unknown.
         uvs: (F, 3, 2) float64; NaN where unknown.
-        colors: (F, 3, 3) float64 display-referred factors of the base colour; 1 where the file gives none.
+        colors: (F, 3, 3) float64 linear factors of the base colour; 1 where the file gives none.
+        flat: (F,) the faces that are flat where they have no normals; None where none are.
     """
 
     points: Array
@@ -54,12 +55,14 @@ class Soup:
     normals: Array
     uvs: Array
     colors: Array
+    flat: Bools | None = None
 
     def only(self, keep: Bools) -> Soup:
         """Return the soup with a part of its faces; `keep` is (F,)."""
         return Soup(
-            self.points, self.faces[keep], self.part[keep], self.normals[keep], self.uvs[keep], self.colors[keep]
-        )
+            self.points, self.faces[keep], self.part[keep], self.normals[keep], self.uvs[keep], self.colors[keep],
+            None if self.flat is None else self.flat[keep],
+        )  # fmt: skip
 
     def reversed(self, turn: Bools) -> Soup:
         """Return the soup with some faces turned over; `turn` is (F,). Normals stay as they are."""
@@ -116,6 +119,7 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
         normals=normals,
         uvs=np.concatenate([_corners(part.uvs, part.faces, 2) for part in parts]),
         colors=np.concatenate([np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors for p in parts]),
+        flat=np.concatenate([np.full(len(part.faces), part.flat) for part in parts]),
     )
 
 
@@ -270,7 +274,10 @@ def _shaded(soup: Soup) -> tuple[Soup, list[str]]:
             notes.append("its normals contradict its faces and were computed anew")
             front = np.zeros_like(front)
     if not front.all():
-        normals = np.where((known & front)[:, :, None], normals, smooth_normals(soup))
+        made = smooth_normals(soup)
+        if soup.flat is not None:
+            made = np.where(soup.flat[:, None, None], unit_vectors(vectors)[:, None], made)
+        normals = np.where((known & front)[:, :, None], normals, made)
     return replace(soup, normals=normals), notes
 
 

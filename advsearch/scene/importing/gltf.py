@@ -1,8 +1,4 @@
-"""The header of a glTF file: read strictly, held to limits, and written again with only what is understood here.
-
-trimesh gets the header that is written here and never the file's own, so that nothing which has not been looked at
-reaches it: neither other types than those of glTF 2.0 nor extensions that decode pictures at full size.
-"""
+"""The header of a glTF file: read strictly and held to limits."""
 
 from __future__ import annotations
 
@@ -16,20 +12,10 @@ from advsearch import files
 from advsearch.files import JsonObject, JsonValue
 from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
 from advsearch.scene.importing.gltf_checks import check_header
-from advsearch.scene.importing.gltf_entries import Asset, Header, MaterialEntry, Primitive, TextureUse
-from advsearch.scene.importing.references import GLOW, NORMAL_MAPS
+from advsearch.scene.importing.gltf_entries import Asset, Header
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
-
-MAP = "TEXCOORD_0"
-"""The texture coordinates that are read of the header that is written."""
-
-MATERIAL = "material "
-"""Before the number of a material in its name, in the header that is written."""
-
-NODE = "node "
-"""Before the number of a node in its name, in the header that is written."""
 
 
 def read_header(path: Path, data: bytes) -> Header:
@@ -78,75 +64,13 @@ def _extensions(content: JsonObject) -> set[str]:
     return found
 
 
-def rewritten(path: Path, data: bytes, header: Header) -> bytes:
-    """Return the file with a header of only what was read of it."""
-    plain = header.model_copy(
-        update={
-            "meshes": [
-                mesh.model_copy(update={"primitives": [_one_map(header, one) for one in mesh.primitives]})
-                for mesh in header.meshes
-            ],
-            "materials": [
-                material.plain().model_copy(update={"name": f"{MATERIAL}{index}"})
-                for index, material in enumerate(header.materials)
-            ],
-            "textures": [texture.plain() for texture in header.textures],
-            "nodes": [
-                node.model_copy(update={"name": f"{NODE}{index}", "camera": None, "extensions": None})
-                for index, node in enumerate(header.nodes)
-            ],
-            "cameras": [],
-            "samplers": [],
-            "extensions": None,
-            "extensionsRequired": [],
-            "extensionsUsed": [],
-        }
-    )
-    text = json.dumps(plain.model_dump(exclude_none=True, exclude_defaults=True)).encode()
-    if path.suffix.lower() == ".gltf":
-        return text
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + struct.unpack_from("<I", data, 12)[0] : struct.unpack_from("<I", data, 8)[0]]
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-
-
-def _one_map(header: Header, primitive: Primitive) -> Primitive:
-    """Return a primitive whose one set of texture coordinates is that by which its textures are looked up."""
-    used = MAP if primitive.material is None else header.materials[primitive.material].coordinates
-    if used == MAP:
-        return primitive
-    attributes = {name: index for name, index in primitive.attributes.items() if name != MAP}
-    if used in attributes:
-        attributes[MAP] = attributes[used]
-    return primitive.model_copy(update={"attributes": attributes})
-
-
-def entry_of(header: Header, name: str | None) -> MaterialEntry | None:
-    """Return the material of a name in the header that is written; None where there is none."""
-    number = (name or "").removeprefix(MATERIAL)
-    return header.materials[int(number)] if number.isdecimal() and int(number) < len(header.materials) else None
-
-
-def image_name(header: Header, used: TextureUse | None) -> str | None:
-    """Return a name for the image of a texture, or None where there is no texture."""
-    if used is None:
+def binary_chunk(data: bytes) -> bytes | None:
+    """Return what follows the header of a .glb file, as `read_header` has accepted it; None where nothing does."""
+    start, end = 20 + struct.unpack_from("<I", data, 12)[0], struct.unpack_from("<I", data, 8)[0]
+    if start + 8 > end:
         return None
-    source = header.textures[used.index].plain().source
-    uri = None if source is None else header.images[source].uri
-    return "(embedded)" if uri is None or uri.startswith("data:") else uri
-
-
-def unread(header: Header) -> dict[str, int]:
-    """Return what materials have that is not read, each with how many of them."""
-    return {
-        NORMAL_MAPS: sum(one.normalTexture is not None and not one.plain().normalTexture for one in header.materials),
-        GLOW: sum(any(one.emission) and not _lit_alike(one) for one in header.materials),
-    }
-
-
-def _lit_alike(material: MaterialEntry) -> bool:
-    """Whether the texture of its emission, if it has one, is looked up as its other textures are."""
-    return material.emissiveTexture is None or material.plain().emissiveTexture is not None
+    size, kind = struct.unpack_from("<I4s", data, start)
+    return data[start + 8 : min(start + 8 + size, end)] if kind == b"BIN\0" else None
 
 
 def _json_chunk(path: Path, data: bytes) -> bytes:

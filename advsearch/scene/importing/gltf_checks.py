@@ -20,17 +20,17 @@ LARGEST_TREE = 20_000
 DEEPEST_TREE = 500
 """Nodes from the root to a leaf."""
 
-_FLOAT = 5126
-
 READ = (
     "EXT_texture_webp",
     "KHR_lights_punctual",
     "KHR_materials_emissive_strength",
     "KHR_materials_pbrSpecularGlossiness",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
 )
 """Extensions that are understood."""
 
-_LOOKS = ("KHR_materials_", "KHR_texture_transform", "KHR_xmp")
+_LOOKS = ("KHR_materials_", "KHR_xmp")
 """Beginnings of those without which a file looks otherwise and has the same geometry: they are named in warnings."""
 
 
@@ -48,15 +48,22 @@ def check_header(path: Path, header: Header) -> None:
         _check_index(path, "buffers", view.buffer, header.buffers)
     for accessor in header.accessors:
         _check_index(path, "bufferViews", accessor.bufferView, header.bufferViews)
+        if accessor.sparse is not None:
+            _check_index(path, "bufferViews", accessor.sparse.indices.bufferView, header.bufferViews)
+            _check_index(path, "bufferViews", accessor.sparse.values.bufferView, header.bufferViews)
     for texture in header.textures:
-        _check_index(path, "images", texture.plain().source, header.images)
+        _check_index(path, "images", texture.image, header.images)
         _check_index(path, "samplers", texture.sampler, header.samplers)
     for image in header.images:
         _check_index(path, "bufferViews", image.bufferView, header.bufferViews)
     for material in header.materials:
-        surface = material.plain().pbrMetallicRoughness
-        uses = (surface.baseColorTexture, surface.metallicRoughnessTexture) if surface else ()
-        for use in (*uses, material.normalTexture, material.emissiveTexture):
+        surface = material.surface
+        for use in (
+            surface.baseColorTexture,
+            surface.metallicRoughnessTexture,
+            material.normalTexture,
+            material.emissiveTexture,
+        ):
             _check_index(path, "textures", None if use is None else use.index, header.textures)
     sizes = (sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
     if max(sizes) > files.scaled(LARGEST_VALUES):
@@ -74,29 +81,23 @@ def _check_index(path: Path, kind: str, index: int | None, entries: list[Any]) -
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
-    """Refuse what would be read wrongly: integers where floats are meant, attributes of different lengths."""
+    """Refuse attributes that are not what their names say, or of different lengths."""
     for index in (*primitive.attributes.values(), primitive.indices):
         _check_index(path, "accessors", index, header.accessors)
     _check_index(path, "materials", primitive.material, header.materials)
-    coordinates = "TEXCOORD_0" if primitive.material is None else header.materials[primitive.material].coordinates
-    for name in ("POSITION", "NORMAL", coordinates):
-        if name not in primitive.attributes:
-            continue
-        accessor = header.accessors[primitive.attributes[name]]
-        if accessor.componentType != _FLOAT:
-            got = f"{name} values that are not 32-bit floats"
-            raise FileFormatError(f"{path}: expected floats, got {got}; export it without quantization")
-        kind = "VEC2" if name.startswith("TEXCOORD_") else "VEC3"
-        if accessor.type != kind:
-            raise damaged(path, f"{name} of type {kind}", accessor.type)
+    held = {name: header.accessors[index] for name, index in primitive.attributes.items()}
+    coordinates = "TEXCOORD_0" if primitive.material is None else header.materials[primitive.material].attribute
+    kinds_of = {"POSITION": ("VEC3",), "NORMAL": ("VEC3",), "COLOR_0": ("VEC3", "VEC4"), coordinates: ("VEC2",)}
+    for name, kinds in kinds_of.items():
+        if name in held and held[name].type not in kinds:
+            raise damaged(path, f"{name} of type {' or '.join(kinds)}", held[name].type)
+        if name in held and "POSITION" in held and held[name].count != held["POSITION"].count:
+            expected = f"as many values of {name} as of POSITION, {held['POSITION'].count:,}"
+            raise damaged(path, expected, f"{held[name].count:,}")
     if primitive.indices is not None and header.accessors[primitive.indices].type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", header.accessors[primitive.indices].type)
-    for index in (*primitive.attributes.values(), primitive.indices):
-        values = None if index is None else header.accessors[index]
-        if values is not None and values.sparse is not None:
-            raise FileFormatError(f"{path}: has sparse accessors, which are not supported; export it without them")
-        if values is not None and values.bufferView is None:
-            raise damaged(path, "accessors with a bufferView", "one without values")
+    if primitive.indices is not None and header.accessors[primitive.indices].componentType not in (5121, 5123, 5125):
+        raise damaged(path, "indices that are unsigned integers", "other numbers")
 
 
 def _triangles(header: Header, primitive: Primitive) -> int:

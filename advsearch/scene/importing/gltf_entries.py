@@ -13,7 +13,7 @@ List = Annotated[list[T], FailFast()]
 """A list of which only the first wrong entry is reported; a million reports take gigabytes."""
 
 Unread = Annotated[JsonValue, Field(exclude=True)]
-"""What is named in a warning and never read."""
+"""What is never read, and named in a warning of its own, or makes no difference."""
 
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
@@ -22,7 +22,13 @@ _ELEMENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9,
 
 
 class _Entry(BaseModel):
-    """A JSON object of glTF; what it holds beyond the fields is dropped."""
+    """A JSON object of glTF; what it holds beyond the fields is kept as `model_extra`, to be named as left out."""
+
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False, frozen=True)
+
+
+class _Extensions(BaseModel):
+    """Extensions of an entry; those that are not understood are named by `gltf_notes`."""
 
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False, frozen=True)
 
@@ -43,17 +49,42 @@ class BufferView(_Entry):
     byteStride: Annotated[int, Field(ge=4, le=252)] | None = None
 
 
+class SparseIndices(_Entry):
+    bufferView: Index
+    componentType: Literal[5121, 5123, 5125]
+    byteOffset: Size = 0
+
+
+class SparseValues(_Entry):
+    bufferView: Index
+    byteOffset: Size = 0
+
+
+class Sparse(_Entry):
+    """Values in place of some of an accessor's own."""
+
+    count: Size
+    indices: SparseIndices
+    values: SparseValues
+
+
 class Accessor(_Entry):
     componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
     count: Size
     type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
     bufferView: Index | None = None
     byteOffset: Size = 0
-    sparse: dict[str, JsonValue] | None = Field(default=None, exclude=True)
+    normalized: bool = False
+    sparse: Sparse | None = None
+
+    @property
+    def width(self) -> int:
+        """Numbers of one of its values."""
+        return _ELEMENTS[self.type]
 
     def size(self) -> int:
         """Bytes of its values, packed."""
-        return self.count * _COMPONENTS[self.componentType] * _ELEMENTS[self.type]
+        return self.count * _COMPONENTS[self.componentType] * self.width
 
 
 class Primitive(_Entry):
@@ -73,7 +104,7 @@ class _LightUse(_Entry):
     light: Index
 
 
-class _NodeExtensions(_Entry):
+class _NodeExtensions(_Extensions):
     punctual: _LightUse | None = Field(default=None, alias="KHR_lights_punctual")
 
 
@@ -132,18 +163,55 @@ class _Lights(_Entry):
     lights: List[Light] = []
 
 
-class _Extensions(_Entry):
+class _FileExtensions(_Extensions):
     punctual: _Lights | None = Field(default=None, alias="KHR_lights_punctual")
+
+
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+Map = Annotated[int, Field(ge=0, lt=256)]
+
+
+class TextureTransform(_Entry):
+    """KHR_texture_transform: scaled, then turned counter-clockwise in radians, then moved."""
+
+    offset: Pair = [0.0, 0.0]
+    rotation: float = 0.0
+    scale: Pair = [1.0, 1.0]
+    texCoord: Map | None = None
+
+
+UNMOVED = TextureTransform()
+
+
+class _TextureUseExtensions(_Extensions):
+    transform: TextureTransform | None = Field(default=None, alias="KHR_texture_transform")
 
 
 class TextureUse(_Entry):
     index: Index
-    texCoord: Annotated[int, Field(ge=0, lt=256)] = 0
+    texCoord: Map = 0
+    extensions: _TextureUseExtensions | None = None
 
     @property
-    def coordinates(self) -> str:
-        """Name of the attribute by which it is looked up."""
-        return f"TEXCOORD_{self.texCoord}"
+    def transform(self) -> TextureTransform:
+        """What is done to the texture coordinates before it is looked up."""
+        given = self.extensions.transform if self.extensions else None
+        return given or UNMOVED
+
+    @property
+    def attribute(self) -> str:
+        """Name of the texture coordinates by which it is looked up."""
+        other = self.transform.texCoord
+        return f"TEXCOORD_{self.texCoord if other is None else other}"
+
+    def looked_up_as(self, other: TextureUse) -> bool:
+        """Whether another texture is looked up at the same places."""
+        ours, theirs = self.transform, other.transform
+        return self.attribute == other.attribute and (ours.offset, ours.rotation, ours.scale) == (
+            theirs.offset,
+            theirs.rotation,
+            theirs.scale,
+        )
 
 
 class NormalUse(TextureUse):
@@ -156,8 +224,8 @@ Factor = Annotated[list[float], Field(min_length=4, max_length=4)]
 class MetallicRoughness(_Entry):
     baseColorFactor: Factor | None = None
     baseColorTexture: TextureUse | None = None
-    metallicFactor: float | None = None
-    roughnessFactor: float | None = None
+    metallicFactor: float = 1.0
+    roughnessFactor: float = 1.0
     metallicRoughnessTexture: TextureUse | None = None
 
 
@@ -171,7 +239,7 @@ class EmissiveStrength(_Entry):
     emissiveStrength: Annotated[float, Field(ge=0.0)] = 1.0
 
 
-class _MaterialExtensions(_Entry):
+class _MaterialExtensions(_Extensions):
     strength: EmissiveStrength | None = Field(default=None, alias="KHR_materials_emissive_strength")
     glossiness: SpecularGlossiness | None = Field(default=None, alias="KHR_materials_pbrSpecularGlossiness")
 
@@ -190,44 +258,17 @@ class MaterialEntry(_Entry):
     emissiveFactor: Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)] = [0.0] * 3
     alphaMode: str = "OPAQUE"
     alphaCutoff: float = CUTOFF
+    doubleSided: Unread = None
     occlusionTexture: Unread = None
     extensions: _MaterialExtensions | None = None
 
     @property
-    def base_color(self) -> TextureUse | None:
-        """Where its base colour texture is, and by which coordinates it is looked up; None without one."""
-        surface = self._metallic_roughness()
-        return None if surface is None else surface.baseColorTexture
-
-    @property
-    def coordinates(self) -> str:
-        """Name of the attribute by which its textures are looked up: that of the base colour, if it has one."""
-        used = self.base_color or self.normalTexture or self.emissiveTexture
-        return "TEXCOORD_0" if used is None else used.coordinates
-
-    @property
-    def emission(self) -> list[float]:
-        """(3,) linear radiance, where there is a texture that times its colour."""
-        given = self.extensions.strength if self.extensions else None
-        return [one * (1.0 if given is None else given.emissiveStrength) for one in self.emissiveFactor]
-
-    def plain(self) -> MaterialEntry:
-        """Return the material without extensions: the diffuse colour of an old one is its base colour. Textures that
-        are looked up by other coordinates than that are left out."""
-        normals, glow = self.normalTexture, self.emissiveTexture
-        return MaterialEntry(
-            pbrMetallicRoughness=self._metallic_roughness(),
-            name=self.name,
-            normalTexture=normals if normals is None or normals.coordinates == self.coordinates else None,
-            emissiveTexture=glow if glow is None or glow.coordinates == self.coordinates else None,
-            alphaMode=self.alphaMode if self.alphaMode in CUT_OUTS else "OPAQUE",
-            alphaCutoff=self.alphaCutoff,
-        )
-
-    def _metallic_roughness(self) -> MetallicRoughness | None:
+    def surface(self) -> MetallicRoughness:
+        """Its base colour, roughness and metallic: the format's where it says none, and those of an old extension,
+        whose diffuse colour is the base colour."""
         old = self.extensions.glossiness if self.extensions else None
         if old is None:
-            return self.pbrMetallicRoughness
+            return self.pbrMetallicRoughness or MetallicRoughness()
         return MetallicRoughness(
             baseColorFactor=old.diffuseFactor,
             baseColorTexture=old.diffuseTexture,
@@ -235,22 +276,52 @@ class MaterialEntry(_Entry):
             roughnessFactor=1.0 - old.glossinessFactor,
         )
 
+    @property
+    def layout(self) -> TextureUse | None:
+        """The use of a texture whose coordinates the mesh gets: of the base colour, if it has one."""
+        return self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
+
+    @property
+    def attribute(self) -> str:
+        """Name of the texture coordinates that are read."""
+        return "TEXCOORD_0" if self.layout is None else self.layout.attribute
+
+    @property
+    def textures(self) -> list[TextureUse]:
+        """The uses of textures that are read, `layout` first."""
+        uses = (self.surface.baseColorTexture, self.normalTexture, self.emissiveTexture)
+        return [one for one in uses if one is not None and self.reads(one)]
+
+    def reads(self, use: TextureUse | None) -> bool:
+        """Whether a texture is looked up at the same places as the others, if there is one; else it is left out."""
+        return use is None or self.layout is None or use.looked_up_as(self.layout)
+
+    @property
+    def emission(self) -> list[float]:
+        """(3,) linear radiance, where there is a texture that times its colour."""
+        given = self.extensions.strength if self.extensions else None
+        return [one * (1.0 if given is None else given.emissiveStrength) for one in self.emissiveFactor]
+
 
 class _WebpSource(_Entry):
     source: Index | None = None
 
 
-class _TextureExtensions(_Entry):
+class _TextureExtensions(_Extensions):
     webp: _WebpSource | None = Field(default=None, alias="EXT_texture_webp")
 
 
-REPEAT = 10497
-"""How a texture goes on beyond its edges, of the three ways that glTF has."""
+REPEAT, MIRRORED, CLAMPED = 10497, 33648, 33071
+"""How a texture goes on beyond its edges."""
+NEAREST = 9728
+"""The filter that leaves texels sharp."""
 
 
 class Sampler(_Entry):
     wrapS: int = REPEAT
     wrapT: int = REPEAT
+    magFilter: int | None = None
+    minFilter: Unread = None
 
 
 class Texture(_Entry):
@@ -258,10 +329,11 @@ class Texture(_Entry):
     sampler: Index | None = None
     extensions: _TextureExtensions | None = None
 
-    def plain(self) -> Texture:
-        """Return the texture without extensions."""
+    @property
+    def image(self) -> int | None:
+        """Number of its picture; None where only an extension that is not understood has one."""
         webp = self.extensions.webp if self.extensions else None
-        return Texture(source=self.source if webp is None or webp.source is None else webp.source)
+        return self.source if webp is None or webp.source is None else webp.source
 
 
 class Image(_Entry):
@@ -288,7 +360,7 @@ class Header(_Entry):
     cameras: List[CameraEntry] = []
     skins: Unread = None
     animations: Unread = None
-    extensions: _Extensions | None = None
+    extensions: _FileExtensions | None = None
     extensionsUsed: List[str] = []
     extensionsRequired: List[str] = []
 

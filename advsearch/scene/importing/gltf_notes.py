@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from pydantic import BaseModel
+
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.gltf_checks import READ
-from advsearch.scene.importing.gltf_entries import CUT_OUTS, REPEAT, Header, MaterialEntry, MeshEntry
+from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header, MeshEntry
+from advsearch.scene.importing.left_out import Inventory
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
 
@@ -20,7 +23,6 @@ EXTENSIONS = {
     "KHR_materials_transmission": _OPAQUE,
     "KHR_materials_unlit": " has surfaces that keep their colour in any light ({name}); here they are lit as others",
     "KHR_materials_variants": " has variants of its materials ({name}); those that it shows by itself are taken",
-    "KHR_texture_transform": " moves its textures with {name}, which is not applied",
 }
 """What becomes of a file with an extension; of all that are not named here, nor understood, `UNKNOWN`."""
 
@@ -35,13 +37,19 @@ def left_out(header: Header) -> Iterator[str]:
     used = {*header.extensionsUsed, *header.extensionsRequired}
     for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
         yield EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False))
-    drawn = _in_the_scene(header)
+    drawn = in_the_scene(header)
     absent = sum(node.mesh is not None for index, node in enumerate(header.nodes) if index not in drawn)
     found = {
         "occlusion map{s}: left out": sum(one.occlusionTexture is not None for one in header.materials),
         "mesh{es} with morph targets, which are left out": sum(map(_is_morphed, header.meshes)),
-        "mesh{es} with an opacity in vertex colours, which is left out": sum(
-            _has_see_through_vertices(header, mesh) for mesh in header.meshes
+        "normal map{s} with other texture coordinates than the base colour: left out": sum(
+            not one.reads(one.normalTexture) for one in header.materials
+        ),
+        "emission texture{s} with other coordinates than the base colour: left out, with the emission": sum(
+            any(one.emission) and not one.reads(one.emissiveTexture) for one in header.materials
+        ),
+        "material{s} with an alphaMode that glTF does not have: opaque": sum(
+            one.alphaMode not in ("OPAQUE", *CUT_OUTS) for one in header.materials
         ),
         "skin{s}: what is bound to bones stays as it was drawn": _length(header.skins),
         "animation{s}: left out": _length(header.animations),
@@ -50,19 +58,65 @@ def left_out(header: Header) -> Iterator[str]:
     }
     for what, count in found.items():
         if count:
-            yield f": {_counted(count, what)}"
+            yield f": {counted(count, what)}"
+    yield from (f": {clause}" for clause in _unread(header))
+
+
+WORDS = {
+    "Header": "entry",
+    "MaterialEntry": "entry of a material",
+    "MetallicRoughness": "entry of a material",
+    "TextureUse": "entry of a material's texture",
+    "NormalUse": "entry of a material's texture",
+    "MeshEntry": "entry of a mesh",
+    "Primitive": "entry of a primitive",
+    "Node": "entry of a node",
+    "Sampler": "entry of a sampler",
+    "Texture": "entry of a texture",
+    "Image": "entry of an image",
+    "Light": "entry of a light",
+}
+"""What is left out of entries whose contents are seen."""
+
+PLAIN = frozenset(("name", "weights", "skin", "extensions"))
+"""Keys without a field that make no difference, or are named with what they belong to."""
+
+
+def _unread(header: Header) -> Iterator[str]:
+    """Yield a clause for every key, extras of materials among them, and every attribute that is not read."""
+    found = Inventory()
+    level: list[object] = [header]
+    for entry in level:  # which grows
+        if isinstance(entry, list):
+            level.extend(one for one in entry if isinstance(one, BaseModel))
+        elif isinstance(entry, BaseModel):
+            kind = WORDS.get(type(entry).__name__)
+            for key in (entry.model_extra or {}) if kind else ():
+                found.has(str(kind), key)
+            level.extend(getattr(entry, name) for name in type(entry).model_fields)
+    for kind in set(WORDS.values()):
+        for key in PLAIN if "material" in kind or "texture" in kind else {*PLAIN, "extras"}:  # notes of applications
+            found.take(kind, key)
+    for mesh in header.meshes:
+        for primitive in mesh.primitives:
+            material = None if primitive.material is None else header.materials[primitive.material]
+            read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0", material.attribute if material else ""}
+            for name in primitive.attributes:
+                if name not in read and not (header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))):
+                    found.has("attribute", name)
+    return found.left()
 
 
 def beside(header: Header) -> str | None:
     """Return what a file read as one object leaves out of its scene; None if nothing."""
     lights = sum(node.lamp is not None for node in header.nodes)
     cameras = sum(node.camera is not None for node in header.nodes)
-    counted = [_counted(count, what) for count, what in ((lights, "light{s}"), (cameras, "camera{s}")) if count]
-    if not counted:
+    found = [counted(count, what) for count, what in ((lights, "light{s}"), (cameras, "camera{s}")) if count]
+    if not found:
         return None
     verb = "is" if lights + cameras == 1 else "are"
     what_to_do = "name one node as the object, FILE#NODE, to keep the rest around it"
-    return f": {' and '.join(counted)} {verb} left out of the object; {what_to_do}"
+    return f": {' and '.join(found)} {verb} left out of the object; {what_to_do}"
 
 
 def lights_and_cameras(header: Header) -> Iterator[str]:
@@ -75,23 +129,10 @@ def lights_and_cameras(header: Header) -> Iterator[str]:
         ),
         "camera{s} without perspective: left out": sum(one.perspective is None for one in header.cameras),
     }
-    yield from (f": {_counted(count, what)}" for what, count in found.items() if count)
+    yield from (f": {counted(count, what)}" for what, count in found.items() if count)
 
 
-EDGES = " has textures that are not to repeat beyond their edges; here they do"
-
-
-def repeats(header: Header, material: MaterialEntry) -> bool:
-    """Whether the textures of a material go on beyond their edges as all do here."""
-    surface = material.plain().pbrMetallicRoughness
-    uses = (surface.baseColorTexture, surface.metallicRoughnessTexture) if surface else ()
-    numbers = [use.index for use in (*uses, material.normalTexture, material.emissiveTexture) if use is not None]
-    samplers = [header.textures[number].sampler for number in numbers]
-    found = [header.samplers[number] for number in samplers if number is not None]
-    return all(one.wrapS == one.wrapT == REPEAT for one in found)
-
-
-def _counted(count: int, what: str) -> str:
+def counted(count: int, what: str) -> str:
     return f"{count} {what.format(s='' if count == 1 else 's', es='' if count == 1 else 'es')}"
 
 
@@ -103,18 +144,7 @@ def _is_morphed(mesh: MeshEntry) -> bool:
     return any(primitive.targets for primitive in mesh.primitives)
 
 
-def _has_see_through_vertices(header: Header, mesh: MeshEntry) -> bool:
-    """Whether the colours of its vertices have an alpha that its material lets count."""
-    return any(
-        primitive.material is not None
-        and header.materials[primitive.material].alphaMode in CUT_OUTS
-        and "COLOR_0" in primitive.attributes
-        and header.accessors[primitive.attributes["COLOR_0"]].type == "VEC4"
-        for primitive in mesh.primitives
-    )
-
-
-def _in_the_scene(header: Header) -> set[int]:
+def in_the_scene(header: Header) -> set[int]:
     """The nodes of the scene that is read."""
     if not header.scenes:
         return set(range(len(header.nodes)))

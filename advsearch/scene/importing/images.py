@@ -56,7 +56,7 @@ def check_pixels(path: Path | str, width: int, height: int, limit: int = LARGEST
         raise files.too_large(path, expected, f"{width} x {height}")
 
 
-def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT) -> Floats:
+def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = False) -> Floats:
     """Read a picture file; arguments and result as for `display_image`.
 
     Raises:
@@ -67,7 +67,7 @@ def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT) -> Floats:
         with warnings.catch_warnings(), without_pillows_limit():
             warnings.simplefilter("ignore")  # of odd metadata
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                return display_image(image, limit, path)
+                return display_image(image, limit, path, raw=raw)
     except (OSError, ValueError, SyntaxError, EOFError) as error:
         reason = getattr(error, "strerror", None) or "one that cannot be read"
         raise FileFormatError(f"{path}: expected a picture file such as PNG, got {reason}; check the path") from error
@@ -85,7 +85,8 @@ def display_image(
 
     Args:
         image: an opened picture of any mode.
-        limit: longest side of the result; larger pictures are averaged down in linear light. None: no limit.
+        limit: longest side of the result; larger pictures are averaged down in linear light, and so that what is
+            transparent does not count. None: no limit.
         path: where it is from, for messages.
         alpha: keep it as a fourth channel, 1 where the picture has none; otherwise it is dropped.
         raw: it holds numbers, as a normal map does, and no colours; larger ones are averaged down as they are.
@@ -113,14 +114,20 @@ def display_image(
         target = max(1, round(height * scale)), max(1, round(width * scale))
         linear = display if raw else srgb_to_linear(display)
 
+        weighted = not raw and (alpha or image.has_transparency_data)
+
         def band(top: int, end: int) -> Floats:
-            steps = _steps(image.crop((0, top, width, end)), alpha=alpha)
-            return np.concatenate([linear[steps[:, :, :3]], display[steps[:, :, 3:]]], axis=2)
+            steps = _steps(image.crop((0, top, width, end)), alpha=weighted)
+            colors, share = linear[steps[:, :, :3]], display[steps[:, :, 3:]]
+            return np.concatenate([colors, share, colors * share] if weighted else [colors], axis=2)
 
         averaged = banded_average(band, (height, width), target)
         if raw:
             return averaged
-        return np.concatenate([linear_to_srgb(averaged[:, :, :3]), averaged[:, :, 3:]], axis=2)
+        colors, share = averaged[:, :, :3], averaged[:, :, 3:4]
+        if weighted:
+            colors = np.where(share > 0.0, averaged[:, :, 4:] / np.maximum(share, 1e-9), colors)
+        return np.concatenate([linear_to_srgb(colors), share] if alpha else [linear_to_srgb(colors)], axis=2)
 
 
 def _scans(image: Image.Image) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -17,9 +18,10 @@ from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
-from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
+from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.parts import GLTF, read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
-from advsearch.scene.importing.texture import textured
+from advsearch.scene.importing.texture import by_material, textured
 from advsearch.scene.importing.upright import guess_up
 
 Floats = npt.NDArray[np.float32]
@@ -37,19 +39,20 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
       object is scaled to a largest extent of 1 and set on z = 0.
     - Faces without area are removed, the winding is made consistent, closed shells that are inside out are turned over.
     - Normals are the file's; where it has none, or they contradict the faces, they are computed: smooth, with creases
-      where faces meet at more than 40 degrees.
+      where faces meet at more than 40 degrees; flat in glTF.
     - UVs are the file's, moved into [0, 1] where that takes little. Where it has none, where they repeat a texture or
       are squashed, and where there are several materials, xatlas makes new ones and the colours are baked into a map.
-    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side; alpha
-      is opacity where a glTF material says so),
-      otherwise the material's colour, otherwise vertex or face colours, otherwise grey of display-referred 0.5. A glTF
-      texture is multiplied by its linear factor. The ``Kd`` of an .mtl is taken as display-referred, and ignored beside
-      a ``map_Kd``. Where a texture is missing, the colour takes its place, or grey if that is plain white, with a
-      warning.
+    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side, with a warning;
+      alpha is opacity where a glTF material says so), otherwise its colour, otherwise vertex or face colours, otherwise
+      grey of display-referred 0.5. A glTF texture is multiplied by its linear factor. The ``Kd`` of an .mtl
+      is taken as display-referred, multiplied by the colours of vertices, and ignored beside a ``map_Kd``. Where a
+      texture is missing, the colour takes its place, or grey if that is plain white, with a warning.
     - Emission is that of glTF, and of an .mtl ``Ke`` and ``map_Ke``: linear radiance on the front of the faces.
     - The normal map of glTF, and of an .mtl ``norm``, ``map_Bump`` or ``bump`` that holds normals; where textures are
       baked, it is turned to the new texture coordinates.
-    - Roughness and metallic are those of glTF where given, their mean over several materials, and else `Material`'s.
+    - Roughness and metallic are those of glTF, and of an .mtl ``Pr`` and ``Pm`` where given, their mean over several
+      materials, and else `Material`'s.
+    - What else a file has is named in the warnings.
 
     The same file gives the same bytes every time.
 
@@ -94,7 +97,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     material, blends = _material(soup, surfaces)
     return ObjectAsset(
         name=name,
-        mesh=_mesh(soup, file),
+        mesh=_mesh(soup, surfaces, file),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
@@ -106,9 +109,12 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     )
 
 
-def _mesh(soup: Soup, file: Path) -> Mesh:
+def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path) -> Mesh:
+    names, number = by_material(soup, surfaces)
+    faces = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number, minlength=len(names)))[:-1])
+    materials = {name: group for name, group in zip(names, faces, strict=True) if name and len(group)}
     try:
-        return normalised(assemble(soup))
+        return replace(normalised(assemble(soup)), materials=materials)
     except InputError as error:  # which knows of no file
         raise InputError(f"{file}: {error}") from None
 
@@ -158,5 +164,6 @@ def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, li
     )
     same = bool((values[area > 0] == values[area > 0][0]).all())
     roughness, metallic = values[area > 0][0] if same else (values * area[:, None]).sum(axis=0) / area.sum()
-    notes = [] if same else ["the roughness and metallic of its materials are replaced by their means"]
+    means = f"{roughness:.2g} and {metallic:.2g}"
+    notes = [] if same else [f"the roughness and metallic of its materials are replaced by their means ({means})"]
     return Material(roughness=float(roughness), metallic=float(metallic)), notes

@@ -19,10 +19,11 @@ from advsearch.scene.importing.images import check_pixels
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
-_RESOLUTION = re.compile(rb"([-+])Y (\d{1,6}) ([-+])X (\d{1,6})\n")
+_RESOLUTION = re.compile(rb"([-+])([YX]) +(\d{1,6}) +([-+])([YX]) +(\d{1,6})\r?\n")
+_NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
-def read_radiance(path: Path, data: bytes) -> Bytes:
+def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
     """Unpack a Radiance RGBE picture; `linear` makes floats of it, which take three times the memory.
 
     Args:
@@ -30,35 +31,58 @@ def read_radiance(path: Path, data: bytes) -> Bytes:
         data: its content.
 
     Returns:
-        (H, W, 4) uint8: three mantissas and an exponent; row 0 is the top, column 0 the left.
+        (H, W, 4) uint8: three mantissas and an exponent; row 0 is the top, column 0 the left. (3,) float32 by which the
+        linear values are multiplied: the inverse of all COLORCORR lines. And clauses about what is left out.
 
     Raises:
-        FileFormatError: not a Radiance picture, one in XYZ colours, an unusual orientation, too large, or cut short.
+        FileFormatError: not a Radiance picture, one in XYZ colours, too large, or cut short.
     """
-    head, found, rest = data.partition(b"\n\n")
+    found = re.search(rb"\r?\n\r?\n", data)
     if not data.startswith(b"#?") or not found:
         got = looks_like(data) if not data.startswith(b"#?") else "half a header"
         raise damaged(path, "a Radiance .hdr picture", got)
+    head, rest = data[: found.start()], data[found.end() :]
     coding = re.search(rb"^FORMAT=\s*(\S+)", head, re.MULTILINE)
     if coding and coding[1] != b"32-bit_rle_rgbe":
         got = shown(coding[1].decode("latin-1"), quoted=False)
         raise FileFormatError(f"{path}: expected FORMAT=32-bit_rle_rgbe, got {got}; convert it to RGB")
     size = _RESOLUTION.match(rest)
-    if not size or not int(size[2]) or not int(size[4]):
+    if not size or not int(size[3]) or not int(size[6]) or size[2] == size[5]:
         line = rest[:30].split(b"\n")[0].decode("latin-1")
-        raise FileFormatError(
-            f"{path}: expected a size like '-Y 512 +X 1024', got {line!r}; save the picture unrotated"
-        )
-    height, width = int(size[2]), int(size[4])
-    check_pixels(path, width, height)
-    pixels = _scanlines(path, rest[size.end() :], height, width)
-    return pixels[:: 1 if size[1] == b"-" else -1, :: 1 if size[3] == b"+" else -1]
+        raise FileFormatError(f"{path}: expected a size like '-Y 512 +X 1024', got {line!r}; save the picture again")
+    lines, length = int(size[3]), int(size[6])
+    check_pixels(path, length, lines)
+    pixels = _scanlines(path, rest[size.end() :], lines, length)
+    pixels = pixels[:: 1 if _forward(size[1], size[2]) else -1, :: 1 if _forward(size[4], size[5]) else -1]
+    scale, notes = _scale(head)
+    return pixels if size[2] == b"Y" else pixels.transpose(1, 0, 2), scale, notes
+
+
+def _forward(sign: bytes, axis: bytes) -> bool:
+    """Whether what runs along an axis comes in our order: from the top, and from the left."""
+    return sign == (b"-" if axis == b"Y" else b"+")
+
+
+def _scale(head: bytes) -> tuple[Floats, list[str]]:
+    """Return the factors (3,) that undo what a header says the colours were multiplied by, and clauses.
+
+    EXPOSURE lines are not undone, as nowhere else: the exposure of pictures is metered.
+    """
+    scale, notes = np.ones(3), list[str]()
+    for text in re.findall(rb"^COLORCORR=(.*)$", head, re.MULTILINE)[:100]:
+        numbers = np.array([float(one) for one in re.findall(_NUMBER, text)[:4]])
+        undone = scale / numbers if len(numbers) == 3 and (numbers > 0.0).all() else np.full(3, np.nan)
+        if ((undone > 1e-20) & (undone < 1e20)).all():
+            scale = undone
+        else:
+            notes.append(f"its line {shown('COLORCORR=' + text.decode('latin-1'))} is left out")
+    return scale.astype(np.float32), notes
 
 
 def linear(pixels: Bytes) -> Floats:
     """Return the linear values (H, W, 3) float32, at least 0, of pixels (H, W, 4).
 
-    A value is mantissa x 2^(exponent - 136); the EXPOSURE line is not applied. Both are as in Mitsuba.
+    A value is mantissa x 2^(exponent - 136), as in Mitsuba.
     """
     scale = np.ldexp(np.float32(1.0), pixels[:, :, 3].astype(np.int32) - 136)
     scale = np.where(pixels[:, :, 3] == 0, np.float32(0.0), scale)

@@ -13,16 +13,10 @@ from urllib.parse import unquote
 
 from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import LARGEST_FILE, text_of
-
-Named = dict[str | None, tuple[str, str]]
-"""For each material that names a texture: the file that names it, and the texture's name."""
+from advsearch.scene.importing.files import LARGEST_FILE
 
 MISSING = "is missing"
 OUTSIDE = "is outside its folder and is not read"
-NORMAL_MAPS = "the normal maps with texture coordinates of their own"
-GLOW = "the emission with texture coordinates of its own"
-"""What a material may have that is not read."""
 
 _NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
@@ -33,20 +27,14 @@ def plain_name(name: str) -> str:
 
 
 class References:
-    """Finds the files that a mesh file names; trimesh asks it for each. It remembers what it could not get, and why.
+    """Finds the files that a mesh file names; it remembers what it could not get, and why.
 
     Attributes:
-        file_name: of the mesh file, after which trimesh names what has no name.
         refused: for each name, as `plain_name` gives it, why it was not read: `MISSING`, `OUTSIDE` or another clause.
-        materials: names of the materials in the .mtl files read.
-        named: the textures that these name.
     """
 
     def __init__(self, path: Path) -> None:
-        self.file_name = path.name
         self.refused: dict[str, str] = {}
-        self.materials: set[str] = set()
-        self.named: Named = {}
         self._folder = os.path.realpath(path.parent)
         self._contents: dict[str, bytes] = {}
 
@@ -56,23 +44,25 @@ class References:
         Raises:
             FileNotFoundError: it is not there, or must not be read; `refused` says which.
         """
-        plain = plain_name(name)
+        found = self.tried(name)
+        if isinstance(found, bytes):
+            return found
+        self.refused[plain_name(name)] = found
+        raise FileNotFoundError(name)
+
+    def tried(self, name: str) -> bytes | str:
+        """Return the content of a named file, or why it is not read, which is not remembered."""
         reason = MISSING
-        for candidate in _candidates(name, plain):
+        for candidate in _candidates(name, plain_name(name)):
             try:
-                data = self._content(candidate)
+                return self._content(candidate)
             except ValueError:  # a zero byte in the name
                 continue
             except OSError as error:
                 reason = reason if error.errno in _NO_SUCH_NAME else f"cannot be read ({error.strerror})"
             except FileFormatError as error:
                 reason = str(error)
-            else:
-                return self._noted(candidate, data) if candidate.lower().endswith(".mtl") else data
-        self.refused[plain] = reason
-        raise FileNotFoundError(name)
-
-    __getitem__ = get
+        return reason
 
     def _content(self, name: str) -> bytes:
         """Return the content of a file in the folder.
@@ -97,23 +87,8 @@ class References:
             raise files.too_large(path, f"files of at most {most:,} bytes in all", f"{size:,}")
         self._contents[path] = data
 
-    def _noted(self, name: str, data: bytes) -> bytes:
-        """Note the materials of a material file and the textures they name; return it as UTF-8."""
-        current = None
-        for line in text_of(data).splitlines():
-            key, _, rest = line.strip().partition(" ")
-            if key.lower() == "newmtl":
-                current = " ".join(rest.split())
-                self.materials.add(current)
-            elif key.lower() == "map_kd" and current is not None and rest.strip():
-                self.named[current] = (Path(name).name, rest.strip())
-        return text_of(data).encode()
-
 
 def _candidates(name: str, plain: str) -> list[str]:
-    """Return the names to try: as it stands, plain, without options (``map_Kd -s 1 1 1 wood.png``), without folders."""
-    given = (name, plain, plain.split()[-1] if plain.split() else plain)
-    tried = [
-        form for text in given for form in (text.strip(), text.strip().lstrip("/"), os.path.basename(text.strip()))
-    ]
+    """Return the names to try: as it stands, plain, without the root, without folders."""
+    tried = [form for text in (name.strip(), plain) for form in (text, text.lstrip("/"), os.path.basename(text))]
     return [form for form in dict.fromkeys(tried) if form]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,9 +23,11 @@ from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
-from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light, Node
+from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light
+from advsearch.scene.importing.gltf_parts import poses
+from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.objects import object_of
-from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
+from advsearch.scene.importing.parts import GLTF, read_parts
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
 
 Doubles = npt.NDArray[np.float64]
@@ -91,11 +93,11 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     data = read_mesh_bytes(path, "scene", GLTF)
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
-    poses = dict(_poses(header))
+    places = dict(poses(header))
     chosen = _below(header, _named(path, header, node, {part.node for part in parts}))
     own = [part for part in parts if part.node in chosen]
     others = sorted({part.node for part in parts} - chosen)
-    lamps = [index for index in poses if header.nodes[index].lamp is not None]
+    lamps = [index for index in places if header.nodes[index].lamp is not None]
     if len(others) + len(lamps) > MOST_SURROUNDINGS:
         raise InputError(
             f"{path}: expected at most {MOST_SURROUNDINGS} meshes and lights beside the object, got "
@@ -115,12 +117,12 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         surroundings.append(mesh_part(name, made, matrix, made.material))
     for index in lamps:
         light = header.lights[header.nodes[index].lamp or 0]
-        lamp = _lamp(names.free(light.name or header.label(index)), light, poses[index], frame)
+        lamp = _lamp(names.free(light.name or header.label(index)), light, places[index], frame)
         _check_lamp(path, lamp)
         surroundings.append(lamp)
     cameras = {
-        name: _camera(header.cameras[header.nodes[index].camera or 0], poses[index], frame)
-        for index, name in _camera_names(header, poses).items()
+        name: _camera(header.cameras[header.nodes[index].camera or 0], places[index], frame)
+        for index, name in _camera_names(header, places).items()
     }
     for name, camera in cameras.items():
         _check_camera(path, name, camera)
@@ -212,7 +214,7 @@ def contents(path: Path) -> Contents:
         x, y, z = map(float, np.ptp(places, axis=0))
         listed.append(NodeContents(header.label(index), called[index], sum(len(one.faces) for one in group), (x, y, z)))
     lights = tuple(light.name or f"light {index}" for index, light in enumerate(header.lights))
-    cameras = _camera_names(header, dict(_poses(header))).values()
+    cameras = _camera_names(header, dict(poses(header))).values()
     return Contents(whole, tuple(listed), lights, tuple(cameras))
 
 
@@ -285,40 +287,6 @@ def _below(header: Header, index: int) -> set[int]:
         level = [child for one in level for child in header.nodes[one].children]
         found.update(level)
     return found
-
-
-def _poses(header: Header) -> Iterator[tuple[int, Doubles]]:
-    """Yield the nodes of the file's scene with their poses (4, 4) in it."""
-    children = {child for node in header.nodes for child in node.children}
-    roots = [index for index in range(len(header.nodes)) if index not in children]
-    if header.scenes:
-        roots = list(header.scenes[header.scene or 0].nodes)
-    level = [(index, np.eye(4)) for index in roots]
-    while level:
-        index, above = level.pop()
-        pose = above @ _matrix(header.nodes[index])
-        yield index, pose
-        level.extend((child, pose) for child in header.nodes[index].children)
-
-
-def _matrix(node: Node) -> Doubles:
-    """The transform (4, 4) of one node."""
-    if node.matrix is not None:
-        return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
-    matrix = np.eye(4)
-    x, y, z, w = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / max(
-        float(np.linalg.norm(node.rotation or 1.0)), 1e-12
-    )
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    matrix[:3, :3] = turn * np.array(node.scale or [1.0, 1.0, 1.0])
-    matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
-    return matrix
 
 
 def _lamp(name: str, light: Light, pose: Doubles, frame: FileFrame) -> PointLamp | SpotLamp:

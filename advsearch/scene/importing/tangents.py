@@ -71,7 +71,7 @@ def turned(texels: Floats, before: Soup, after: Array, face: Ints, weights: Arra
     """
     normal = unit_vectors(np.einsum("tk,tkc->tc", weights, before.normals[face]))
     old, new = (_tangents(one, normal, face) for one in (before, replace(before, uvs=after)))
-    up = np.cross(normal, old) * np.sign(doubled_areas(before.uvs))[face, None]
+    up = np.cross(normal, old) * np.sign(doubled_areas(before.uvs[face]))[:, None]
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)
     way = x[:, None] * old + y[:, None] * up
     found = np.stack([(way * new).sum(axis=1), (way * np.cross(normal, new)).sum(axis=1), z], axis=1)
@@ -80,8 +80,10 @@ def turned(texels: Floats, before: Soup, after: Array, face: Ints, weights: Arra
 
 def _tangents(soup: Soup, normal: Array, face: Ints) -> Array:
     """Unit directions (T, 3) along u in the plane across the normals (T, 3); NaN where there is none."""
-    a, b, c = (soup.points[soup.faces[:, k]] for k in range(3))
-    (_, v1), (_, v2) = (soup.uvs[:, 1] - soup.uvs[:, 0]).T, (soup.uvs[:, 2] - soup.uvs[:, 0]).T
-    along = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * np.sign(doubled_areas(soup.uvs))[:, None]
-    along = along[face]
+    used, at = np.unique(face, return_inverse=True)
+    a, b, c = (soup.points[soup.faces[used, k]] for k in range(3))
+    uvs = soup.uvs[used]
+    (_, v1), (_, v2) = (uvs[:, 1] - uvs[:, 0]).T, (uvs[:, 2] - uvs[:, 0]).T
+    along = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * np.sign(doubled_areas(uvs))[:, None]
+    along = along[at.reshape(-1)]
     return unit_vectors(along - normal * (along * normal).sum(axis=1, keepdims=True))

@@ -6,7 +6,7 @@ and whatever the file has (repeating textures, several materials, vertex colours
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, csgraph
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.geometry import Array, Soup
+from advsearch.scene.importing.geometry import Array, Ints, Soup
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.importing.normal_maps import FLAT
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
@@ -37,7 +37,8 @@ _SQUASHED = 0.05  # share of the surface that may have no area in UV space
 _CRAMPED = 0.02  # share of the unit square that UVs must cover in all
 _WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their layout
 _BORDER = 2.0  # texels outside a chart up to which it emits light: filtering needs them
-_SHARED = 0.005  # share of the texels that emit light which may lie on several faces
+_SHARED = 0.005  # share of the texels which may lie on several faces where each should have its own
+_FINER = 1.5  # how many times more texels a picture may have than a baked texture before that is said
 _FILLED = 0.5  # share of an atlas that its charts fill, about
 
 
@@ -65,21 +66,43 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Sur
         soup: repaired geometry.
         surfaces: the surface of each part.
     """
-    used = [surfaces[number] for number in np.unique(soup.part)]
+    used = list({id(surfaces[number]): surfaces[number] for number in np.unique(soup.part)}.values())
     first, uniform = used[0], all(surface.same_maps(used[0]) for surface in used)
-    colored, twice = uniform and _one_factor(soup), False
+    colored, twice, material = uniform and _one_factor(soup), False, by_material(soup, surfaces)[1]
     if colored and not first.pictures:
-        kept = _usable(soup, soup.uvs)
-        soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup)
+        kept = _usable(soup, soup.uvs) and not _overlap(soup.uvs, material)
+        soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup, material)
         return soup, SurfaceMaps(_of_one_color(soup, first), None, first.emission), []
     if colored and (first.texture is None or soup.colors.min() == 1.0) and np.isfinite(soup.uvs).all():
-        uvs, pictures = _windowed(_into_unit_square(soup), first.pictures)
+        uvs, pictures = _windowed(_into_unit_square(soup), first.pictures, first.texture)
         twice = _usable(soup, uvs) and _lit_twice(uvs, first, pictures)
         if _usable(soup, uvs) and not twice:
             return *_kept(soup, np.clip(uvs, 0.0, 1.0), first, pictures), []
-    fresh = unwrapped(soup)
+    fresh = unwrapped(soup, material)
+    maps = baked(fresh.uvs, soup, surfaces)
     shared = "several faces share a texture that emits light; it was unwrapped anew and its texture resampled"
-    return fresh, baked(fresh.uvs, soup, surfaces), [shared if twice else _why(soup, used, uniform)]
+    size, why = len(maps.color), shared if twice else _why(soup, used, uniform)
+    times = _texels(soup, surfaces) / (size * size * _FILLED)
+    fewer = "" if times < _FINER else f", {times:.0f} times fewer than its pictures have there"
+    return fresh, maps, [f"{why} ({size} x {size} texels{fewer})"]
+
+
+def by_material(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[list[str], Ints]:
+    """Return the names of materials, "" for none, and the number (F,) of each face's among them."""
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(surface.name for surface in surfaces))}
+    return list(numbers), np.array([numbers[surface.name] for surface in surfaces])[soup.part]
+
+
+def _overlap(uvs: Array, material: Ints) -> bool:
+    """Whether places of different materials (F,) lie at the same texture coordinates (F, 3, 2)."""
+    if material.min() == material.max():
+        return False
+    side = BAKED_SIZE
+    face, row, column, _ = pixels_in(uvs * side - 0.5, (side, side), tolerance=-1e-6)
+    least, most = np.full(side * side, len(uvs)), np.full(side * side, -1)
+    np.minimum.at(least, row * side + column, material[face])
+    np.maximum.at(most, row * side + column, material[face])
+    return bool((most > least).sum() > _SHARED * (most >= 0).sum())
 
 
 def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
@@ -113,7 +136,8 @@ def _lit_twice(uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats])
 def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool) -> str:
     """Return the sentence that says why the object was unwrapped anew."""
     if not uniform:
-        return f"the colours of its {len(used)} parts were baked into one texture"
+        count = len({surface.name or id(surface) for surface in used})
+        return f"the colours of its {count} materials were baked into one texture"
     if not _one_factor(soup) or soup.colors.min() < 1.0:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
@@ -133,9 +157,9 @@ def _plain(surface: ImportedSurface) -> Floats:
 
 
 def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -> Floats:
-    """Multiply display-referred colours (..., 3 or 4) by factors (..., 3) in linear light; opacity stays."""
+    """Multiply display-referred colours (..., 3 or 4) by linear factors (..., 3); opacity stays."""
     color = np.asarray(color, np.float32)
-    product = srgb_to_linear(color[..., :3]) * srgb_to_linear(np.asarray(factor, np.float32))
+    product = srgb_to_linear(color[..., :3]) * factor
     return np.concatenate([linear_to_srgb(product.astype(np.float32)), color[..., 3:]], axis=-1)
 
 
@@ -164,7 +188,7 @@ def _into_unit_square(soup: Soup) -> Array:
     return moved
 
 
-def _windowed(uvs: Array, pictures: Sequence[Floats]) -> tuple[Array, Sequence[Floats]]:
+def _windowed(uvs: Array, pictures: Sequence[Floats], colors: Floats | None) -> tuple[Array, Sequence[Floats]]:
     """Cut pictures to the window that UVs span where they overstep the unit square a little or use a corner of it.
 
     The layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the textures repeat.
@@ -178,17 +202,17 @@ def _windowed(uvs: Array, pictures: Sequence[Floats]) -> tuple[Array, Sequence[F
     inside = low.min() >= -_SLACK - texel.max() and high.max() <= 1.0 + _SLACK + texel.max()
     if size.max() > _WINDOW or (inside and np.abs(doubled_areas(uvs)).sum() / 2.0 >= _CRAMPED):
         return uvs, pictures
-    return (uvs - low) / size, [_cut(one, low, high) for one in pictures]
+    return (uvs - low) / size, [_cut(one, low, high, filtered if one is colors else sampled) for one in pictures]
 
 
-def _cut(picture: Floats, low: Array, high: Array) -> Floats:
+def _cut(picture: Floats, low: Array, high: Array, look_up: Callable[[Floats, Array], Floats]) -> Floats:
     """Return the window of a repeating picture (H, W, C) between two corners (u, v), with texels of the same size."""
     size = high - low
     width, height = np.clip(np.ceil(size * np.array(picture.shape[1::-1])), 1, TEXTURE_LIMIT).astype(int)
     columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
     rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
     grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    return sampled(picture, grid).reshape(height, width, -1)
+    return look_up(picture, grid).reshape(height, width, -1)
 
 
 # --- baking ----------------------------------------
@@ -205,7 +229,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
     Returns:
         Maps (N, N, ...). Texels outside every chart repeat the nearest one inside, so that filtering finds no seam.
     """
-    size = _baked_size(soup, surfaces)
+    size = _baked_size(_texels(soup, surfaces))
     corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
     face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
     through = any(_channels(one) == 4 for one in surfaces)
@@ -238,7 +262,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
 def _looked_up(surface: ImportedSurface, at: Array) -> Floats:
     """Return the base colour (T, 3 or 4) of a surface at UVs (T, 2)."""
     if surface.texture is not None and np.isfinite(at).all():
-        return sampled(surface.texture, at)
+        return filtered(surface.texture, at)
     color = _plain(surface)[None] if surface.texture is None else _mean(surface.texture)
     return np.broadcast_to(color, (len(at), color.shape[1]))
 
@@ -248,11 +272,16 @@ def _channels(surface: ImportedSurface) -> int:
     return int((_plain(surface) if surface.texture is None else surface.texture).shape[-1])
 
 
-def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
-    """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
+def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
+    """Return how many texels of its pictures the object shows."""
     texels, areas = 0.0, np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
     for number, area in enumerate(np.bincount(soup.part, areas)):
         texels += float(area) * max((one.shape[0] * one.shape[1] for one in surfaces[number].pictures), default=0)
+    return texels
+
+
+def _baked_size(texels: float) -> int:
+    """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
     size = BAKED_SIZE
     while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
         size *= 2
@@ -261,12 +290,32 @@ def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
 
 def _mean(texture: Floats) -> Floats:
     """Return the mean colour (1, 3 or 4) of a texture, taken in linear light."""
-    mean: Floats = srgb_to_linear(texture[:, :, :3]).mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
-    return np.concatenate([linear_to_srgb(mean), texture[:, :, 3:].mean(axis=(0, 1))])[None]
+    mean = _in_display(_in_linear(texture).mean(axis=(0, 1), dtype=np.float64).astype(np.float32))
+    return mean[None]
+
+
+def filtered(colors: Floats, uvs: Array) -> Floats:
+    """Look a repeating texture of display-referred colours up with bilinear interpolation in linear light; what is
+    transparent does not count. Arguments and result as for `sampled`."""
+    return _in_display(sampled(_in_linear(colors), uvs))
+
+
+def _in_linear(colors: Floats) -> Floats:
+    """Return display-referred colours (..., 3 or 4) as linear ones, times their opacity where there is one."""
+    linear = srgb_to_linear(colors[..., :3])
+    return linear if colors.shape[-1] == 3 else np.concatenate([linear * colors[..., 3:], colors[..., 3:]], axis=-1)
+
+
+def _in_display(colors: Floats) -> Floats:
+    """Undo `_in_linear`; what is transparent all over is black."""
+    linear, opacity = colors[..., :3], colors[..., 3:]
+    if opacity.size:
+        linear = linear / np.maximum(opacity, np.float32(1e-9))
+    return np.concatenate([linear_to_srgb(linear), opacity], axis=-1)
 
 
 def sampled(texture: Floats, uvs: Array) -> Floats:
-    """Look a repeating texture up with bilinear interpolation of its display-referred values.
+    """Look a repeating texture up with bilinear interpolation of its values, as they are.
 
     Args:
         texture: (H, W, C) float32, row 0 on top.

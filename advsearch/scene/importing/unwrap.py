@@ -24,12 +24,18 @@ _MOST_PATCHES = 10_000  # more are no surface but a heap of faces, and xatlas wo
 _SMOOTHING = 10  # rounds of averaging normals, so that noise does not fray the borders of patches
 
 
-def unwrapped(soup: Soup) -> Soup:
+def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
     """Return the soup with UVs from xatlas: charts that do not overlap, inside the unit square; deterministic.
 
     The faces of a mesh in very many pieces become triangles of one size, side by side in a grid.
+
+    Args:
+        soup: the mesh.
+        apart: (F,) numbers; faces with different ones get charts of their own.
     """
     patch = _patches(soup)
+    if apart is not None:
+        patch = np.unique(patch * (int(apart.max()) + 1) + apart, return_inverse=True)[1].reshape(-1)
     if int(patch.max()) >= _MOST_PATCHES:
         return replace(soup, uvs=_side_by_side(len(soup.faces)))
     groups = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])
@@ -47,7 +53,9 @@ def unwrapped(soup: Soup) -> Soup:
     for number, group in enumerate(groups):
         _, corners, uvs = atlas[number]
         result[group] = np.asarray(uvs, dtype=np.float64)[np.asarray(corners)]
-    return replace(soup, uvs=np.clip(result, 0.0, 1.0))
+    # lookups repeat at the border, where xatlas keeps nothing apart
+    margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
+    return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(result, 0.0, 1.0))
 
 
 def _side_by_side(count: int) -> Array:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import EnvironmentSetupError
+from advsearch.scene.mitsuba_backend.variant import one_at_a_time
 
 KEY = 0.18
 """Mean logarithmic luminance of a picture as the network sees it (as in Open Image Denoise's `autoexposure`)."""
@@ -26,6 +27,7 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 """Of red, green and blue (ITU-R BT.709); likewise."""
 
 
+@one_at_a_time
 def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = False) -> Tensor:
     """Return the denoised linear radiance.
 

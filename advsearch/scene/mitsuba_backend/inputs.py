@@ -86,6 +86,7 @@ class SceneInput:
         write: converts the tensor.
         interior: the interior adjoint (`prb`) differentiates it correctly.
         shape: of the tensor; None takes it from Mitsuba's own value.
+        owner: Mitsuba's object that has the parameter, where `key` alone may mean several.
     """
 
     name: str
@@ -93,18 +94,22 @@ class SceneInput:
     write: Write = as_is
     interior: bool = False
     shape: tuple[int, ...] | None = None
+    owner: Any = None
 
 
-def key_of(parameters: Any, pattern: str) -> str | None:
-    """Return the parameter that a pattern with at most one "*" means, or None if the scene has none such.
+def key_of(parameters: Any, one: SceneInput) -> str | None:
+    """Return the parameter that an input means, or None if the scene has none such.
 
     Raises:
         RuntimeError: there are several.
     """
-    before, star, after = pattern.partition("*")
+    before, star, after = one.key.partition("*")
     found = [
-        key for key in parameters.keys() if (key.startswith(before) and key.endswith(after) if star else key == pattern)
+        key
+        for key in parameters.keys()
+        if (key.startswith(before) and key.endswith(after) if star else key == one.key)
+        and (one.owner is None or parameters.properties[key][2] is one.owner)
     ]
     if len(found) > 1:
-        raise RuntimeError(f"expected one Mitsuba parameter {pattern}, found {found}")
+        raise RuntimeError(f"expected one Mitsuba parameter {one.key}, found {found}")
     return str(found[0]) if found else None

@@ -5,11 +5,13 @@ Mitsuba 3.10 renames these parameters: they stand here and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
@@ -91,21 +93,48 @@ def _texture(linear: Floats) -> Plugin:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear"}
 
 
-def own_surface(surface: Mapping[str, object], base_color: Floats) -> tuple[Plugin, str]:
-    """Return a surface in Mitsuba's words with the texture in its place, and the name of that place ("none": none)."""
-    place = "none"
+def own_surface(surface: Mapping[str, object], fill: Callable[[Mapping[str, object]], object]) -> Plugin:
+    """Return a surface in Mitsuba's words with its base colour in its place.
 
-    def filled(plugin: Mapping[str, object]) -> Plugin:
-        nonlocal place
-        found: Plugin = {}
-        for key, value in plugin.items():
-            if isinstance(value, str) and value == BASE_COLOR:
-                place, found[key] = key, _texture(srgb_to_linear(base_color))
-            else:
-                found[key] = filled(value) if isinstance(value, Mapping) else value
-        return found
+    Args:
+        surface: with `BASE_COLOR` as the type of that place.
+        fill: from how the texture is looked up to what comes there.
+    """
 
-    return loadable(filled(surface)), place
+    def filled(value: object) -> object:
+        if not isinstance(value, Mapping):
+            return value
+        if value.get("type") == BASE_COLOR:
+            return fill({key: one for key, one in value.items() if key != "type"})
+        return {key: filled(one) for key, one in value.items()}
+
+    return loadable({key: filled(one) for key, one in surface.items()})
+
+
+def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:
+    """A base colour (h, w, 3), display-referred, as a texture of linear reflectance that is looked up as `options`
+    say."""
+    return {**_texture(srgb_to_linear(base_color)), **loadable(options)}
+
+
+def repeating(uv: Tensor, options: Mapping[str, object], size: tuple[int, int]) -> Tensor:
+    """Return where a texture that repeats and is interpolated shows what one with these options does.
+
+    Args:
+        uv: (n, 2) float32 texture coordinates, as Mitsuba has them.
+        options: as of `base_texture`.
+        size: height and width of the texture in texels.
+    """
+    if "to_uv" in options:
+        matrix = torch.as_tensor(np.asarray(options["to_uv"]), dtype=uv.dtype)
+        uv = uv @ matrix[:2, :2].T + matrix[:2, -1]
+    texels = torch.tensor((size[1], size[0]), dtype=uv.dtype)
+    wrap = options.get("wrap_mode", "repeat")
+    if wrap == "mirror":
+        uv = 1.0 - (uv % 2.0 - 1.0).abs()
+    if wrap != "repeat":
+        uv = torch.minimum(torch.maximum(uv, 0.5 / texels), 1.0 - 0.5 / texels)
+    return (torch.floor(uv * texels) + 0.5) / texels if options.get("filter_type") == "nearest" else uv
 
 
 def mitsuba_mesh(
@@ -138,4 +167,6 @@ def mitsuba_mesh(
     parameters[TEXCOORDS] = mi.Float(uvs.astype(np.float32).ravel())
     parameters[FACES] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
     parameters.update()
+    for key, values in mesh.attributes.items():
+        result.add_attribute(key, values.shape[1], np.ascontiguousarray(values, np.float32).ravel())
     return result

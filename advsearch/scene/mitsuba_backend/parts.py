@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import singledispatch
 
@@ -10,6 +10,7 @@ from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, numb
 from advsearch.scene.mitsuba_backend.meshes import (
     NORMALS,
     POSITIONS,
+    base_texture,
     emitter,
     mitsuba_mesh,
     own_surface,
@@ -67,18 +68,30 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
         lobes: further entries of the principled plugin's dictionary, such as `IDLE_LOBES`.
     """
     name, count = part.name, len(part.mesh.vertices)
-    surface, color_key = principled(part, lobes), "base_color"
-    if part.surface is not None:
-        surface, color_key = own_surface(part.surface, part.base_color)
     inputs: tuple[SceneInput, ...] = (
         SceneInput(f"{name}.vertices", f"{name}.{POSITIONS}", flat, shape=(count, 3)),
         SceneInput(f"{name}.normals", f"{name}.{NORMALS}", flat, shape=(count, 3)),
-        SceneInput(f"{name}.base_color", f"{name}.*.{color_key}.data", interior=True),
-        SceneInput(f"{name}.roughness", f"{name}.*.roughness.value", number, True, (1,)),
-        SceneInput(f"{name}.metallic", f"{name}.*.metallic.value", number, True, (1,)),
-        SceneInput(f"{name}.specular", f"{name}.*.specular", number, True, (1,)),
-        SceneInput(f"{name}.clearcoat", f"{name}.*.clearcoat.value", number, True, (1,)),
     )
+    if part.surface is None:
+        surface = principled(part, lobes)
+        inputs += (
+            SceneInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True),
+            SceneInput(f"{name}.roughness", f"{name}.*.roughness.value", number, True, (1,)),
+            SceneInput(f"{name}.metallic", f"{name}.*.metallic.value", number, True, (1,)),
+            SceneInput(f"{name}.specular", f"{name}.*.specular", number, True, (1,)),
+            SceneInput(f"{name}.clearcoat", f"{name}.*.clearcoat.value", number, True, (1,)),
+        )
+    else:
+        textures = []
+
+        def fill(options: Mapping[str, object]) -> object:
+            textures.append(mitsuba().load_dict(base_texture(part.base_color, options)))
+            return textures[-1]
+
+        surface = own_surface(part.surface, fill)
+        inputs += tuple(
+            SceneInput(f"{name}.base_color", f"{name}.*.data", interior=True, owner=one) for one in textures
+        )
     if part.emission is not None:
         inputs += (_radiance(part),)
     return Translation({name: mitsuba_mesh(name, part.mesh, part.to_world, surface, emitter(part))}, inputs)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -21,13 +22,14 @@ from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, scene_dict
 from advsearch.scene.mitsuba_backend.first_hit import first_hits
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of, plain_number
-from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, sampling_weights, textured_emission
+from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import media_in, population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import PluginPart
+from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mitsuba, one_at_a_time
+from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
+from advsearch.scene.parts import PluginPart, plugins_in
 from advsearch.scene.surfaces import Surfaces
 
 MAX_DEPTH = 6
@@ -66,6 +68,7 @@ class MitsubaScene:
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
     """
 
+    @one_at_a_time
     def __init__(
         self,
         description: SceneDescription,
@@ -118,7 +121,7 @@ class MitsubaScene:
         self._integrators: dict[tuple[str, int], Any] = {}
         parts = [one for part in translated for one in part.inputs]
         declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, GROUND_INPUT, *parts]
-        self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one.key))}
+        self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one))}
         self.names = frozenset(self.declared)
         self.interior = frozenset(name for name, (_, one) in self.declared.items() if one.interior)
         self._shapes = frozenset(
@@ -167,6 +170,7 @@ class MitsubaScene:
         value = as_torch(self.parameters[key])
         return value if one.shape is None else value.reshape(one.shape)
 
+    @one_at_a_time
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
         """Render linear radiance with `spp` independent samples a pixel.
 
@@ -182,23 +186,27 @@ class MitsubaScene:
         self._apply(inputs)
         return self._render("hidden" if hide else "path", seed, spp)
 
+    @one_at_a_time
     def guides(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> tuple[Tensor, Tensor]:
         """Render what guides the denoiser: first-hit albedo and shading normal, each (H, W, 3) float32."""
         self._apply(inputs)
         both = self._render("guides", seed, spp)[..., -6:]
         return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
 
+    @one_at_a_time
     def held(self, inputs: Mapping[str, Tensor]) -> Any:
         """Return Mitsuba's scene with these inputs set, until the next call of anything here."""
         self._apply(inputs)
         return self._scene
 
+    @one_at_a_time
     def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; arguments as for `Renderer.surfaces`."""
         self._apply(inputs)
         height, width = self.resolution
         return first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
 
+    @one_at_a_time
     def adjoint(
         self,
         inputs: Mapping[str, Tensor],
@@ -243,7 +251,7 @@ class MitsubaScene:
             if self._backdrop:
                 shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
             arriving = mi.TensorXf(shown)
-            with _fewer_warnings():
+            with fewer_warnings():
                 self._integrator(method).render_backward(
                     self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
                 )
@@ -254,6 +262,7 @@ class MitsubaScene:
                 self._write(name, mi.TensorXf(contiguous(value)))
             self.parameters.update()
 
+    @one_at_a_time
     def material_adjoint(
         self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, *, meshes: Collection[str]
     ) -> dict[str, Tensor]:
@@ -287,6 +296,7 @@ class MitsubaScene:
         found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
         return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
 
+    @one_at_a_time
     def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
         """Return what the vertices of light paths add to their pixels for a unit more of a base colour, and the picture
         of these paths.
@@ -305,7 +315,13 @@ class MitsubaScene:
         noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
         noise.set_samples_per_wavefront(spp)
         noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
-        return collect(self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
+        found = collect(self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
+        surface = self.made[0].meshes[name.partition(".")[0]].surface
+        if surface is None:
+            return found
+        options = next(one for one in plugins_in(surface) if one["type"] == BASE_COLOR_PLACE)
+        size = tuple(self.parameters[key].shape[:2])
+        return replace(found, vertices=[replace(one, uv=repeating(one.uv, options, size)) for one in found.vertices])
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
@@ -323,6 +339,11 @@ class MitsubaScene:
         mi = mitsuba()
 
         unknown = [name for name in inputs if name not in self.declared]
+        if any(name.endswith(".base_color") for name in unknown):
+            raise InputError(
+                f"{unknown[0]}: the surface is one of Mitsuba's own without a base colour that can be searched; leave "
+                "out what changes it, such as texture, material or patch, or search mitsuba:KEY=[low, high]"
+            )
         if unknown:
             raise InputError(f"the scene has no input {', '.join(unknown)}; it has {', '.join(sorted(self.declared))}")
         if self._every:
@@ -422,24 +443,12 @@ def _loaded(plugins: Plugin, description: SceneDescription) -> Any:
         InputError: Mitsuba refuses plugins of the user's.
     """
     try:
-        with _fewer_warnings():
+        with fewer_warnings():
             return mitsuba().load_dict(plugins, optimize=False)
     except RuntimeError as error:
         if not any(isinstance(part, PluginPart) for part in description.parts):
             raise
         raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {error}; change it there") from error
-
-
-@contextmanager
-def _fewer_warnings() -> Iterator[None]:
-    """Keep Mitsuba from advising a film that samples beyond its border, at every call."""
-    mi = mitsuba()
-    before = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)
-    try:
-        yield
-    finally:
-        mi.set_log_level(before)
 
 
 def _is_of_a_shape(key: str) -> bool:

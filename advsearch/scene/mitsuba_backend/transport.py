@@ -60,8 +60,8 @@ class Paths:
         radiance: (H, W, 3) float32, with the same noise as the weights; the environment is in it.
         coverage: (H, W, 1), the share of each pixel that shows surfaces.
         background: (H, W, 3), what of the radiance is the environment as the camera sees it.
-        albedo: (H, W, 3), first-hit reflectance in [0, 1].
-        normal: (H, W, 3), first-hit shading normal.
+        albedo: (H, W, 3), reflectance in [0, 1] of the first hit that light does not pass, as `guides` has it.
+        normal: (H, W, 3), shading normal there.
         vertices: by their place in the path.
     """
 
@@ -149,10 +149,31 @@ def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Verti
 
 @dataclass
 class _First:
-    """What the camera sees: light that it sees directly, and the other pictures of `Paths` by channel."""
+    """What the camera sees.
+
+    Attributes:
+        shown: light that it sees directly.
+        covered, behind: the channels of `Paths.coverage` and `Paths.background`.
+        albedo, normal: those of the first hit that light does not pass.
+    """
 
     shown: Any
-    others: list[Any]
+    covered: Any
+    behind: Any
+    albedo: Any
+    normal: Any
+
+    def stops(self, hit: Any, bsdf: Any, where: Any) -> None:
+        """Take reflectance and normal of a hit for those of the picture."""
+        import drjit as dr
+
+        self.albedo = dr.select(where, bsdf.eval_diffuse_reflectance(hit, where), self.albedo)
+        self.normal = dr.select(where, hit.sh_frame.n, self.normal)
+
+    @property
+    def others(self) -> list[Any]:
+        """The other pictures of `Paths` by channel."""
+        return [self.covered, *self.behind, *self.albedo, *self.normal]
 
 
 @dataclass
@@ -206,6 +227,8 @@ def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_S
     context = mi.BSDFContext()
     through = mi.Spectrum(1.0)
     active, sharp = mi.Bool(True), dr.full(mi.Bool, True, dr.width(ray.o))
+    cut_out = any(mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.Null) for one in scene.shapes() if one.bsdf())
+    passed = mi.Bool(cut_out)
     last, last_pdf, last_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
     steps: list[_Step] = []
     first: _First | None = None
@@ -220,7 +243,9 @@ def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_S
             steps[-1].hit = shown
         bsdf = hit.bsdf(ray)
         if first is None:
-            first = _seen(hit, bsdf, shown)
+            first = _seen(hit, shown)
+            if not cut_out:
+                first.stops(hit, bsdf, hit.is_valid())
         active &= hit.is_valid() & mi.Bool(segment + 1 < depth)
         if segment + 1 == depth:
             break
@@ -232,6 +257,10 @@ def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_S
         sampled, factor = bsdf.sample(context, hit, noise.next_1d(active), noise.next_2d(active), active)
         going = active & (sampled.pdf > 0.0)
         delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
+        if cut_out:
+            through_it = going & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)
+            first.stops(hit, bsdf, passed & active & ~through_it)
+            passed &= through_it
         factor = dr.select(going, factor, 0.0)
         made = _Step(
             bsdf=bsdf,
@@ -259,16 +288,14 @@ def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_S
     return first, steps
 
 
-def _seen(hit: Any, bsdf: Any, shown: Any) -> _First:
+def _seen(hit: Any, shown: Any) -> _First:
     """What the camera sees at the first vertices, and the radiance that these emit."""
     mi = mitsuba()
     import drjit as dr
 
-    covered = hit.is_valid()
-    albedo = dr.select(covered, bsdf.eval_diffuse_reflectance(hit, covered), 0.0)
-    normal = dr.select(covered, hit.sh_frame.n, 0.0)
+    covered, none = hit.is_valid(), dr.zeros(mi.Color3f, dr.width(hit.p))
     behind = dr.select(covered, 0.0, shown)
-    return _First(shown, [dr.select(covered, mi.Float(1.0), 0.0), *behind, *albedo, *normal])
+    return _First(shown, dr.select(covered, mi.Float(1.0), 0.0), behind, none, mi.Normal3f(none))
 
 
 def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any, Any]]]:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from advsearch import threads
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
@@ -14,6 +18,21 @@ VARIANT = "llvm_ad_rgb"
 Plugin = dict[str, Any]
 """A plugin, or a whole scene, as Mitsuba's loader takes it: its `type`, and by Mitsuba's names for them numbers, texts,
 transforms, bitmaps, objects that are loaded already, and further plugins."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_LOCK = threading.RLock()
+
+
+def one_at_a_time(function: Function) -> Function:
+    """Let one thread be in such functions at a time: they share what Dr.Jit records, and the denoiser's pictures."""
+
+    @wraps(function)
+    def locked(*args: Any, **named: Any) -> Any:
+        with _LOCK:
+            return function(*args, **named)
+
+    return locked  # type: ignore[return-value]
 
 
 def mitsuba() -> ModuleType:
@@ -34,6 +53,18 @@ def mitsuba() -> ModuleType:
         _settle(mi)
     module: ModuleType = mi
     return module
+
+
+@contextmanager
+def fewer_warnings() -> Iterator[None]:
+    """Keep Mitsuba from warning: of a film that samples beyond its border, at every call, or of what is told here."""
+    mi = mitsuba()
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(before)
 
 
 def _settle(mi: ModuleType) -> None:

@@ -10,6 +10,10 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import BasisRenderer, Lights, fixed_lights, light_inputs, lighting
 from advsearch.scene.transport.renderer import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
 
+HAZE = "there is haze"
+NOISE = "noise is part of the picture without the denoiser"
+"""Reasons that stand alone: without haze, or with the denoiser, pictures of the same space could be predicted."""
+
 
 def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     """Why pictures of a renderer's space cannot be predicted, in words; None if they can.
@@ -21,16 +25,10 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     plan, linear = renderer.plan, linear_inputs(renderer)
     searched = [group for group in plan.groups if group.control not in varying]
     lit = {} if varying else lighting(renderer).groups
-    if renderer.scene.volumetric and not all(group.name in lit for group in searched):
-        return "there is haze"
-    if renderer.scene.made[0].cut_out:
-        return "there are cut-outs"
-    if renderer.formation.denoiser != "oidn":
-        return "noise is part of the picture without the denoiser"
     for group in searched:
         if "forced" in group.reason and group.estimator not in ("none", "image"):
             return f"the estimator of {group.name} is forced"
-        if group.estimator == "image" or group.name in lit:
+        if group.estimator == "image" or group.name in lit or _of_haze(renderer, group.name):
             continue
         if renderer.routes.get(group.name, frozenset()) & light_inputs(renderer) and fixed_lights(renderer):
             return f"{group.name} changes light, and the scene has other lights of its own"
@@ -38,7 +36,16 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
             return f"{group.name} changes more than base colours{'' if varying else ' and light'}"
     if not any(renderer.routes.get(group.name) or lit.get(group.name) for group in searched):
         return "nothing that is searched needs a render to be differentiated"
-    return None
+    if renderer.scene.volumetric and not all(group.name in lit for group in searched):
+        return HAZE
+    return None if renderer.formation.denoiser == "oidn" else NOISE
+
+
+def _of_haze(renderer: Renderer, group: str) -> bool:
+    """Whether a group of coordinates changes haze alone."""
+    hazes = tuple(f"{part.name}." for part in renderer.scene.made[0].parts if part.volumetric)
+    inputs = renderer.routes.get(group, frozenset())
+    return bool(inputs) and all(name.startswith(hazes) for name in inputs)
 
 
 def predicting(

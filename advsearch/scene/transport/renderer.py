@@ -29,6 +29,7 @@ MOST = 4.0
 """Factor by which the noise of the base picture corrects a row at most."""
 MOST_BYTES = 2**30
 """Memory of the matrix of one input, times `ADVSEARCH_LIMITS`."""
+TOO_LARGE = "the matrix would take more than"
 LINEAR = ".base_color"
 """What the names of inputs end in to which radiance is linear, but for light that meets them twice."""
 
@@ -183,7 +184,7 @@ class LinearRenderer(PredictingRenderer):
                 paths = self.scene.transport(inputs, name, noise, samples)
                 transport.add(paths.vertices, 1.0 / count)
                 if self.bytes > scaled(MOST_BYTES):
-                    raise TransportTooLargeError(f"the matrix would take more than {scaled(MOST_BYTES) / 2**30:g} GiB")
+                    raise TransportTooLargeError(f"{TOO_LARGE} {scaled(MOST_BYTES) / 2**30:g} GiB")
                 found.append(replace(paths, vertices=[]))
                 tick(samples)
         return mean_of(found)

@@ -15,16 +15,21 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.importing.files import safe_name
-from advsearch.scene.importing.objects import object_of
+from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.importing.files import safe_name, shown
+from advsearch.scene.importing.geometry import assemble, join
+from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
+from advsearch.scene.importing.surfaces import BRIGHTEST, ImportedSurface
+from advsearch.scene.importing.texture import textured
 from advsearch.scene.mitsuba_backend.files.haze import haze_in
-from advsearch.scene.mitsuba_backend.files.shapes import MESHES, mesh_of, surface_of
+from advsearch.scene.mitsuba_backend.files.shapes import MESHES, ShapeMesh, mesh_of
+from advsearch.scene.mitsuba_backend.files.surfaces import ShapeSurface, constant, surface_of
 from advsearch.scene.mitsuba_backend.files.trusted import trusted
 from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.plugins import plain
 from advsearch.scene.mitsuba_backend.variant import Plugin
-from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart
+from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
 
 Doubles = npt.NDArray[np.float64]
 
@@ -60,18 +65,24 @@ DIAGONAL = math.hypot(36.0, 24.0)
 """Of the film of which Mitsuba's `focal_length` speaks, millimetres."""
 
 
-def read_tree(scene: Path | Mapping[str, object]) -> Plugin:
-    """Return a scene file's dictionary, or a caller's own, with arrays for transforms.
+def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
+    """Return a scene file's dictionary, or a caller's own, with arrays for transforms; and warnings about its pictures.
 
     Raises:
         FileFormatError: as for `read_scene` and `trusted`.
         InputError: no scene.
     """
+    notes: list[str] = []
     if isinstance(scene, Path):
-        return trusted(scene, read_scene(scene))
+        return trusted(scene, read_scene(scene), notes), notes
     if scene.get("type") != "scene":
         raise InputError(f"scene: expected a dictionary of type 'scene', got {scene.get('type')!r}")
-    return plain(scene)
+    notes += [
+        f"scene: {name} is left out: expected a plugin's dictionary, got {type(one).__name__}"
+        for name, one in scene.items()
+        if name != "type" and not isinstance(one, Mapping)
+    ]
+    return plain(scene), notes
 
 
 def shape_ids(tree: Mapping[str, object]) -> list[str]:
@@ -102,7 +113,7 @@ def contents(path: Path) -> PluginContents:
     Raises:
         FileFormatError: as for `read_tree`.
     """
-    named = dict(_plugins(read_tree(path)))
+    named = dict(_plugins(read_tree(path)[0]))
     kinds = {name: str(one["type"]) for name, one in named.items()}
     objects = tuple(name for name, kind in kinds.items() if kind in MESHES and named[name].get("bsdf") != NOTHING)
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
@@ -121,7 +132,7 @@ def _free(name: str) -> str:
 
 
 def _shines(plugin: Mapping[str, object]) -> bool:
-    return any(inner.get("type") in LIGHTS for inner in _all(plugin))
+    return any(inner.get("type") in LIGHTS for inner in plugins_in(plugin))
 
 
 def _meant(wanted: str, ids: Sequence[str]) -> str:
@@ -151,7 +162,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
         FileFormatError: as for `read_tree`.
         InputError: the shape is no mesh and cannot be made one, or the scene is too large.
     """
-    tree = read_tree(scene)
+    tree, notes = read_tree(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
     ids = shape_ids(tree)
     wanted = _meant(wanted, ids)
@@ -161,19 +172,24 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     if len(named) > MOST_PARTS:
         raise InputError(f"{where}: expected at most {MOST_PARTS} plugins at the top, got {len(named)}; join meshes")
     shape = named[wanted]
-    bsdf = _bsdf(shape, named)
-    color, surface = surface_of(bsdf)
-    frame = _Frame(shape, wanted, z_up=_is_z_up(named))
+    surface, found = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
+    frame = _Frame(found.mesh, wanted, z_up=_is_z_up(named))
     haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
-    notes = [f"{where}: {one}" for one in _left_out(tree, shape, hazy=haze is not None)]
-    part = replace(mesh_of(shape, wanted, painted=color.texture is not None), surface=color)
-    turned = replace(
-        part,
-        vertices=part.vertices @ frame.turn.T,
-        normals=None if part.normals is None else part.normals @ frame.turn.T,
-    )
+    light = _light(shape)
+    left_out = _left_out(tree, shape, hazy=haze is not None, lit=light is not None)
+    notes += [f"{where}: {one}" for one in (*left_out, *surface.notes, *_without(surface.plugin, found.mesh))]
     source = scene if isinstance(scene, Path) else Path("scene.xml")
-    made = object_of([turned], notes, source, f"{safe_name(source)}-{clean(wanted)}", "z")
+    mesh, base_color = _painted(frame.turned(found), surface, str(shape["type"]), where)
+    made = ObjectAsset(
+        name=f"{safe_name(source)}-{clean(wanted)}",
+        mesh=normalised(mesh),
+        base_color=base_color,
+        source=str(source),
+        warnings=tuple(notes),
+        up=UpAxis("z"),
+        surface=surface.plugin,
+        emission=light,
+    )
     around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}
     for name, one in named.items():
@@ -185,22 +201,33 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
                 cameras[free] = _camera(one, frame)
             continue
         kept = _renamed(frame.moved(one))
-        holds = MediumPart if any(inner.get("type") in MEDIA for inner in _all(kept)) else PluginPart
+        holds = MediumPart if any(inner.get("type") in MEDIA for inner in plugins_in(kept)) else PluginPart
         around.append(holds(free, kept, _shines(kept)))
-    return ImportedScene(replace(made, surface=surface), tuple(around), cameras)
+    return ImportedScene(made, tuple(around), cameras)
+
+
+def _painted(found: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> tuple[Mesh, Floats]:
+    """Return a shape's mesh with texture coordinates for its base colour, and that.
+
+    Where anything is looked up by the mesh's own, or by its attributes, they stay. A shape of one colour gets new ones
+    where its own do not tell its places apart, as on a cube.
+    """
+    mesh = found.mesh
+    if surface.picture or surface.bound:
+        down = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
+        down = down @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
+        return replace(mesh, uvs=(down * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)), surface.base_color
+    own = found.uv and kind not in ("cube", "sphere", "cylinder", "disk")
+    vertices, normals, uvs = (one.astype(np.float64) for one in (mesh.vertices, mesh.normals, mesh.uvs))
+    color = ImportedSurface(color=surface.base_color[0, 0])
+    part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own else None, None, color)
+    soup, maps, _ = textured(join([part], where, y_up=False), [color])
+    return assemble(soup), maps.color
 
 
 def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:
     """The plugins at the top of a scene, by name."""
     return ((name, one) for name, one in tree.items() if isinstance(one, Mapping) and "type" in one)
-
-
-def _all(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
-    """A plugin and all within it."""
-    yield plugin
-    for inner in plugin.values():
-        if isinstance(inner, Mapping):
-            yield from _all(inner)
 
 
 def _renamed(plugin: Mapping[str, object]) -> Plugin:
@@ -214,7 +241,13 @@ def _renamed(plugin: Mapping[str, object]) -> Plugin:
 def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]) -> Mapping[str, object]:
     """The surface of a shape with what it refers to in its place; Mitsuba's default where it has none."""
 
+    count = 0
+
     def whole(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
+        nonlocal count
+        count += 1
+        if count > MOST_PARTS:
+            raise InputError(f"object: expected a surface of at most {MOST_PARTS} plugins, got more; make it simpler")
         if plugin["type"] == "ref":
             name = str(plugin["id"])
             if name not in named or depth > len(named):
@@ -228,8 +261,33 @@ def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]
     return {"type": "diffuse"}
 
 
-def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool) -> Iterator[str]:
-    """Sentences about what is not as it is in the file; `hazy` where the camera's medium is the scene's haze."""
+def _light(shape: Mapping[str, object]) -> Floats | None:
+    """The radiance (1, 1, 3) of a shape that shines evenly; None of any other."""
+    for inner in shape.values():
+        if isinstance(inner, Mapping) and inner["type"] == "area" and set(inner) <= {"type", "id", "radiance"}:
+            radiance = constant(inner.get("radiance"))
+            if radiance is not None and 0.0 < radiance.max() <= BRIGHTEST and radiance.min() >= 0.0:
+                return radiance.reshape(1, 1, 3)
+    return None
+
+
+def _without(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
+    """Sentences about attributes that a surface shows and the mesh has not."""
+    for one in plugins_in(surface):
+        if one["type"] == "mesh_attribute" and one.get("name") not in mesh.attributes:
+            there = ", ".join(sorted(mesh.attributes)) or "none"
+            yield f"the mesh has no attribute {shown(str(one.get('name')))} (it has {there}), so that is black"
+
+
+def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool) -> Iterator[str]:
+    """Sentences about what is not as it is in the file.
+
+    Args:
+        tree: the scene.
+        shape: the object in it.
+        hazy: the camera's medium is the scene's haze.
+        lit: the object keeps its light.
+    """
     for name, one in _plugins(tree):
         kind = one["type"]
         if kind in SENSORS - CAMERAS:
@@ -238,12 +296,22 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: 
             yield f"the sensor {name} is sharp at all distances: its lens is left out"
         elif kind in INTEGRATORS - {"path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective"}:
             yield f"the integrator {name} is left out: a {kind}; light takes all paths of up to 6 segments"
+        elif kind in INTEGRATORS:
+            if one.get("hide_emitters"):
+                yield f"hide_emitters of the integrator {name} is left out: lights are seen"
+            depth = one.get("max_depth", -1)
+            if isinstance(depth, int) and 0 <= depth < 6:
+                yield f"the integrator's max_depth of {depth} is left out: light takes all paths of up to 6 segments"
+        if kind in SENSORS and any(
+            isinstance(film, Mapping) and any(str(key).startswith("crop") for key in film) for film in one.values()
+        ):
+            yield f"the crop of the film of {name} is left out: the whole picture is seen"
         if kind in SENSORS and "medium" in one and not hazy:
             yield f"the sensor {name} sees nothing of its medium up to the first surface"
         if kind in SENSORS and any("principal_point" in key for key in one):
             yield f"the sensor {name} looks along its middle: its principal point is left out"
     for inner in shape.values():
-        if isinstance(inner, Mapping) and inner["type"] in LIGHTS:
+        if isinstance(inner, Mapping) and inner["type"] in LIGHTS and not lit:
             yield "the object's own light is left out"
         if isinstance(inner, Mapping) and inner["type"] in MEDIA:
             yield "the medium in the object is left out"
@@ -261,10 +329,9 @@ def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
 class _Frame:
     """From the scene's coordinates to the object's: z up, standing on z = 0, a largest extent of 1."""
 
-    def __init__(self, shape: Mapping[str, object], name: str, *, z_up: bool) -> None:
+    def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
         turn = np.eye(4) if z_up else Y_TO_Z
-        part = mesh_of(shape, name)
-        places = part.vertices[part.faces].reshape(-1, 3) @ turn[:3, :3].T
+        places = mesh.vertices.astype(np.float64) @ turn[:3, :3].T
         low, high = places.min(axis=0), places.max(axis=0)
         self.turn = turn[:3, :3]
         self.size = float((high - low).max())
@@ -273,6 +340,12 @@ class _Frame:
         move = np.eye(4)
         move[:3, 3] = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
+
+    def turned(self, found: ShapeMesh) -> ShapeMesh:
+        """Return a mesh with z up."""
+        turn = self.turn.astype(np.float32)
+        mesh = replace(found.mesh, vertices=found.mesh.vertices @ turn.T, normals=found.mesh.normals @ turn.T)
+        return replace(found, mesh=mesh)
 
     def moved(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin at the top of a scene in its place."""

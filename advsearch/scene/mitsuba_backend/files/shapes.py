@@ -3,55 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError
-from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.importing.parts import ImportedPart, read_parts
-from advsearch.scene.importing.surfaces import ImportedSurface
-from advsearch.scene.mitsuba_backend.variant import Plugin
-from advsearch.scene.parts import BASE_COLOR
+from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.mitsuba_backend.meshes import FACES, NORMALS, POSITIONS, TEXCOORDS
+from advsearch.scene.mitsuba_backend.plugins import loadable
+from advsearch.scene.mitsuba_backend.variant import fewer_warnings, mitsuba
 
 Doubles = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
+"""Vertices, faces, normals and texture coordinates of a mesh, and its attributes, (V or F, n) by their names."""
 
+BARE = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+"""Texture coordinates of a face that has none, as Mitsuba takes them."""
 SECTIONS = 64
 """Sides of a round shape."""
-MESHES = ("rectangle", "cube", "sphere", "cylinder", "disk", "obj", "ply")
+SOLIDS = ("rectangle", "sphere", "cylinder", "disk")
+"""Shapes of which Mitsuba has no triangles."""
+MESHES = (*SOLIDS, "cube", "obj", "ply", "serialized")
 """The shapes that can be the object."""
-COLORS = {
-    "diffuse": "reflectance",
-    "principled": "base_color",
-    "principledthin": "base_color",
-    "plastic": "diffuse_reflectance",
-    "roughplastic": "diffuse_reflectance",
-    "pplastic": "diffuse_reflectance",
-}
-"""Surfaces with a base colour, and its name there."""
-SIDES = (
-    ((1, -1, -1), (1, -1, 1), (-1, -1, 1), (-1, -1, -1)),
-    ((1, 1, -1), (-1, 1, -1), (-1, 1, 1), (1, 1, 1)),
-    ((1, -1, -1), (1, 1, -1), (1, 1, 1), (1, -1, 1)),
-    ((1, -1, 1), (1, 1, 1), (-1, 1, 1), (-1, -1, 1)),
-    ((-1, -1, 1), (-1, 1, 1), (-1, 1, -1), (-1, -1, -1)),
-    ((1, 1, -1), (1, -1, -1), (-1, -1, -1), (-1, 1, -1)),
+OF_A_MESH = frozenset(
+    ("type", "filename", "to_world", "face_normals", "flip_tex_coords", "flip_normals", "shape_index")
 )
-"""Corners of each side of Mitsuba's cube, in the order of those of a picture: (0, 1), (1, 1), (1, 0), (0, 0)."""
-GREY = 0.5
-"""Reflectance where a surface says none: Mitsuba's default."""
+"""Entries of a mesh that are no surface, light or medium."""
 
 
-def mesh_of(shape: Mapping[str, object], name: str, *, painted: bool = False) -> ImportedPart:
-    """Return a shape's triangles in its scene, without a surface.
+@dataclass(frozen=True, eq=False)
+class ShapeMesh:
+    """The triangles of a shape in its scene, as Mitsuba has them.
+
+    Attributes:
+        mesh: with the file's own texture coordinates, which may leave the unit square, and attributes.
+        uv: whether it has texture coordinates of its own; else they are (0, 0), (1, 0) and (0, 1) on each face, as
+            Mitsuba takes them.
+    """
+
+    mesh: Mesh
+    uv: bool = True
+
+
+def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
+    """Return a shape's triangles.
+
+    Where Mitsuba has a mesh, it is Mitsuba's own; round shapes become triangles here. Of a mesh with `face_normals`, or
+    without texture coordinates, every face has vertices of its own.
 
     Args:
         shape: its dictionary.
         name: of it.
-        painted: it shows a picture. Without one, texture coordinates of a solid shape are left out: on a cube they
-            repeat.
 
     Raises:
         InputError: it has none.
@@ -59,55 +63,99 @@ def mesh_of(shape: Mapping[str, object], name: str, *, painted: bool = False) ->
     kind = str(shape["type"])
     if kind not in MESHES:
         raise InputError(f"object {name}: a {kind} cannot be moved; expected a shape of {', '.join(MESHES)}")
-    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64)
-    if kind in ("obj", "ply"):
-        path = Path(str(shape["filename"]))
-        parts, _ = read_parts(path, path.read_bytes())
-        part = _joined(parts)
+    vertices, faces, normals, uvs, attributes = _solid(kind, shape) if kind in SOLIDS else _loaded(shape, name)
+    if not np.isfinite(vertices).all():
+        raise InputError(f"object {name}: expected finite vertices, got NaN or infinite ones; repair the mesh")
+    if uvs is None or normals is None or shape.get("face_normals"):
+        corners = faces.reshape(-1)
+        attributes = _of(corners, attributes)
+        vertices, faces = vertices[corners], np.arange(len(corners)).reshape(-1, 3)
+        flat = normals is None or bool(shape.get("face_normals"))
+        normals = _unit(_fronts(vertices, faces)).repeat(3, axis=0) if flat or normals is None else normals[corners]
+        texture = np.tile(BARE, (len(faces), 1)) if uvs is None else uvs[corners]
     else:
-        part, own = _solid(kind, shape)
-        matrix = matrix @ own
-        if not (painted or kind == "rectangle"):
-            part = replace(part, uvs=None)
-    if part.uvs is not None and not shape.get("flip_tex_coords", kind == "obj"):
-        part = replace(part, uvs=part.uvs * (1.0, -1.0) + (0.0, 1.0))  # Mitsuba has row 0 of a picture at v = 0
-    vertices = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
-    mirrored = (np.linalg.det(matrix[:3, :3]) < 0.0) != bool(shape.get("flip_normals"))
-    normals = part.normals
-    if normals is not None:
-        normals = normals @ np.linalg.inv(matrix[:3, :3]) * (-1.0 if shape.get("flip_normals") else 1.0)
-    faces = part.faces[:, ::-1] if mirrored else part.faces
-    return replace(part, vertices=vertices, faces=faces, normals=None if shape.get("face_normals") else normals)
+        texture = uvs
+    used, index = np.unique(faces, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    vertices, texture = vertices[used], texture[used] * (1.0, -1.0) + (0.0, 1.0)
+    normals = np.nan_to_num(normals)[used] * (-1.0 if shape.get("flip_normals") else 1.0)
+    if np.einsum("fk,fck->", _fronts(vertices, faces), normals[faces]) < 0.0:
+        faces = faces[:, ::-1]  # Mitsuba shades by the normals, whichever way faces are wound
+    mesh = Mesh(
+        vertices.astype(np.float32),
+        np.ascontiguousarray(faces, np.uint32),
+        normals.astype(np.float32),
+        texture.astype(np.float32),
+        _of(used, attributes),
+    )
+    return ShapeMesh(mesh, uvs is not None)
 
 
-def _solid(kind: str, shape: Mapping[str, object]) -> tuple[ImportedPart, Doubles]:
-    """A shape of Mitsuba's around the origin, and its own transform (4, 4) before `to_world`."""
+def _of(vertices: Ints, attributes: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The attributes of some of the vertices, in their order, and of all faces."""
+    return {key: one[vertices] if key.startswith("vertex_") else one for key, one in attributes.items()}
+
+
+def _fronts(vertices: Doubles, faces: Ints) -> Doubles:
+    """Vectors (F, 3) along the sides from which faces are wound counter-clockwise, twice as long as their areas."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _loaded(shape: Mapping[str, object], name: str) -> Buffers:
+    """Return what Mitsuba reads of a mesh."""
+    mi = mitsuba()
+    try:
+        with fewer_warnings():
+            loaded = mi.load_dict(loadable({key: value for key, value in shape.items() if key in OF_A_MESH}))
+    except RuntimeError as error:
+        raise InputError(f"object {name}: Mitsuba refuses the shape: {error}; change it there") from error
+    found = mi.traverse(loaded)
+    vertices = np.array(found[POSITIONS], np.float64).reshape(-1, 3)
+    faces = np.array(found[FACES], np.int64).reshape(-1, 3)
+    if not len(faces):
+        raise InputError(f"object {name}: expected a mesh with faces, got none; export triangles")
+    normals = np.array(found[NORMALS], np.float64).reshape(-1, 3) if loaded.has_vertex_normals() else None
+    uvs = np.array(found[TEXCOORDS], np.float64).reshape(-1, 2) if loaded.has_vertex_texcoords() else None
+    attributes: dict[str, Floats] = {}
+    for key in found.keys():
+        count = {"vertex": len(vertices), "face": len(faces)}.get(key.split("_")[0], 0)
+        if count and key not in (POSITIONS, NORMALS, TEXCOORDS) and "." not in key:
+            attributes[str(key)] = np.array(found[key], np.float32).reshape(count, -1)
+    return vertices, faces, normals, uvs, attributes
+
+
+def _unit(vectors: Doubles) -> Doubles:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30))
+
+
+def _solid(kind: str, shape: Mapping[str, object]) -> Buffers:
+    """The same of a shape of which Mitsuba has no triangles."""
     own = np.eye(4)
     round_ = np.linspace(0.0, 1.0, SECTIONS + 1)
+    normals = None
     if kind == "sphere":
         uvs, faces = _grid(round_, round_[::2])
         down = np.pi * uvs[:, 1]
-        vertices = np.stack([*(np.sin(down) * _circle(uvs[:, 0])), np.cos(down)], axis=1)
+        vertices = normals = np.stack([*(np.sin(down) * _circle(uvs[:, 0])), np.cos(down)], axis=1)
         own[:3, :3] *= _number(shape.get("radius", 1.0))
         own[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), dtype=np.float64)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
         uvs, faces = _grid(round_, np.array([0.0, 1.0]))
         vertices = np.stack([*_circle(uvs[:, 0]), uvs[:, 1]], axis=1)
+        normals = vertices * (1.0, 1.0, 0.0)
         own = _along(shape)
-    elif kind == "cube":
-        vertices = np.array(SIDES, dtype=np.float64).reshape(-1, 3)
-        uvs = np.tile([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], (6, 1))
-        faces = (np.arange(0, 24, 4)[:, None, None] + np.array([[0, 1, 2], [3, 0, 2]])).reshape(-1, 3)
     elif kind == "disk":
         uvs, faces = _grid(round_[::8], round_)
         vertices = np.stack([*(uvs[:, 0] * _circle(uvs[:, 1])), np.zeros(len(uvs))], axis=1)
     else:
         uvs, faces = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
         vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
-    normals = {"sphere": vertices, "cylinder": vertices * (1.0, 1.0, 0.0)}.get(kind)
-    ends = vertices[faces]
-    faces = faces[np.linalg.norm(np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0]), axis=1) > 1e-9]
-    return ImportedPart(vertices, faces, normals, uvs, None, ImportedSurface()), own
+    normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1)) if normals is None else normals
+    faces = faces[np.linalg.norm(_fronts(vertices, faces), axis=1) > 1e-9]
+    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64) @ own
+    normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
+    return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
 
 
 def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, npt.NDArray[np.int64]]:
@@ -143,53 +191,3 @@ def _along(shape: Mapping[str, object]) -> Doubles:
 
 def _number(value: object) -> float:
     return float(np.asarray(value, dtype=np.float64))
-
-
-def _joined(parts: list[ImportedPart]) -> ImportedPart:
-    """All parts of a file as one; what not all of them have is left out."""
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    normals, uvs = [part.normals for part in parts], [part.uvs for part in parts]
-    return ImportedPart(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
-        np.concatenate([one for one in normals if one is not None]) if all(n is not None for n in normals) else None,
-        np.concatenate([one for one in uvs if one is not None]) if all(uv is not None for uv in uvs) else None,
-        None,
-        ImportedSurface(),
-    )
-
-
-def surface_of(bsdf: Mapping[str, object]) -> tuple[ImportedSurface, Plugin]:
-    """Return a surface's base colour, and its dictionary with `BASE_COLOR` in the place of it, if it has such a place.
-
-    Only the first base colour is taken out. A texture that is no picture stays where it is.
-    """
-    found = ImportedSurface()
-    taken = False
-
-    def without(plugin: Mapping[str, object]) -> Plugin:
-        nonlocal found, taken
-        key = COLORS.get(str(plugin["type"]))
-        if key is not None and not taken:
-            color = _color(plugin.get(key, GREY))
-            if color is not None:
-                taken, found = True, color
-                return {**plugin, key: BASE_COLOR}
-        return {name: without(value) if isinstance(value, Mapping) else value for name, value in plugin.items()}
-
-    surface = without(bsdf)
-    return found, surface
-
-
-def _color(value: object) -> ImportedSurface | None:
-    """A constant or a picture as a base colour, display-referred."""
-    if isinstance(value, Mapping):
-        picture = value.get("bitmap")
-        if value["type"] == "bitmap" and isinstance(picture, np.ndarray) and picture.ndim == 3 and "to_uv" not in value:
-            return ImportedSurface(texture=linear_to_srgb(np.clip(picture[..., :3], 0.0, 1.0).astype(np.float32)))
-        value = value.get("value") if value["type"] in ("rgb", "uniform", "spectrum", "srgb") else None
-    if isinstance(value, (int, float)):
-        value = [float(value)] * 3
-    if not isinstance(value, (list, tuple, np.ndarray)) or np.shape(value) != (3,):
-        return None
-    return ImportedSurface(color=linear_to_srgb(np.clip(np.array(value, dtype=np.float32), 0.0, 1.0)))

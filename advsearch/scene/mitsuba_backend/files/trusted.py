@@ -12,13 +12,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
-from advsearch.scene.environments import import_environment
+from advsearch.scene.environments import import_environment, read_light
 from advsearch.scene.importing.files import shown
-from advsearch.scene.importing.images import read_picture
+from advsearch.scene.importing.images import TEXTURE_LIMIT, banded_average, read_picture
 from advsearch.scene.importing.parts import read_parts
 from advsearch.scene.importing.references import References
 from advsearch.scene.mitsuba_backend.variant import Plugin
@@ -39,8 +40,13 @@ STOCK = frozenset(
 """The plugins that come with Mitsuba 3.9, but for `measured` and `merge`."""
 
 
-def trusted(path: Path, scene: Mapping[str, object]) -> Plugin:
+def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin:
     """Return a file's dictionary with pictures read, and with the full names of meshes that were read once.
+
+    Args:
+        path: of the file.
+        scene: its dictionary.
+        notes: warnings about pictures are put here.
 
     Raises:
         FileFormatError: a plugin that Mitsuba does not bring, or a file that is missing, outside the folder of `path`,
@@ -70,14 +76,17 @@ def trusted(path: Path, scene: Mapping[str, object]) -> Plugin:
     def bitmap(plugin: Plugin) -> Plugin:
         found = file_of("a texture", plugin.pop("filename"))
         if found.suffix.lower() in RADIANCE:
-            return {**plugin, "bitmap": import_environment(found).radiance, "raw": True}
-        picture = read_picture(found)
-        return {**plugin, "bitmap": picture if plugin.get("raw") else srgb_to_linear(picture), "raw": True}
+            return {**plugin, "bitmap": _texture(found, notes), "raw": True}
+        raw = bool(plugin.get("raw"))
+        picture = read_picture(found, raw=raw)
+        return {**plugin, "bitmap": picture if raw else srgb_to_linear(picture), "raw": True}
 
     def envmap(plugin: Plugin) -> Plugin:
         found = file_of("a light", plugin.pop("filename"))
         if found.suffix.lower() in RADIANCE:
-            return {**plugin, "bitmap": import_environment(found).radiance}
+            environment = import_environment(found)
+            notes.extend(environment.warnings)
+            return {**plugin, "bitmap": environment.radiance}
         return {**plugin, "bitmap": np.asarray(srgb_to_linear(read_picture(found)), np.float32)}
 
     readers: dict[str, Callable[[Plugin], Plugin]] = {"obj": mesh, "ply": mesh, "bitmap": bitmap, "envmap": envmap}
@@ -91,6 +100,8 @@ def trusted(path: Path, scene: Mapping[str, object]) -> Plugin:
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
             raise FileFormatError(f"{path}: {shown(str(plugin['material']))} is no name of a material")
         found = {key: checked(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
+        if kind in readers and "filename" not in found:  # without one Mitsuba's bitmap ends the process
+            raise FileFormatError(f"{path}: expected a filename in each {kind}, got none; name the file")
         if "filename" in found:
             if kind not in readers:
                 named = shown(str(found["filename"]))
@@ -102,3 +113,14 @@ def trusted(path: Path, scene: Mapping[str, object]) -> Plugin:
         return found
 
     return checked(scene)
+
+
+def _texture(file: Path, notes: list[str]) -> npt.NDArray[np.float32]:
+    """The linear values (H, W, 3) of an .hdr or .exr picture, averaged down as other textures are."""
+    picture = read_light(file, "texture")
+    notes.extend(f"{file.name}: {note}" for note in picture.notes)
+    height, width = picture.size
+    scale = min(1.0, TEXTURE_LIMIT / max(height, width))
+    if scale == 1.0:
+        return picture.band(0, height)
+    return banded_average(picture.band, picture.size, (max(1, round(height * scale)), max(1, round(width * scale))))

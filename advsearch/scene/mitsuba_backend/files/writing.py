@@ -22,7 +22,7 @@ from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.mitsuba_backend.dictionary import GROUND, scene_dict
-from advsearch.scene.mitsuba_backend.meshes import emitter, matt, own_surface, principled
+from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, matt, own_surface, principled
 from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
@@ -161,7 +161,8 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
             part = replace(part, base_color=_display(color))
         surface = principled(part)
         if part.surface is not None:
-            surface = own_surface(part.surface, part.base_color)[0]
+            base_color = part.base_color
+            surface = own_surface(part.surface, lambda options: base_texture(base_color, options))
         radiance = given.pop("radiance", None)
         if radiance is not None:
             part = replace(part, emission=radiance.reshape(-1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)))

@@ -37,6 +37,8 @@ PLUGINS = frozenset(
     "shape bsdf emitter sensor integrator film rfilter sampler texture medium phase volume spectrum".split()
 )
 """Elements that are plugins."""
+SHARED = frozenset(("bsdf", "texture", "medium", "phase", "volume"))
+"""Those to which others refer."""
 MOVES = frozenset(("translate", "rotate", "scale", "matrix", "lookat", "look_at"))
 
 
@@ -67,7 +69,8 @@ def read_scene(path: Path, parameters: Mapping[str, str] | None = None) -> Plugi
     root = reader.parsed(data)
     if root.tag != "scene":
         raise damaged(path, "a Mitsuba scene, which begins with <scene version=...>", f"<{shown(root.tag)}>")
-    return reader.plugin(root, "scene")
+    scene = reader.plugin(root, "scene")
+    return {**scene, **{name: reader.named[name] for name in sorted(reader.referred & set(reader.named) - set(scene))}}
 
 
 @dataclass
@@ -78,6 +81,9 @@ class _Reader:
     size: int = 0
     elements: int = 0
     included: int = 0
+    named: dict[str, Plugin] = field(default_factory=dict)
+    """Plugins with ids that stand within others, to which the rest of the file may refer."""
+    referred: set[str] = field(default_factory=set)
 
     def parsed(self, data: bytes) -> _Element:
         """Return the tree of a file."""
@@ -134,12 +140,15 @@ class _Reader:
         elif one.tag in ("alias", "path"):
             raise self.wrong(one, f"<{one.tag}> is not read; write the scene without it")
         elif one.tag == "ref":
+            self.referred.add(_plain(self.text(one, "id")))
             into[_free(into, one.name or "ref")] = {"type": "ref", "id": _plain(self.text(one, "id"))}
         elif one.tag in PLUGINS and "type" in one.given:
             wanted = one.name or one.given.get("id") or (one.given["type"] if into["type"] == "scene" else one.tag)
             inner = self.plugin(one, self.text(one, "type"))
             if "id" in one.given and into["type"] == "scene":
                 wanted = one.given["id"]
+            elif "id" in one.given and one.tag in SHARED:
+                self.named.setdefault(_plain(self.text(one, "id")), inner)
             into[_free(into, _plain(wanted))] = inner
         else:
             into[_free(into, self.text(one, "name"))] = self.value(one)

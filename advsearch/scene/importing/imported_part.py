@@ -1,0 +1,59 @@
+"""One piece of a mesh file, as the readers of all formats hand it on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.scene.importing.surfaces import ImportedSurface
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedPart:
+    """One piece of a mesh file, with the transform of its place in the file applied.
+
+    Attributes:
+        vertices: (V, 3) float64 positions in the file's axes and units; may hold NaN.
+        faces: (F, 3) int64 vertex indices, F > 0.
+        normals: (V, 3) float64 of the file, not necessarily unit length or finite; None when the file gives none.
+        uvs: (V, 2) float64 of the file, v = 0 at the bottom row; None when the file gives none.
+        colors: (F, 3, 3) float64 linear colour of each corner in [0, 1], which multiplies the base colour in linear
+            light; None when the file gives none.
+        surface: the part's material.
+        node: number of its node in a glTF file; -1 in others.
+        flat: where the file gives no normals, its faces are flat; otherwise smooth normals are made.
+    """
+
+    vertices: Array
+    faces: npt.NDArray[np.int64]
+    normals: Array | None
+    uvs: Array | None
+    colors: Array | None
+    surface: ImportedSurface
+    node: int = -1
+    flat: bool = False
+
+
+def placed(part: ImportedPart, matrix: Array) -> ImportedPart:
+    """Return a part moved to its place in the file by an affine transform (4, 4)."""
+    if np.array_equal(matrix, np.eye(4)):
+        return part
+    turn, normals = matrix[:3, :3], part.normals
+    with np.errstate(all="ignore"):
+        vertices = part.vertices @ turn.T + matrix[:3, 3]
+        if normals is not None:  # a normal turns with the cofactors of the matrix
+            normals = normals @ np.cross(turn[[1, 2, 0]], turn[[2, 0, 1]]).T
+    if not np.linalg.det(turn) < 0.0:
+        return replace(part, vertices=vertices, normals=normals)
+    colors = None if part.colors is None else part.colors[:, ::-1]  # a mirror turns faces over, and cofactors normals
+    return replace(
+        part,
+        vertices=vertices,
+        faces=part.faces[:, ::-1],
+        normals=None if normals is None else -normals,
+        colors=colors,
+    )

@@ -1,0 +1,359 @@
+"""What the materials of an .mtl file look like, as `ImportedSurface` has it; what they say beyond that is named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from advsearch.scene.importing.files import shown, text_of
+from advsearch.scene.importing.left_out import Inventory
+from advsearch.scene.importing.mtl import (
+    MapUse,
+    MtlMaterial,
+    Pair,
+    color_of,
+    map_of,
+    numbers_of,
+    parsed,
+    radiance_of,
+    share_of,
+    without_comment,
+)
+from advsearch.scene.importing.normal_maps import holds_normals, normal_map
+from advsearch.scene.importing.pictures import Kind, Pictures
+from advsearch.scene.importing.references import References, plain_name
+from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface, limited_radiance, with_opacity
+
+Floats = npt.NDArray[np.float32]
+
+STATEMENT = "material statement"
+READ = frozenset("kd ke d tr pr pm map_kd map_ke map_d map_pr map_pm norm map_kn map_bump bump illum".split())
+"""Statements that become something, in lower case."""
+QUIET = frozenset("ka ks ns ni sharpness map_aat".split())
+"""Statements of every file whose terms (ambient light, Phong's highlights) have no place in a physical material."""
+NORMALS = ("norm", "map_kn", "map_bump", "bump")
+PLACED = ("map_kd", "map_d", *NORMALS, "map_ke")
+"""Maps that are looked up by texture coordinates; the first of a material says where all of them lie."""
+CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
+"""Channels of a picture by the value of ``-imfchan``."""
+DEFAULTS = {"blendu": "on", "blendv": "on", "cc": "off", "clamp": "off", "bm": "1", "boost": "0"}
+"""What options say by default."""
+
+
+@dataclass(frozen=True, eq=False)
+class Painted:
+    """A material that was read.
+
+    Attributes:
+        surface: what it looks like.
+        scale: factors of texture coordinates.
+        offset: what is added to them then.
+        clamped: whether its textures are not to repeat.
+    """
+
+    surface: ImportedSurface
+    scale: Pair = (1.0, 1.0)
+    offset: Pair = (0.0, 0.0)
+    clamped: bool = False
+
+
+@dataclass
+class MtlReader:
+    """Reads the material files that a mesh file names, and turns their materials into surfaces, each once.
+
+    Attributes:
+        source: the mesh file's name, for warnings.
+        references: finds files.
+        inventory: of the mesh file.
+        libraries: how many material files were read.
+        notes: the warnings so far.
+    """
+
+    source: str
+    references: References
+    inventory: Inventory
+    libraries: int = 0
+    notes: list[str] = field(default_factory=list)
+    _materials: dict[str, MtlMaterial] = field(default_factory=dict)
+    _painted: dict[int, Painted] = field(default_factory=dict)
+    _pictures: Pictures | None = None
+    _read: dict[tuple[str, Kind], Floats | str] = field(default_factory=dict)
+
+    def read_library(self, name: str) -> None:
+        """Read a material file; of materials with the same name, the first counts."""
+        try:
+            text = text_of(self.references.get(name))
+        except FileNotFoundError:
+            plain = plain_name(name)
+            why = f"{shown(plain)}, which {self.references.refused[plain]}"
+            self.note(f"{self.source} names the material file {why}; neutral grey is used instead")
+            return
+        self.libraries += 1
+        file = plain_name(name).rpartition("/")[2]
+        materials, stray = parsed(text, file)
+        for key in stray:
+            self.inventory.has(f"before the first material of {shown(file, quoted=False)}, statement", key)
+        for material in materials:
+            first = self._materials.setdefault(material.name, material)
+            if first.statements != material.statements and first.file == material.file:
+                twice = f"{file} has the material {shown(material.name)} more than once"
+                self.note(f"{self.source}: {twice}; the first counts")
+        for material in materials:  # a comment, or part of the name: both are tried
+            self._materials.setdefault(without_comment(material.name), material)
+
+    def painted(self, name: str) -> Painted | None:
+        """Return a material by its name, or None; the name may have a comment after it."""
+        material = self._materials.get(name) or self._materials.get(without_comment(name))
+        if material is None:
+            return None
+        if id(material) not in self._painted:
+            self._painted[id(material)] = self._look_of(material)
+        return self._painted[id(material)]
+
+    def note(self, message: str) -> None:
+        """Warn, once."""
+        if message not in self.notes:
+            self.notes.append(message)
+
+    def _look_of(self, material: MtlMaterial) -> Painted:
+        """Read all statements of a material."""
+        self._list(material)
+        uses = {key: use for key in (*PLACED, "map_pr", "map_pm") if (use := self._use(material, key)) is not None}
+        first = next((uses[key] for key in PLACED if key in uses), None)
+        for key in [key for key in PLACED if key in uses]:
+            if first is not None and (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
+                what = f"{material.spelled[key]} of the material {shown(material.name)}"
+                self.note(f"{self.source}: {what} lies elsewhere than its other maps (-s, -o); it is left out")
+                del uses[key]
+        color = self._color(material)
+        texture = self._texture(material, uses.get("map_kd"), color)
+        if "map_kd" in uses and color is not None and (color > 0.999).all():
+            color = None  # plain white only leaves a texture alone
+        found = self._see_through(material, uses.get("map_d"), ImportedSurface(color, texture))
+        found = replace(
+            found,
+            roughness=self._share(material, "pr", uses.get("map_pr")),
+            metallic=self._share(material, "pm", uses.get("map_pm")),
+            normal_map=self._bumps(material, uses),
+            emission=self._glow(material, uses.get("map_ke")),
+            name=material.name,
+        )
+        if first is None:
+            return Painted(found)
+        clamped = any(use.options.get("clamp", "").lower() == "on" for use in uses.values())
+        return Painted(found, first.scale, first.offset, clamped)
+
+    def _list(self, material: MtlMaterial) -> None:
+        """Put what is not read into the inventory; what is there by default, and changes nothing, is not in it."""
+        said = {key: without_comment(rest) for key, rest in material.statements.items()}
+        zero = {key for key in said if not any(numbers_of(material.numbers(key)) or [1.0])}
+        for key in material.again:
+            self.inventory.has("earlier material statement", key)
+        if len(material.numbers("kd").split()) == 4:
+            self.inventory.has("fourth number of", material.spelled["kd"])
+        base = map_of(said.get("map_kd", ""))
+        for key, rest in said.items():
+            use = map_of(rest)
+            quiet = key in READ or key in QUIET or key in zero or (key == "pcr" and "pc" in zero)
+            quiet |= key == "tf" and len(set(rest.split())) == 1
+            quiet |= key == "map_ka" and use is not None and base is not None and use.name == base.name
+            if key == "illum" and material.numbers(key) not in ("", "0", "1", "2"):
+                self.inventory.has("illumination model", rest)
+            elif not quiet:
+                self.inventory.has(STATEMENT, material.spelled[key])
+
+    def _use(self, material: MtlMaterial, key: str) -> MapUse | None:
+        """Return what a statement says that names a picture, and put options that are not read into the inventory."""
+        rest = material.statements.get(key, "")
+        use = map_of(without_comment(rest))
+        whole = map_of(rest)
+        if whole is not None and whole != use and isinstance(self.references.tried(whole.name), bytes):
+            use = whole  # the # belongs to the name
+        for option, value in {} if use is None else use.options.items():
+            taken = {
+                "s",
+                "o",
+                "mm",
+                "clamp",
+                *(["bm"] if key in NORMALS else []),
+                *([] if key in NORMALS else ["imfchan"]),
+            }
+            colors = key in ("map_kd", "map_ke")
+            if option == "colorspace":
+                quiet = value.lower() == ("srgb" if colors else "linear")
+            elif option == "imfchan" and colors:
+                quiet = False
+            else:
+                quiet = option in taken or value.lower() == DEFAULTS.get(option) or not any(numbers_of(value) or [1.0])
+            if not quiet:
+                self.inventory.has("texture option", f"-{option} of {material.spelled[key]}")
+        return use
+
+    def _color(self, material: MtlMaterial) -> Floats | None:
+        rest = material.numbers("kd")
+        color = color_of(rest)
+        if "kd" in material.statements and color is None:
+            self.note(
+                f"{self.source}: the Kd {shown(rest)} of the material {shown(material.name)} is no colour; neutral grey"
+                " is used instead"
+            )
+        return color
+
+    def _texture(self, material: MtlMaterial, use: MapUse | None, color: Floats | None) -> Floats | None:
+        """Return the base colour texture. It stands alone: a Kd beside it is an exporter's default more often than a
+        tint. Warn where it cannot be had."""
+        if use is None:
+            return None
+        found = self._picture(use, "colours and alpha")
+        if isinstance(found, np.ndarray):
+            if found[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
+                self.note(f"{self.source}: the alpha of {shown(use.name)} is left out: no map_d makes it an opacity")
+            return np.ascontiguousarray(found[:, :, :3])
+        plain = color is None or bool((color > 0.999).all())
+        instead = (
+            "neutral grey" if color is None or plain else f"its base colour ({', '.join(f'{c:.2f}' for c in color)})"
+        )
+        where = f"{self.source}: {material.file} names the texture {shown(use.name)}"
+        self.note(f"{where}, which {found}; {instead} is used instead")
+        return None
+
+    def _see_through(self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface) -> ImportedSurface:
+        """Give a surface its opacity: ``d``, a number, or ``Tr``, and ``map_d``, a picture."""
+        factor, map = self._opacity(material), None
+        if use is not None:
+            found = self._picture(use, "colours and alpha")
+            if isinstance(found, np.ndarray):
+                map = _channel(found, use)
+            else:
+                self.note(f"{self.source}: the opacity {shown(use.name)} {found}; it is opaque instead")
+        if map is None and factor == 1.0:
+            return surface
+        share, color, texture = np.array([factor], np.float32), surface.color, surface.texture
+        if map is None and color is None and texture is None:
+            color = np.full(3, NEUTRAL, np.float32)
+        if map is not None:
+            plain = np.full(3, NEUTRAL, np.float32) if color is None else color
+            texture = np.broadcast_to(plain, (*map.shape, 3)) if texture is None else texture
+            size = (texture.shape[1], texture.shape[0])
+            fitted = np.asarray(Image.fromarray(map).resize(size, Image.Resampling.BILINEAR))
+            texture = np.concatenate([texture, fitted[:, :, None]], axis=2)
+        return replace(surface, color=with_opacity(color, share, None), texture=with_opacity(texture, share, None))
+
+    def _opacity(self, material: MtlMaterial) -> float:
+        """Return ``d``, or 1 - ``Tr`` where there is none; some programs write Tr for d."""
+        if "-halo" in material.numbers("d").lower().split():
+            self.inventory.has("option", "-halo of d")
+        opacity, clear = share_of(material.numbers("d"), -1.0), share_of(material.numbers("tr"), -1.0)
+        what = f"{self.source}: the material {shown(material.name)} has Tr {clear:g}"
+        if opacity >= 0.0:
+            if clear >= 0.0 and min(abs(clear - opacity), abs(1.0 - clear - opacity)) > 0.01:
+                self.note(f"{what} beside d {opacity:g}, which it contradicts; d is taken for its opacity")
+            return opacity
+        if clear > 0.0:
+            self.note(
+                f"{what} and no d: it is taken for transparency, which makes its opacity {1.0 - clear:g}; some programs"
+                f" mean opacity by it, so write d in its place"
+            )
+        return 1.0 - max(clear, 0.0)
+
+    def _share(self, material: MtlMaterial, key: str, use: MapUse | None) -> float | None:
+        """Return a roughness or metallic: the mean of its map, or else its number; None where there is neither."""
+        if use is not None:
+            found = self._picture(use, "numbers")
+            if isinstance(found, np.ndarray):
+                self.note(f"{self.source}: textures of roughness and metallic are replaced by their means")
+                return float(_channel(found, use).mean())
+            self.note(f"{self.source}: {material.spelled[f'map_{key}']} {shown(use.name)} {found}; it is left out")
+        rest = material.numbers(key)
+        value = share_of(rest, -1.0)
+        return value if value >= 0.0 else None
+
+    def _bumps(self, material: MtlMaterial, uses: dict[str, MapUse]) -> Floats | None:
+        """Return the normal map: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
+        for key in NORMALS:
+            use = uses.get(key)
+            if use is None:
+                continue
+            picture = self._picture(use, "numbers")
+            if isinstance(picture, np.ndarray):
+                if key in ("norm", "map_kn") or holds_normals(picture):
+                    return normal_map(picture, use.bump)
+                picture = "holds heights, and no normals"
+            self.note(f"{self.source}: the normal map {shown(use.name)} {picture}; it is left out")
+        return None
+
+    def _glow(self, material: MtlMaterial, use: MapUse | None) -> Floats | None:
+        """Return the radiance that is said by ``Ke`` and ``map_Ke``; where there are both, their product."""
+        rest = material.numbers("ke")
+        factor, picture = radiance_of(rest), None
+        if factor is None:
+            self.note(f"{self.source}: the emission {shown(rest)} is no colour; it is left out")
+            return None
+        if use is not None:
+            found = self._picture(use, "colours")
+            if not isinstance(found, np.ndarray):
+                self.note(f"{self.source}: the texture {shown(use.name)} of the emission {found}; it is left out")
+                return None
+            picture, factor = found, factor if factor.any() else np.ones(3)
+        radiance, cut = limited_radiance(factor, picture)
+        if cut is not None:
+            self.note(f"{self.source}: {cut}")
+        return radiance
+
+    def _picture(self, use: MapUse, kind: Kind) -> Floats | str:
+        """Return a picture's values with its ``-mm`` applied, or why they cannot be had."""
+        if self._pictures is None:
+            self._pictures = Pictures(len(self._materials), self.references.get, self.references.refused)
+        if (use.name, kind) not in self._read:
+            self._read[use.name, kind] = self._pictures.of_file(use.name, kind)
+            for note in self._pictures.notes:
+                self.note(f"{self.source}: {note}")
+        found, (base, gain) = self._read[use.name, kind], use.range
+        if isinstance(found, str) or (base, gain) == (0.0, 1.0):
+            return found
+        colors = np.clip(found[:, :, :3] * np.float32(gain) + np.float32(base), 0.0, 1.0)
+        return np.concatenate([colors, found[:, :, 3:]], axis=2)
+
+
+def _channel(picture: Floats, use: MapUse) -> Floats:
+    """Return the (H, W) values that a picture holds for a map of numbers: of the channel that ``-imfchan`` names, or
+    else its alpha, or its grey where it has none."""
+    number = CHANNELS.get(use.options.get("imfchan", "").lower())
+    alpha = picture.shape[2] == 4
+    if number is None and alpha and picture[:, :, 3].min() < 1.0:
+        number = 3
+    return picture[:, :, :3].mean(axis=2) if number is None or (number == 3 and not alpha) else picture[:, :, number]
+
+
+def libraries_of(rests: Sequence[str], references: References) -> list[str]:
+    """Return the names of material files that ``mtllib`` lines hold.
+
+    A line may name several, and a name may have blanks: a line that is the name of a file is that, else each name ends
+    in ``.mtl``, else in a blank.
+    """
+    found: list[str] = []
+    for rest in rests:
+        plain = without_comment(rest)
+        for line in (rest, plain):
+            if isinstance(references.tried(line), bytes):
+                found.append(line)
+                break
+        else:
+            parts = _split(plain)
+            ended = all(part.strip('"').lower().endswith(".mtl") for part in parts)
+            found += parts if ended or any(isinstance(references.tried(part), bytes) for part in parts) else [plain]
+    return list(dict.fromkeys(one for one in found if one))
+
+
+def _split(line: str) -> list[str]:
+    names, name = [], ""
+    for word in line.split():
+        name = f"{name} {word}".strip()
+        if word.strip('"').lower().endswith(".mtl"):
+            names.append(name)
+            name = ""
+    return [*names, *name.split()]

@@ -1,0 +1,134 @@
+"""Polygons as triangles: fans where those are right, else ears are cut off, for many polygons at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+MOST_WORK = 100_000_000
+"""Points that are compared with ears, in all; then the polygons that are left are cut up as fans."""
+
+_FLAT = 1e-9  # twice the area of a triangle, as a share of that of its polygon, up to which it has none
+
+
+def triangulated(points: Array, counts: Ints) -> tuple[Ints, Ints, int]:
+    """Cut polygons up into triangles.
+
+    Where the triangles from a polygon's first corner all face as the polygon does (it is convex, mostly), these are
+    taken. Otherwise ears are cut off (Meisters 1975) in the plane that the polygon lies in on average (Newell).
+
+    Args:
+        points: (C, 3) positions of the corners of all polygons, one polygon after the other; may hold NaN.
+        counts: (P,) number of corners of each, at least 3.
+
+    Returns:
+        (T, 3) corners of the triangles, as indices into `points`, in the order of the polygons; (T,) the polygon of
+        each; and of how many polygons some triangles may lie outside: they cross themselves, or were too much work.
+    """
+    starts = np.cumsum(counts) - counts
+    kinds, group = np.unique(counts, return_inverse=True)
+    triangles, owners, wrong, left = [], [], 0, MOST_WORK
+    for number, count in enumerate(kinds):
+        polygons = np.flatnonzero(group == number)
+        corners = starts[polygons, None] + np.arange(count)
+        cut = np.stack(
+            [np.broadcast_to(corners[:, :1], (len(corners), count - 2)), corners[:, 1:-1], corners[:, 2:]], 2
+        )
+        if count > 3:
+            flat = _flattened(points[corners])
+            areas = _doubled_areas(flat[:, :1], flat[:, 1:-1], flat[:, 2:])
+            bad = np.flatnonzero((areas <= _FLAT * np.abs(areas.sum(axis=1))[:, None]).any(axis=1))
+            if len(bad):
+                ears, failed, used = _ears(flat[bad], left)
+                left -= used
+                wrong += failed
+                cut[bad] = np.take_along_axis(corners[bad, None], ears.reshape(len(bad), 1, -1), axis=2).reshape(
+                    ears.shape
+                )
+        triangles.append(cut.reshape(-1, 3))
+        owners.append(np.repeat(polygons, count - 2))
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return np.concatenate(triangles)[order], owner[order], wrong
+
+
+def _flattened(corners: Array) -> Array:
+    """Return polygons (P, n, 3) in their planes, (P, n, 2), counter-clockwise and about 1 large."""
+    corners = corners - corners.mean(axis=1, keepdims=True)
+    corners = corners / np.maximum(np.abs(corners).max(axis=(1, 2), keepdims=True), 1e-300)
+    normal = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    aside = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    across = np.cross(aside, normal)
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    plane = np.stack([across, np.cross(normal, across)], axis=2)
+    return np.asarray(corners @ plane)
+
+
+def _doubled_areas(a: Array, b: Array, c: Array) -> Array:
+    """Return twice the signed areas of triangles in the plane, (..., 2) each."""
+    ahead, aside = b - a, c - a
+    return np.asarray(ahead[..., 0] * aside[..., 1] - ahead[..., 1] * aside[..., 0])
+
+
+def _ears(flat: Array, budget: int) -> tuple[Ints, int, int]:
+    """Cut the ears off polygons with the same number of corners, all at once, each in turns of its own.
+
+    Args:
+        flat: (P, n, 2) as `_flattened` gives them.
+        budget: comparisons that may be made.
+
+    Returns:
+        (P, n - 2, 3) corners of the triangles; how many polygons with an area had no ear at some time, or were left
+        over; and the comparisons that were made.
+    """
+    count, corners = flat.shape[:2]
+    after = np.tile(np.roll(np.arange(corners), -1), (count, 1))
+    before = np.tile(np.roll(np.arange(corners), 1), (count, 1))
+    triangles = np.zeros((count, corners - 2, 3), dtype=np.int64)
+    cut, tip, tries = (np.zeros(count, dtype=np.int64) for _ in range(3))
+    failed = np.zeros(count, dtype=np.bool_)
+    size = np.abs(_doubled_areas(flat, np.roll(flat, -1, axis=1), np.zeros(2)).sum(axis=1))
+    # only a corner that is not convex can lie in an ear
+    dents = _doubled_areas(np.roll(flat, 1, axis=1), flat, np.roll(flat, -1, axis=1)) <= _FLAT * size[:, None]
+    dent = np.argsort(~dents, axis=1, kind="stable")[:, : int(dents.sum(axis=1).max())]
+    there = np.take_along_axis(dents, dent, axis=1)
+    places = np.take_along_axis(flat, dent[:, :, None], axis=1)
+    busy, used = np.arange(count), 0
+    while len(busy):
+        b = tip[busy]
+        a, c = before[busy, b], after[busy, b]
+        left = corners - cut[busy]
+        ear = left == 3
+        hopeless = tries[busy] >= left
+        if used < budget:
+            used += places[busy].size // 2
+            ends = [flat[busy, one] for one in (a, b, c)]
+            ear |= _is_ear(ends, places[busy], there[busy], _FLAT * size[busy])
+        else:
+            hopeless[:] = True
+        failed[busy] |= hopeless & ~ear
+        ear |= hopeless
+        tip[busy], tries[busy] = c, tries[busy] + 1
+        rows, a, b, c = busy[ear], a[ear], b[ear], c[ear]
+        triangles[rows, cut[rows]] = np.stack([a, b, c], axis=1)
+        there[rows] &= dent[rows] != b[:, None]
+        after[rows, a], before[rows, c], tries[rows] = c, a, 0
+        cut[rows] += 1
+        busy = busy[cut[busy] < corners - 2]
+    return triangles, int((failed & (size > _FLAT)).sum()), used
+
+
+def _is_ear(ends: list[Array], places: Array, there: npt.NDArray[np.bool_], least: Array) -> npt.NDArray[np.bool_]:
+    """Tell of triangles, three times (P, 2), whether they have an area and hold no place (P, n, 2) that is there."""
+    ear: npt.NDArray[np.bool_] = _doubled_areas(*ends) > least
+    x, y, inside = places[ear, :, 0], places[ear, :, 1], there[ear]
+    for one, other in zip(ends, [*ends[1:], ends[0]], strict=True):
+        (x0, y0), (x1, y1) = one[ear, :, None].swapaxes(0, 1), other[ear, :, None].swapaxes(0, 1)
+        inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
+        inside &= (x != x0) | (y != y0)
+    ear[ear] = ~inside.any(axis=1)
+    return ear

@@ -1,0 +1,294 @@
+"""What a detector returns: which of its outputs are boxes, scores and classes, and which rows only fill up.
+
+Detections of one picture are a mapping with `boxes` (D, 4) as they came and `scores`: (D, C) of every class, or (D,)
+with `labels` (D,), the class of each box. Where types, names and shapes leave open which of two numbers of a box is its
+score and which its class, these stand as `either` (D, 2) in place of both. Rows that only fill up are
+gone; how many of them were NaN throughout is said as `blank` (1,), if any were.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Detections = Mapping[str, Tensor]
+
+EXPECTED = (
+    "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, D) and scores (N, D); rows "
+    "(N, D, 6) of a box, a score and a class; or for each picture a mapping with boxes (D, 4), labels (D,) and scores "
+    "(D,)"
+)
+
+ORDERS = ("boxes scores labels", "boxes labels scores")
+"""What two numbers of a box may be."""
+
+NAMES = {
+    "boxes": ("boxes", "pred_boxes", "detection_boxes", "bboxes", "xyxy", "box", "bbox"),
+    "scores": ("scores", "pred_scores", "detection_scores", "confidences", "confidence", "conf", "score"),
+    "labels": ("labels", "pred_classes", "detection_classes", "classes", "class_ids", "category_ids", "cls", "label"),
+}
+"""What the parts of an answer are called, the usual name first."""
+
+WORDS = {"boxes": ("box",), "scores": ("score", "conf", "prob", "logit"), "labels": ("label", "class", "cls", "categ")}
+"""What is in a name that is none of these."""
+
+NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
+
+TOLERANCE = 1e-3
+"""How far outside [0, 1] a score may lie."""
+
+
+def checked_order(text: str) -> tuple[str, ...]:
+    """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture.
+
+    Raises:
+        ValueError: it names others.
+    """
+    parts = tuple(text.replace(",", " ").split())
+    if sorted(parts) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
+        raise ValueError(f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', got {text!r}")
+    return parts
+
+
+def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
+    """Return what a detector answered to each of `count` pictures.
+
+    Args:
+        answer: as `EXPECTED` says. The parts of a mapping or an object may have other names.
+        count: pictures.
+        order: of parts that have no names, see `checked_order`; "" for what types and shapes say.
+
+    Raises:
+        ValueError: it is something else, or scores are not in [0, 1].
+    """
+    parts = checked_order(order) if order else ()
+    if isinstance(answer, (list, tuple)) and len(answer) == count and all(map(_is_one, answer)):
+        found = [dict(NOTHING) if one is None else _parts(one, parts) for one in answer]
+    elif isinstance(answer, Tensor) and answer.ndim == 2 and answer.shape[1] == 7:
+        found = [_parts(rows, [part for part in parts if part != "batch"]) for rows in _split(answer, count, parts)]
+    else:
+        together = _parts(answer, parts)
+        if together["boxes"].ndim == 2 and count == 1:  # the network has dropped the batch dimension
+            together = {name: part[None] for name, part in together.items()}
+        if together["boxes"].ndim != 3 or any(len(part) != count for part in together.values()):
+            raise ValueError(EXPECTED)
+        found = [{name: part[k] for name, part in together.items()} for k in range(count)]
+    return [_one(one) for one in found]
+
+
+def _is_one(part: Any) -> bool:
+    """Whether a part of an answer is that to one picture, and not boxes or scores of all; None where nothing is."""
+    if isinstance(part, Tensor):
+        return part.ndim == 2 and part.shape[1] == 6
+    return part is None or isinstance(part, (Mapping, list, tuple)) or _named(part) is not None
+
+
+def _split(rows: Tensor, count: int, order: Sequence[str]) -> list[Tensor]:
+    """Rows (K, 7) of all pictures as rows (D, 6) of each; the number of the picture comes first, or where it says."""
+    place = _columns(order)["batch"].start if "batch" in order else 0
+    numbers = rows.detach()[:, place]
+    if not bool(((numbers == numbers.round()) & (numbers >= -1) & (numbers < count)).all()):
+        raise ValueError(EXPECTED)
+    rest = torch.cat([rows[:, :place], rows[:, place + 1 :]], dim=1)
+    return [rest[numbers == number] for number in range(count)]
+
+
+def _columns(order: Sequence[str]) -> dict[str, slice]:
+    """Which columns of rows hold a part."""
+    found, begin = dict[str, slice](), 0
+    for part in order:
+        found[part] = slice(begin, begin + (4 if part == "boxes" else 1))
+        begin = found[part].stop
+    return found
+
+
+def _parts(answer: Any, order: Sequence[str]) -> dict[str, Tensor]:
+    """Return the parts of an answer by name: boxes, and scores, with labels or without, or `either`."""
+    if isinstance(answer, Tensor):
+        if answer.ndim not in (2, 3) or answer.shape[-1] != 6:
+            raise ValueError(EXPECTED)
+        if order:
+            columns = {part: answer[..., where] for part, where in _columns(order).items()}
+            return {name: part if name == "boxes" else part[..., 0] for name, part in columns.items()}
+        return {"boxes": answer[..., :4], "either": answer[..., 4:]}
+    named = _named(answer)
+    if named is not None and "boxes" in named and "scores" in named:
+        return named
+    listed = answer.values() if isinstance(answer, Mapping) else answer
+    if not isinstance(listed, Iterable):
+        raise ValueError(EXPECTED)
+    tensors = list(listed)
+    if isinstance(answer, Mapping):
+        tensors = [one for one in tensors if isinstance(one, Tensor)]
+    if not all(isinstance(one, Tensor) for one in tensors):
+        raise ValueError(EXPECTED)
+    if order and len(tensors) == len(order):
+        given = dict(zip(order, tensors, strict=True))
+        shape = given["boxes"].shape[:-1]
+        return {name: part[..., 0] if part.shape == (*shape, 1) else part for name, part in given.items()}
+    return _by_shape(tensors)
+
+
+def _named(answer: Any) -> dict[str, Tensor] | None:
+    """The parts of a mapping or an object by their names; None of what is neither."""
+    if isinstance(answer, Mapping):
+        given = {str(name): part for name, part in answer.items() if isinstance(part, Tensor)}
+    elif any(hasattr(answer, name) for name in NAMES["boxes"]):
+        known = [name for names in NAMES.values() for name in names]
+        given = {name: getattr(answer, name) for name in known if isinstance(getattr(answer, name, None), Tensor)}
+    else:
+        return None
+    found, left = dict[str, Tensor](), dict(given)
+    for part, names in NAMES.items():
+        exact = [name for name in names if name in left]
+        near = [name for name in left if any(word in name.lower() for word in WORDS[part])]
+        if exact or len(near) == 1:
+            found[part] = left.pop((exact or near)[0])
+    return found
+
+
+def _by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
+    """The parts of a tuple: boxes have four numbers, classes are whole numbers by type."""
+    fours = [one for one in tensors if one.ndim > 1 and one.shape[-1] == 4]
+    fours = [one for one in fours if one.ndim == max(four.ndim for four in fours)]
+    far = [one for one in fours if bool((one.detach() > 1.0 + TOLERANCE).any())]  # no scores of four classes
+    if not fours or len(tensors) < 2:
+        raise ValueError(EXPECTED)
+    boxes = far[0] if len(far) == 1 else fours[0]
+    shape = boxes.shape[:-1]
+    others = [one for one in tensors if one is not boxes and one.shape[: len(shape)] == shape]
+    if len(others) == 1 and others[0].ndim == boxes.ndim:
+        return {"boxes": boxes, "scores": others[0]}
+    flat = [one[..., 0] if one.shape == (*shape, 1) else one for one in others]
+    whole = [one for one in flat if not one.is_floating_point()]
+    if len(flat) != 2 or len(whole) == 2 or any(one.shape != shape for one in flat):
+        raise ValueError(EXPECTED)
+    if whole:
+        return {"boxes": boxes, "scores": flat[0] if flat[1] is whole[0] else flat[1], "labels": whole[0]}
+    return {"boxes": boxes, "either": torch.stack([one.to(boxes.dtype) for one in flat], dim=-1)}
+
+
+def _one(one: Mapping[str, Tensor]) -> Detections:
+    """The detections of one picture, checked, without rows that only fill up.
+
+    Such a row has a class or score of -1, or four equal numbers or NaN for a box, and no score.
+    """
+    boxes = one["boxes"].reshape(-1, 4) if one["boxes"].numel() == 0 else one["boxes"]
+    parts = [part for name, part in one.items() if name != "blank"]
+    if boxes.ndim != 2 or boxes.shape[1] != 4 or any(len(part) != len(boxes) for part in parts):
+        raise ValueError(EXPECTED)
+    boxes = boxes.float()
+    if "either" in one:
+        either = one["either"].float()
+        filling = nowhere(boxes.detach()) & ~(either.detach() > 0.0).all(dim=1)
+        return _kept({"boxes": boxes, "either": either}, filling, either.detach())
+    scores, labels = one["scores"].float(), one.get("labels")
+    if scores.ndim != (2 if labels is None else 1) or (labels is not None and labels.shape != scores.shape):
+        raise ValueError(EXPECTED)
+    if labels is not None and labels.is_floating_point():
+        nameless = labels.detach().isnan()
+        scores, labels = scores.masked_fill(nameless, math.nan), labels.detach().masked_fill(nameless, 0.0)
+        if bool((labels != labels.round()).any()):
+            raise ValueError("expected classes that are whole numbers")
+    best = scores.detach() if labels is None else scores.detach()[:, None]
+    filling = nowhere(boxes.detach()) & ~(best > 0.0).any(dim=1) | (best == -1.0).all(dim=1)
+    filling = filling if labels is None else filling | (labels < 0)
+    outside = best[~filling]
+    if bool(((outside < -TOLERANCE) | (outside > 1.0 + TOLERANCE) & outside.isfinite()).any()):
+        raise ValueError("expected scores that are probabilities in [0, 1]; apply a sigmoid or a softmax to them")
+    found = {"boxes": boxes, "scores": scores} if labels is None else {
+        "boxes": boxes, "scores": scores, "labels": labels.long()
+    }  # fmt: skip
+    return {**_kept(found, filling, best), **{name: one[name] for name in one if name == "blank"}}
+
+
+def _kept(one: dict[str, Tensor], filling: Tensor, numbers: Tensor) -> Detections:
+    """The rows that do not fill up (D,), and how many of those that do are NaN in box and numbers (D, K)."""
+    if not bool(filling.any()):
+        return one
+    blank = filling & numbers.isnan().all(dim=1) & one["boxes"].detach().isnan().all(dim=1)
+    kept = {name: part[~filling] for name, part in one.items()}
+    return {**kept, "blank": blank.sum()[None]} if bool(blank.any()) else kept
+
+
+def nowhere(boxes: Tensor) -> Tensor:
+    """Whether boxes (D, 4) of any form are none: four times the same number, or one that is not finite, (D,) bool."""
+    return (boxes == boxes[:, :1]).all(dim=1) | ~boxes.isfinite().all(dim=1)
+
+
+# ---- scores and classes by what they are ----------------------------------------------------------------------------
+
+
+def counted(one: Detections) -> Tensor:
+    """Rows that say something: a box, and a number over 0 beside it, (D,) bool."""
+    return ~nowhere(one["boxes"]) & (numbers_of(one) > 0.0).any(dim=1)
+
+
+def numbers_of(one: Detections) -> Tensor:
+    """The numbers of each box that are scores, or may be, without derivatives, (D, K)."""
+    beside = (one["either"] if "either" in one else one["scores"]).detach()
+    return beside if beside.ndim == 2 else beside[:, None]
+
+
+def settled(one: Detections, order: str = "") -> Detections:
+    """Return the detections of a picture with scores and labels told apart.
+
+    Args:
+        one: of `detections_in`.
+        order: one of `ORDERS`; "" for what its rows show.
+
+    Raises:
+        ValueError: they do not show it, or something else than the order says.
+    """
+    if "either" not in one:
+        return one
+    rows = counted(one) | one["either"].isnan().any(dim=1)
+    order = order or order_in([one]) or ("" if bool(rows.any()) else ORDERS[0])
+    if not order:
+        raise ValueError(f"which of a box's two numbers is its score does not show; {ask_order()}")
+    first, second = one["either"].unbind(dim=1)
+    scores, labels = (first, second) if order == ORDERS[0] else (second, first)
+    return _one({**{k: v for k, v in one.items() if k != "either"}, "scores": scores, "labels": labels})
+
+
+def ask_order() -> str:
+    """What to say where scores and classes cannot be told apart."""
+    return f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
+
+
+def as_option(options: str) -> str:
+    """Return what says options of detection, as messages name settings."""
+    return f"`task='detection={{{options}}}'`"
+
+
+def order_in(found: Sequence[Detections], classes: int | None = None) -> str:
+    """Return which of `ORDERS` the rows of detections show; "" where they leave it open.
+
+    A class is a whole number, a score lies in [0, 1]; and what suppression leaves comes by falling scores.
+
+    Args:
+        found: of any pictures.
+        classes: that there are; None where nobody says.
+
+    Raises:
+        ValueError: no number can be a score, or none a class.
+    """
+    each = [one["either"][counted(one)] for one in found if "either" in one]
+    rows = [one[one.isfinite().all(dim=1)].detach() for one in each]
+    if not any(map(len, rows)):
+        return ""
+    numbers, most = torch.cat(rows).unbind(dim=1), math.inf if classes is None else classes
+    whole = [bool(((c == c.round()) & (c >= -1.0) & (c < most)).all()) for c in numbers]
+    share = [bool(((c >= -TOLERANCE) & (c <= 1.0 + TOLERANCE)).all()) for c in numbers]
+    fits = [share[0] and whole[1], share[1] and whole[0]]
+    if not any(fits) and classes is not None:
+        return order_in(found)
+    if not any(fits):
+        raise ValueError("expected for each box a score in [0, 1] and the number of a class, got other numbers")
+    if all(fits):
+        fits = [all(bool((one[:, k].diff() <= 0.0).all()) for one in rows) for k in (0, 1)]
+    return "" if fits[0] == fits[1] else ORDERS[0] if fits[0] else ORDERS[1]

@@ -1,0 +1,112 @@
+"""Environments of one's own in the control `environment`: in lists, as an axis, for every picture, and refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+
+import advsearch
+from advsearch.controls import make_control
+from advsearch.errors import AdvsearchError, FileFormatError, InputError
+
+SIZE = 16
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """Two rooms: a red one as .exr, and a blue one as .hdr."""
+    folder = tmp_path_factory.mktemp("rooms")
+    red, blue = folder / "red.exr", folder / "blue.hdr"
+    radiance = np.random.default_rng(0).random((8, 16, 3), dtype=np.float32) * (1.0, 0.3, 0.2)
+    OpenEXR.File({}, {"RGB": radiance.astype(np.float32)}).write(str(red))
+    pixels = np.full((8, 16, 4), (40, 90, 200, 129), np.uint8)
+    pixels[:3] = (90, 120, 250, 130)
+    blue.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 16\n" + pixels.tobytes())
+    return str(red), str(blue)
+
+
+def shown(scene: advsearch.Scene, controls: object, u: list[float] | None = None) -> torch.Tensor:
+    renderer = scene.renderer(controls, resolution=SIZE, denoise="none")  # type: ignore[arg-type]
+    return renderer(renderer.start if u is None else torch.tensor(u), 0, 16).detach()
+
+
+def test_each_looks_as_the_scene_in_it(maps: tuple[str, str]) -> None:
+    """Floor and exposure too: the first of one's own files is the clean scene."""
+    space = {"environment": {"which": list(maps)}}
+    for number, name in enumerate(maps):
+        alone = shown(advsearch.load_scene("mug", environment=name), "pose")
+        chosen = shown(advsearch.load_scene("mug"), space, [(number + 0.5) / 2])
+        np.testing.assert_allclose(chosen, alone, atol=2e-5)
+    assert float((shown(advsearch.load_scene("mug"), space) - chosen).abs().mean()) > 0.05
+    fixed = {"environment": {"which": maps[1]}, "pose": {"yaw": [0, 90]}}
+    np.testing.assert_allclose(shown(advsearch.load_scene("mug"), fixed), chosen, atol=2e-5)
+
+
+def test_beside_a_bundled_one_the_table_stays_and_is_said(maps: tuple[str, str]) -> None:
+    scene = advsearch.load_scene("mug", environment="noon")
+    renderer = scene.renderer({"environment": {"which": ["own", *maps]}}, resolution=SIZE, denoise="none")
+    assert renderer.space.describe(torch.tensor([0.5]))["environment.which"]["value"] == maps[0]
+    np.testing.assert_allclose(renderer(renderer.start, 0, 16), shown(scene, "pose"), atol=2e-5)
+    assert renderer.space.scene is not None
+    assert "red, blue: the object stands on the scene's table" in renderer.space.scene.notes[-1]
+
+
+def test_a_file_that_changed_is_read_again(maps: tuple[str, str], tmp_path: Path) -> None:
+    path = tmp_path / "room.exr"
+    found = []
+    for factor in (0.2, 1.0):
+        radiance = np.full((8, 16, 3), 0.5, np.float32) * np.array([1.0, factor, factor], np.float32)
+        OpenEXR.File({}, {"RGB": radiance}).write(str(path))
+        found.append(shown(advsearch.load_scene("mug"), {"environment": {"which": [maps[0], str(path)]}}, [0.75]))
+    assert float((found[0] - found[1]).abs().mean()) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("names", "kind", "reason"),
+    [
+        (["missing.hdr", "noon"], FileFormatError, "missing.hdr: no such environment file"),
+        (["noon", "room.png"], FileFormatError, r"expected an environment file ending in .hdr or .exr, got '.png'"),
+        (["noon", "nooon"], AdvsearchError, "unknown environment.which 'nooon'"),
+        (["a.hdr", "a.hdr"], InputError, "got a.hdr twice"),
+        ([3, "a.hdr"], InputError, "expected one of own"),
+    ],
+)
+def test_what_cannot_be_is_refused(names: list[object], kind: type[Exception], reason: str) -> None:
+    with pytest.raises(kind, match=reason):
+        make_control("environment", {"which": names}).prepare(advsearch.load_scene("mug").description)
+
+
+def test_another_file_than_the_scene_was_asked_to_have_is_refused(maps: tuple[str, str]) -> None:
+    scene = advsearch.load_scene("mug", environment=maps[0])
+    with pytest.raises(InputError, match="contradict each other"):
+        scene.renderer({"environment": {"which": [maps[1], "noon"]}}, resolution=SIZE)
+
+
+def test_they_are_an_axis_of_a_sweep(maps: tuple[str, str]) -> None:
+    found = advsearch.sweep(
+        "mug", "reference", {"environment.which": [*maps, "noon"]}, resolution=SIZE, spp=1, trials=6, verify_spp=4
+    )
+    assert [row["environment.which [name]"] for row in found.to_pandas().to_dict("records")] == [*maps, "noon"]
+
+
+def test_they_are_drawn_for_every_picture(maps: tuple[str, str]) -> None:
+    found = advsearch.attack(
+        advsearch.load_scene("mug"),
+        "reference",
+        controls={"texture": {"resolution": 4}},
+        over={"environment": {"which": [*maps, "studio"]}},
+        resolution=SIZE,
+        steps=1,
+        trials=6,
+        draws=2,
+        verify_spp=4,
+        spp=1,
+        baseline=False,
+        denoise="none",
+    )
+    assert found.summary.over == ["environment"]
+    assert "table" in " ".join(found.summary.warnings)

@@ -1,0 +1,422 @@
+"""Textures by material: which texels belong to which material of a file, and a search that keeps to some of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from torch import Tensor
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+import advsearch
+from advsearch.cli.main import main
+from advsearch.controls import make_control, make_space
+from advsearch.engine.print_terms import off_print, variation
+from advsearch.engine.printing import printable
+from advsearch.engine.transport import remark
+from advsearch.errors import InputError
+from advsearch.scene.assets import Mesh, ObjectAsset
+from advsearch.scene.importing.objects import import_object
+from advsearch.scene.raster import texels_read
+from advsearch.scene.surface_map import looked_up, texels_of_faces
+from advsearch.scene.transport.plan import why_not
+from advsearch.scene.transport.renderer import TOO_LARGE, LinearRenderer
+
+Box = tuple[Sequence[float], Sequence[float]]
+CAR: dict[str, list[Box]] = {
+    "Body Paint": [((-1, -0.4, 0.2), (1, 0.4, 0.5))],
+    "roof": [((-0.45, -0.32, 0.83), (0.35, 0.32, 0.88))],
+    "glass": [((-0.5, -0.36, 0.51), (0.4, 0.36, 0.82))],
+    "tyres": [((x, y, 0), (x + 0.36, y + 0.14, 0.36)) for x in (-0.8, 0.44) for y in (-0.55, 0.41)],
+    "plate": [((1.001, -0.15, 0.28), (1.02, 0.15, 0.38))],
+}
+"""Boxes from corner to corner by material, z up."""
+COLOURS = {
+    "Body Paint": (0.7, 0.1, 0.1),
+    "roof": (0.6, 0.6, 0.65),
+    "glass": (0.1, 0.2, 0.25),
+    "tyres": (0.05, 0.05, 0.05),
+    "plate": (0.9, 0.9, 0.7),
+}
+SIDES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
+
+
+def corners(box: Box) -> np.ndarray:
+    low, high = (np.array(one, dtype=np.float64) for one in box)
+    steps = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])
+    return np.asarray(low + steps * (high - low))
+
+
+def car(folder: Path, colours: dict[str, tuple[float, float, float]] = COLOURS, opacity: float = 0.4) -> Path:
+    """A car of boxes with five materials, one of them see-through, and an .mtl file beside it."""
+    lines, count = ["mtllib car.mtl"], 0
+    for name, boxes in CAR.items():
+        lines.append(f"usemtl {name}")
+        for box in boxes:
+            lines += [f"v {x:g} {y:g} {z:g}" for x, y, z in corners(box)]
+            lines += ["f " + " ".join(str(count + 1 + corner) for corner in side) for side in SIDES]
+            count += 8
+    (folder / "car.obj").write_text("\n".join(lines) + "\n")
+    said = {name: f"newmtl {name}\nKd {' '.join(map(str, colour))}\n" for name, colour in colours.items()}
+    said["glass"] += f"d {opacity}\n"
+    (folder / "car.mtl").write_text("".join(said.values()))
+    return folder / "car.obj"
+
+
+def car_as_gltf(folder: Path) -> Path:
+    """The same in binary glTF, a node a box."""
+    scene = trimesh.Scene()
+    turn = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+    for name, boxes in CAR.items():
+        material = PBRMaterial(
+            name=name, baseColorFactor=[*COLOURS[name], 1.0], roughnessFactor=0.5, metallicFactor=0.0
+        )
+        for box in boxes:
+            low, high = corners(box)[[0, -1]]
+            mesh = trimesh.creation.box(bounds=[low, high])
+            mesh.apply_transform(turn)
+            mesh.visual = TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=material)
+            scene.add_geometry(mesh)
+    scene.export(folder / "car.glb")
+    return folder / "car.glb"
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return car(tmp_path_factory.mktemp("car"))
+
+
+@pytest.fixture(scope="module")
+def scene(file: Path) -> advsearch.Scene:
+    return advsearch.load_scene(file, settings={"ground.size": 0.0})
+
+
+def seen(mesh: Mesh, faces: np.ndarray, texture: np.ndarray, count: int = 40) -> np.ndarray:
+    """What bilinear lookups at random places on some faces find."""
+    weights = np.random.default_rng(0).dirichlet([0.3] * 3, size=(len(faces), count))
+    uvs = np.einsum("fnk,fkc->fnc", weights, mesh.uvs[mesh.faces[faces]].astype(np.float64)).reshape(-1, 2)
+    height, width = texture.shape[:2]
+    return looked_up(texture, uvs[:, 0] * width - 0.5, (1.0 - uvs[:, 1]) * height - 0.5)
+
+
+# ---- what is known of a file ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("write", [car, car_as_gltf])
+def test_the_materials_of_a_file_keep_their_faces_and_their_texels(
+    write: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    asset = import_object(write(tmp_path))
+    mesh, side = asset.mesh, len(asset.base_color)
+    assert {name: len(faces) for name, faces in mesh.materials.items()} == {
+        name: 12 * len(boxes) for name, boxes in CAR.items()
+    }
+    assert sorted(np.concatenate(list(mesh.materials.values()))) == list(range(len(mesh.faces)))
+    for name, faces in mesh.materials.items():
+        found = seen(mesh, faces, asset.base_color)
+        wanted = COLOURS[name] if write is car else linear_to_display(COLOURS[name])
+        np.testing.assert_allclose(found, np.broadcast_to(wanted, found.shape), atol=0.01)
+        assert texels_of_faces(mesh, faces, (side, side))[1] == 1.0, "no texel is read by two materials"
+    told = " ".join(asset.warnings)
+    assert "the colours of its 5 materials were baked into one texture (512 x 512 texels)" in told
+
+
+def linear_to_display(color: Sequence[float]) -> np.ndarray:
+    linear = np.array(color)
+    return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+
+
+def test_materials_of_one_colour_are_told_apart_too(tmp_path: Path) -> None:
+    """Each has the whole unit square for itself in the file, as exporters write it, so that it is unwrapped anew."""
+    lines = ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+    for number, name in enumerate(("left", "right")):
+        x = 2 * number
+        lines += [f"v {x} 0 0", f"v {x + 1} 0 0", f"v {x + 1} 1 0", f"v {x} 1 0", f"usemtl {name}"]
+        lines.append("f " + " ".join(f"{4 * number + corner}/{corner}" for corner in (1, 2, 3, 4)))
+    (tmp_path / "two.obj").write_text("mtllib two.mtl\n" + "\n".join(lines) + "\n")
+    (tmp_path / "two.mtl").write_text("newmtl left\nKd 0.2 0.4 0.6\nnewmtl right\nKd 0.2 0.4 0.6\n")
+    mesh = import_object(tmp_path / "two.obj").mesh
+    assert [texels_of_faces(mesh, faces, (256, 256))[1] for faces in mesh.materials.values()] == [1.0, 1.0]
+
+
+def two_quads(folder: Path, ending: str) -> Path:
+    """Two quads of two materials: OBJ without its .mtl file, PLY with two textures, glTF with one name."""
+    file, corners = folder / f"two{ending}", [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    if ending == ".obj":
+        lines = [f"v {x} {y} {z}" for x, y, z in corners]
+        file.write_text("\n".join([*lines, "usemtl one", "f 1 2 3 4", "usemtl other # back", "f 5 6 7 8"]) + "\n")
+    elif ending == ".ply":
+        Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / "one.png")
+        Image.new("RGB", (4, 4), (0, 0, 255)).save(folder / "other.png")
+        head = ["ply", "format ascii 1.0", "comment TextureFile one.png", "comment TextureFile other.png"]
+        head += ["element vertex 8", *(f"property float {axis}" for axis in "xyz"), "element face 2"]
+        head += [
+            "property list uchar int vertex_indices",
+            "property list uchar float texcoord",
+            "property int texnumber",
+        ]
+        faces = [f"4 {4 * n} {4 * n + 1} {4 * n + 2} {4 * n + 3} 8 0 0 1 0 1 1 0 1 {n}" for n in (0, 1)]
+        file.write_text("\n".join([*head, "end_header", *(f"{x} {y} {z}" for x, y, z in corners), *faces]) + "\n")
+    else:
+        scene = trimesh.Scene()
+        for number, name in enumerate(("one", None)):
+            mesh = trimesh.Trimesh(corners[4 * number : 4 * number + 4], [[0, 1, 2], [0, 2, 3]], process=False)
+            material = PBRMaterial(name=name, baseColorFactor=[1.0, 0.5 * number, 0.0, 1.0])
+            mesh.visual = TextureVisuals(uv=np.zeros((4, 2)), material=material)
+            scene.add_geometry(mesh)
+        scene.export(file)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("ending", "names"), [(".obj", {"one", "other"}), (".ply", {"one.png", "other.png"}), (".glb", {"one", None})]
+)
+def test_names_are_those_of_the_file(ending: str, names: set[str], tmp_path: Path) -> None:
+    """In PLY those of textures; a material of glTF without a name has its number for one."""
+    found = import_object(two_quads(tmp_path, ending)).mesh.materials
+    assert [len(faces) for faces in found.values()] == [2, 2]
+    if None in names:
+        unnamed = set(found) - {"one"}
+        assert len(unnamed) == 1 and unnamed.pop().startswith("material")
+    else:
+        assert set(found) == names
+
+
+def test_a_baked_texture_says_how_much_finer_its_pictures_were(tmp_path: Path) -> None:
+    names, size = ("a", "b", "c", "d"), 1024
+    Image.new("RGB", (size, size), (10, 20, 30)).save(tmp_path / "p.png")
+    lines = ["mtllib many.mtl", "vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+    for number, name in enumerate(names):
+        lines += [f"v {number + dx} {dy} 0" for dx, dy in ((0, 0), (0.9, 0), (0.9, 0.9), (0, 0.9))] + [f"usemtl {name}"]
+        lines.append("f " + " ".join(f"{4 * number + corner}/{corner}" for corner in (1, 2, 3, 4)))
+    (tmp_path / "many.obj").write_text("\n".join(lines) + "\n")
+    glow = {name: f"Ke 0 0 {number}\n" for number, name in enumerate(names)}
+    (tmp_path / "many.mtl").write_text("".join(f"newmtl {name}\nmap_Kd p.png\n{glow[name]}" for name in names))
+    told = " ".join(import_object(tmp_path / "many.obj", up="z").warnings)
+    assert "4 materials were baked into one texture (1024 x 1024 texels, 8 times fewer than its pictures have" in told
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_texels_that_lookups_read_are_all_there(seed: int) -> None:
+    """Against lookups at many random places in a triangle; some have corners on texel centres."""
+    random, shape = np.random.default_rng(seed), (13, 17)
+    triangle = random.random((1, 3, 2)) * [17, 13] * random.choice([0.1, 0.5, 1.0])
+    triangle = (np.round(triangle) if seed % 2 else triangle) - 0.5
+    read = texels_read(triangle, shape)
+    places = random.dirichlet([0.5] * 3, 20_000) @ triangle[0]
+    left, top = np.floor(places[:, 0]).astype(int), np.floor(places[:, 1]).astype(int)
+    wanted = np.zeros(shape, bool)
+    for row in (0, 1):
+        for column in (0, 1):
+            across, down = np.abs(places[:, 0] - left - 1 + column), np.abs(places[:, 1] - top - 1 + row)
+            counts = across * down > 1e-9
+            wanted[(top[counts] + row) % 13, (left[counts] + column) % 17] = True
+    assert read[wanted].all() and read.sum() <= wanted.sum() + 12
+
+
+def test_import_lists_materials_and_says_what_is_slow(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["import", str(file)]) == 0
+    said = capsys.readouterr().out
+    assert "materials (--control 'texture={materials: [NAME]}'): Body Paint, roof, glass, tyres, plate\n" in said
+    assert "slow: for what it lets light through, controls that move outlines" in said
+    assert main(["import", str(file), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert {"name": "tyres", "triangles": 48} in told["materials"] and len(told["slow"]) == 1
+
+
+# ---- the control ----------------------------------------------------------------------------------------------------
+
+FORMS: list[dict[str, object]] = [{}, {"form": "palette"}, {"form": "waves", "epsilon": 0.3}]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_only_the_texels_of_the_materials_are_painted(scene: advsearch.Scene, form: dict[str, object]) -> None:
+    control = make_control("texture", {"materials": ["Body Paint", "roof"], **form})
+    space, asset = make_space([control], scene.description), scene.description.object
+    u = torch.rand(space.start.shape, generator=torch.Generator().manual_seed(0))
+    made = space.artifacts(u)
+    before, after = made["texture-original"].numpy(), made["texture"].numpy()
+    assert np.array_equal(before, asset.base_color)
+    for name, faces in asset.mesh.materials.items():
+        same = (seen(asset.mesh, faces, before) == seen(asset.mesh, faces, after)).all(axis=1)
+        assert same.mean() < 0.05 if name in ("Body Paint", "roof") else same.all(), name
+    assert np.array_equal(space.artifacts(space.start)["texture"].numpy(), before)
+
+
+def test_the_ball_is_over_what_is_painted(scene: advsearch.Scene) -> None:
+    """Its default radius in L2, and the root mean square that is told, count the painted texels alone."""
+    space = make_space([make_control("texture", {"materials": "plate", "norm": "l2"})], scene.description)
+    (group,) = space.groups
+    assert len(space.start) == group.size < 0.05 * 3 * 512 * 512
+    assert group.budget.epsilon == pytest.approx(0.1 * group.size**0.5)
+    u = (space.start - 0.1).clamp(0.0, 1.0)
+    told = space.describe(u)
+    assert told["texture.rms"]["value"] == pytest.approx(0.1) and told["texture.materials"]["value"] == "plate"
+
+
+@pytest.mark.parametrize("name", ["texture:Body-Paint", "texture:roof"])
+def test_a_material_can_stand_where_a_mesh_does(scene: advsearch.Scene, name: str) -> None:
+    """Where no mesh of the scene is called so; signs that a name cannot have become dashes."""
+    space = make_space([make_control(name)], scene.description)
+    wanted = "Body Paint" if "Body" in name else "roof"
+    other = make_space([make_control("texture", {"materials": wanted})], scene.description)
+    assert torch.equal(space.start, other.start)
+    assert set(space.inputs(space.start)) == {"object.base_color"}
+    assert set(space.artifacts(space.start)) == {name.replace(":", "@"), f"{name.replace(':', '@')}-original"}
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        ({"texture": {"materials": ["Bodypaint"]}}, "unknown material of the object 'Bodypaint'. Did you mean 'Body P"),
+        ({"texture:tire": {}}, r"material of the object 'tire'. Did you mean 'tyres'\? Known: Body Paint, glass, obj"),
+        ({"texture": {"materials": []}}, r"texture.materials: expected names of materials, got \[\]"),
+        ({"texture": {"materials": 3}}, "texture.materials: expected names of materials, got 3"),
+        ({"texture:roof": {}, "texture:plate": {}}, "two controls set object.base_color.*takes several materials"),
+        ({"texture": {"materials": "plate", "resolution": 4}}, "% of the texels of plate too.*a higher resolution"),
+    ],
+)
+def test_what_cannot_be_painted_is_refused(scene: advsearch.Scene, controls: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        scene.renderer(controls, resolution=16)
+
+
+def test_an_object_without_materials_says_so() -> None:
+    with pytest.raises(InputError, match="the object has no materials with names"):
+        advsearch.load_scene("mug").renderer({"texture": {"materials": "glaze"}}, resolution=16)
+
+
+def quads(folder: Path, second: Sequence[Sequence[float]]) -> ObjectAsset:
+    """Two quads of two materials with one picture, not square; the first has its left half, the second these UVs."""
+    texels = np.random.default_rng(3).integers(0, 256, (256, 320, 3)).astype(np.uint8)
+    Image.fromarray(texels).save(folder / "p.png")
+    uvs = [(0, 0), (0.5, 0), (0.5, 1), (0, 1), *second]
+    lines = ["mtllib q.mtl", *(f"vt {u} {v}" for u, v in uvs)]
+    lines += [f"v {x} {y} {z}" for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    lines += ["usemtl one", "f 1/1 2/2 3/3 4/4", "usemtl other", "f 5/5 6/6 7/7 8/8"]
+    (folder / "q.obj").write_text("\n".join(lines) + "\n")
+    (folder / "q.mtl").write_text("newmtl one\nmap_Kd p.png\nnewmtl other\nmap_Kd p.png\n")
+    return import_object(folder / "q.obj", up="z")
+
+
+def test_materials_beside_each_other_on_one_picture_share_no_texel(tmp_path: Path) -> None:
+    """The file's own picture is kept; the texels on both sides of the seam stay as they are. Lookups of the first reach
+    around the picture's border."""
+    quads(tmp_path, [(0.5, 0), (1, 0), (1, 1), (0.5, 1)])
+    described = advsearch.load_scene(tmp_path / "q.obj", up="z").description
+    mesh, own = described.object.mesh, described.object.base_color
+    space = make_space([make_control("texture", {"materials": "one"})], described)
+    after = space.artifacts(torch.rand(space.start.shape))["texture"].numpy()
+    assert own.shape == after.shape == (256, 320, 3)
+    other = mesh.materials["other"]
+    assert np.array_equal(seen(mesh, other, own, 4000), seen(mesh, other, after, 4000))
+    changed = (own != after).any(axis=2)
+    assert changed[:, 1:159].all() and not changed[:, 159:].any() and not changed[:, 0].any()
+
+
+def test_materials_that_share_all_their_texels_cannot_be_painted_alone(tmp_path: Path) -> None:
+    quads(tmp_path, [(0, 0), (0.5, 0), (0.5, 1), (0, 1)])
+    scene = advsearch.load_scene(tmp_path / "q.obj", up="z")
+    with pytest.raises(InputError, match="other materials read 100 % of the texels of one too"):
+        make_space([make_control("texture:one")], scene.description)
+    both = make_space([make_control("texture", {"materials": ["one", "other"]})], scene.description)
+    assert len(both.start) > 0.45 * 3 * 256 * 320
+
+
+# ---- what takes part in a search -------------------------------------------------------------------------------------
+
+
+def levels(one: Tensor, other: Tensor) -> float:
+    return 255.0 * float(((one - other) ** 2).mean().sqrt())
+
+
+def test_a_matrix_predicts_what_is_painted_beside_and_behind_glass(scene: advsearch.Scene) -> None:
+    """Half of the light passes through the glass, which lets the matrix see what is behind it."""
+    renderer = scene.renderer({"texture": {"materials": ["Body Paint", "glass"]}}, resolution=32)
+    predicted = LinearRenderer(renderer, renderer.start, seed=1)
+    with torch.no_grad():
+        one, other = (renderer(renderer.start, seed=seed, spp=256) for seed in (11, 12))
+        assert levels(predicted(renderer.start), one) < 1.5 * levels(one, other)
+        for sign in (1.0, -1.0):
+            u = (renderer.start + 0.1 * sign).clamp(0.0, 1.0)
+            change = renderer(u, seed=11, spp=256) - one
+            off = levels(predicted(u) - predicted(renderer.start), change)
+            assert off < 1.5 and levels(change, torch.zeros(())) > 4.0 * off
+
+
+class Red(torch.nn.Module):
+    """A car where the middle of a picture is red, else a van."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        middle = x[:, :, 12:24, 6:26].mean(dim=(2, 3))
+        car = 40.0 * (middle[:, 0] - middle[:, 1] - 0.1)
+        return torch.stack([car, -car], dim=1)
+
+
+def test_a_search_over_the_paint_of_a_car_with_glass_renders_nothing(file: Path, tmp_path: Path) -> None:
+    """All other texels are those of the file, also in what is kept; what is printed is the paint."""
+    model = advsearch.load_model(Red(), labels=["car", "van"], input_size=32, name="red")
+    controls = {"texture": {"materials": ["Body Paint"], "epsilon": 0.5}}
+    settings: Any = {"label": "car", "resolution": 32, "steps": 16, "trials": 6, "baseline": False, "verify_spp": 8}
+    run = tmp_path / "run"
+    found = advsearch.attack(file, model=model, controls=controls, run=run, **settings).summary
+    assert found.ending == "found" and found.transport is not None and found.transport.used
+    assert found.renders["products"] == 16 and found.renders["gradient"] == 0
+    before, after = (np.array(Image.open(run / "artifacts" / f"texture{one}.png")) for one in ("-original", ""))
+    asset = import_object(file)
+    painted = texels_of_faces(asset.mesh, asset.mesh.materials["Body Paint"], (512, 512))[0]
+    changed = (before != after).any(axis=2)
+    assert changed.any() and not changed[~painted].any()
+    length, width, height = 100.0, 40.0, 15.0  # of the body's box, where the car is as long
+    sizes = sum(int(piece.size[0] * piece.size[1]) for piece in printable(run, length))
+    assert sizes == pytest.approx(2 * (length * width + length * height + width * height), rel=0.1)
+
+
+def test_print_terms_count_what_is_painted() -> None:
+    """A fourth channel leaves pixels out, and the steps to and from them."""
+    colors = torch.full((4, 5, 3), 0.5)
+    colors[:2, 2] = 0.9
+    colors[3] = torch.rand(5, 3)
+    where = torch.zeros(4, 5, 1)
+    where[:2, :3] = 1.0
+    masked = torch.cat([colors, where], dim=-1)
+    assert float(off_print(masked)) == pytest.approx(float(off_print(colors[:2, :3]))) == 0.0
+    assert float(variation(masked)) == pytest.approx(2 * 0.4 / 6)
+    assert float(variation(torch.cat([colors, torch.ones(4, 5, 1)], dim=-1))) == float(variation(colors))
+
+
+HAZY = {"density": [0.0, 0.05]}
+
+
+@pytest.mark.parametrize(
+    ("controls", "options", "told"),
+    [
+        ({"texture": {}, "haze": HAZY}, {}, "as predicting it: there is haze; leave the haze out."),
+        ({"texture": {}}, {"denoise": "none"}, "without the denoiser; `denoise=oidn` takes the noise out"),
+        ({"texture": {}, "pose": {}, "haze": HAZY}, {"denoise": "none"}, ""),
+    ],
+)
+def test_what_could_be_done_so_that_steps_are_predicted(
+    controls: dict[str, Any], options: dict[str, Any], told: str
+) -> None:
+    """Nothing where it would not be enough."""
+    reason = why_not(advsearch.load_scene("mug").renderer(controls, resolution=16, **options))
+    assert reason is not None and told in remark(reason) and bool(told) == bool(remark(reason))
+    assert remark(f"{TOO_LARGE} 1 GiB").startswith("Each step of the search is rendered, which takes several times")
+
+
+def test_a_search_that_needlessly_renders_each_step_says_so() -> None:
+    model = advsearch.load_model(Red(), labels=["vase", "mug"], input_size=32, name="red")
+    settings: Any = {"resolution": 16, "steps": 16, "trials": 6, "baseline": False, "verify_spp": 1, "spp": 1}
+    controls = {"texture": {"resolution": 8}}
+    found = advsearch.attack("mug", model=model, controls=controls, run=None, denoise="none", **settings).summary
+    assert found.transport is not None and not found.transport.used and found.steps == 16
+    assert any(text.startswith("Each step of the search is rendered") for text in found.warnings)

@@ -1,0 +1,98 @@
+"""torch's global switches, turned by the code of users: they stay with their network, and break nothing of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.models import load_model
+from advsearch.models.switches import PLAIN, Switches, plainly
+
+TURNED = {
+    "type": Switches(dtype=torch.float64),
+    "gradients": Switches(gradients=False),
+    "deterministic": Switches(deterministic=2),
+    "anomalies": Switches(anomalies=True),
+    "all": Switches(torch.float64, PLAIN.device, gradients=False, deterministic=2, anomalies=True),
+}
+
+
+@pytest.fixture(autouse=True)
+def turned_back() -> Iterator[None]:
+    yield
+    PLAIN.turn()
+
+
+class OfItsType(nn.Module):
+    """A classifier that makes tensors of the type that its code has chosen, and may switch gradients off."""
+
+    def __init__(self, *, forgets: bool = False) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.pooled, self.last, self.forgets = nn.AdaptiveAvgPool2d(4), nn.Linear(48, 3), forgets
+
+    def forward(self, x: Tensor) -> Tensor:
+        answer: Tensor = 20.0 * self.last(self.pooled(x).flatten(1)) @ torch.eye(3)
+        if self.forgets:
+            torch.set_grad_enabled(False)
+        return answer
+
+
+@pytest.mark.parametrize("turned", TURNED)
+def test_a_model_is_loaded_and_asked_whatever_is_turned(turned: str) -> None:
+    theirs = TURNED[turned]
+    theirs.turn()
+    model = load_model(OfItsType(), input_size=16)
+    assert Switches.now() == theirs, "as they were"
+    assert model.differentiable and model.dtype == theirs.dtype
+    with plainly():
+        picture = torch.full((16, 16, 3), 0.5, requires_grad=True)
+        logits = model(picture)
+        (gradient,) = torch.autograd.grad(logits.max(), picture)
+        assert logits.dtype == gradient.dtype == torch.float32 and bool(gradient.any()) and Switches.now() == PLAIN
+    assert Switches.now() == theirs
+
+
+def test_what_the_code_of_a_network_turns_stays_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "turning_nets.py").write_text(
+        "import torch\ntorch.set_default_dtype(torch.float64)\ntorch.set_grad_enabled(False)\n"
+        f"import sys; sys.path.append({str(Path(__file__).parent)!r})\nfrom test_switches import OfItsType\n"
+        "def make():\n    return OfItsType()\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    model = load_model("turning_nets:make", input_size=16)
+    assert Switches.now() == PLAIN and model.dtype == torch.float64 and model.differentiable
+    assert model(torch.zeros(16, 16, 3)).dtype == torch.float32 and Switches.now() == PLAIN
+
+
+def test_a_network_that_switches_gradients_off_as_it_runs_does_so_for_itself() -> None:
+    model = load_model(OfItsType(forgets=True), input_size=16)
+    model(torch.zeros(16, 16, 3))
+    assert torch.is_grad_enabled() and model.differentiable
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_networks_in_other_types_are_warned_of_by_nothing(dtype: torch.dtype) -> None:
+    net = nn.Sequential(nn.Conv2d(3, 8, 5, 4), nn.ReLU(), nn.AdaptiveAvgPool2d(2), nn.Flatten(), nn.Linear(32, 4))
+    with torch.no_grad():
+        for one in net.parameters():
+            one.copy_(torch.linspace(-1.0, 1.0, one.numel()).sin().reshape(one.shape))
+    model = load_model(net.to(dtype), input_size=32)
+    assert model.dtype == dtype and model.differentiable and model(torch.zeros(2, 32, 32, 3)).dtype == torch.float32
+
+
+def test_a_scene_is_rendered_and_searched_whatever_is_turned() -> None:
+    TURNED["all"].turn()
+    network = OfItsType()
+    with torch.no_grad():
+        network.last.bias[0] += 5.0
+    named = load_model(network, input_size=16, labels=["mug", "bowl", "vase"])
+    assert advsearch.render("mug", named, spp=1).views[0].answers[0].label == "mug"
+    result = advsearch.attack("mug", named, steps=2, spp=1, trials=6, verify_spp=1, baseline=False)
+    assert Switches.now() == TURNED["all"]
+    assert result.summary.ending == "budget spent" and result.summary.renders["gradient"] > 0

@@ -1,0 +1,393 @@
+"""Wavefront OBJ and its material files: what each statement says is read, or named as left out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.mtl import map_of
+from advsearch.scene.importing.objects import import_object
+from advsearch.scene.importing.parts import read_parts
+
+POINTS = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+MAPPED = POINTS + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+FACE = "f 1/1 2/2 3/3 4/4\n"
+USED = "mtllib a.mtl\nusemtl m\n"
+
+
+def read(folder: Path, obj: str, **others: str) -> tuple[list[ImportedPart], list[str]]:
+    """Read an OBJ beside other files; ``a`` is a.mtl."""
+    for name, text in others.items():
+        (folder / f"{name}.mtl").write_text(text)
+    path = folder / "a.obj"
+    path.write_text(obj)
+    parts, notes = read_parts(path, path.read_bytes())
+    assert all(note.startswith("a.obj") for note in notes)
+    return parts, [note.removeprefix("a.obj").removeprefix(": ") for note in notes]
+
+
+def material(folder: Path, *lines: str, obj: str = MAPPED + USED + FACE) -> tuple[ImportedPart, list[str]]:
+    """Read a square with a material of some lines."""
+    (part,), notes = read(folder, obj, a="\n".join(("newmtl m", *lines, "")))
+    return part, notes
+
+
+def picture(folder: Path, name: str, pixels: object = None) -> np.ndarray:
+    """Write a picture, of noise by default; return its values."""
+    codes = np.random.default_rng(1).integers(256, size=(8, 8, 3)) if pixels is None else np.asarray(pixels)
+    Image.fromarray(codes.astype(np.uint8)).save(folder / name)
+    found: np.ndarray = codes.astype(np.float32) / np.float32(255.0)
+    return found
+
+
+def same(found: np.ndarray | None, expected: np.ndarray) -> bool:
+    """Whether there is an array, and it is as expected."""
+    return found is not None and np.array_equal(found, expected)
+
+
+def areas(part: ImportedPart) -> np.ndarray:
+    """The areas (F,) of a part's faces."""
+    a, b, c = (part.vertices[part.faces[:, k]] for k in range(3))
+    found: np.ndarray = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2.0
+    return found
+
+
+# --- material files ----------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rest", "name", "options"),
+    [
+        ("wood.png", "wood.png", {}),
+        ("-s 2 2 1 wood.png", "wood.png", {"s": "2 2 1"}),
+        ("-s 2 my wood tex.png", "my wood tex.png", {"s": "2"}),
+        ("-S 2 2 -o 0.5 -clamp on wood 2.png", "wood 2.png", {"s": "2 2", "o": "0.5", "clamp": "on"}),
+        ("-bm 0.5 -imfchan r bump.png", "bump.png", {"bm": "0.5", "imfchan": "r"}),
+        ("bump.png -bm -1e-1", "bump.png", {"bm": "-1e-1"}),
+        ("-blendu off -blendv on -cc off -mm 0.1 .8 -texres 64 -t 1 1 1 -boost 2 w.png", "w.png", None),
+        ("-type cube_top -colorspace linear w.png", "w.png", {"type": "cube_top", "colorspace": "linear"}),
+        ("-quality 3 high res.png", "high res.png", {"quality": ""}),
+        ("a -s.png", "a -s.png", {}),
+        ("C:\\maps\\-s 1\\w.png", "C:\\maps\\-s 1\\w.png", {}),
+        ("-s 2 2 2 7", "7", {"s": "2 2 2"}),
+        ("-s 2 2 2", None, {}),
+    ],
+)
+def test_options_and_names_of_maps(rest: str, name: str | None, options: dict[str, str] | None) -> None:
+    use = map_of(rest)
+    assert (use and use.name) == name
+    assert use is None or options is None or use.options == options
+
+
+@pytest.mark.parametrize("line", ["map_Kd -s 2 3 1 -o 0.5 0.25 my wood.png", "map_Kd my wood.png -o .5 .25 -s 2 3"])
+def test_scale_and_offset_of_a_map_move_texture_coordinates(tmp_path: Path, line: str) -> None:
+    pixels = picture(tmp_path, "my wood.png")
+    part, notes = material(tmp_path, "Kd 1 1 1", line)
+    assert notes == [] and part.uvs is not None and same(part.surface.texture, pixels)
+    corners = part.vertices[:, :2] * (2.0, 3.0) + (0.5, 0.25)
+    np.testing.assert_allclose(part.uvs, corners)
+
+
+def test_maps_of_a_material_lie_at_the_same_place(tmp_path: Path) -> None:
+    picture(tmp_path, "wood.png")
+    part, notes = material(tmp_path, "map_Kd -s 2 2 wood.png", "map_d -s 2 2 wood.png", "map_Ke wood.png")
+    assert part.surface.emission is None and part.surface.texture is not None and part.surface.texture.shape[2] == 4
+    assert notes == ["map_Ke of the material 'm' lies elsewhere than its other maps (-s, -o); it is left out"]
+
+
+def test_values_and_channels_of_maps(tmp_path: Path) -> None:
+    pixels = picture(tmp_path, "wood.png")
+    part, notes = material(tmp_path, "map_Kd -mm 0.25 0.5 wood.png", "map_d -imfchan g wood.png")
+    assert notes == [] and part.surface.texture is not None
+    np.testing.assert_allclose(part.surface.texture[:, :, 3], pixels[:, :, 1], atol=1e-6)
+    seen = part.surface.texture[:, :, 3] > 0
+    np.testing.assert_allclose(part.surface.texture[seen][:, :3], (0.25 + 0.5 * pixels)[seen], atol=1e-6)
+
+
+def test_an_alpha_that_nothing_makes_an_opacity_is_said(tmp_path: Path) -> None:
+    picture(tmp_path, "leaf.png", np.full((4, 4, 4), 128))
+    part, notes = material(tmp_path, "map_Kd leaf.png")
+    assert part.surface.texture is not None and part.surface.texture.shape == (4, 4, 3)
+    assert notes == ["the alpha of 'leaf.png' is left out: no map_d makes it an opacity"]
+    part, notes = material(tmp_path, "map_Kd leaf.png", "map_d leaf.png")
+    assert (
+        notes == [] and part.surface.texture is not None and part.surface.texture[0, 0, 3] == pytest.approx(128 / 255)
+    )
+
+
+def test_clamped_textures_are_said_where_they_would_repeat(tmp_path: Path) -> None:
+    picture(tmp_path, "wood.png")
+    assert material(tmp_path, "map_Kd -clamp on wood.png")[1] == []
+    said = " has textures that are not to repeat beyond their edges (-clamp); here they do"
+    assert material(tmp_path, "map_Kd -clamp on -s 2 2 wood.png")[1] == [said]
+
+
+def test_several_material_files(tmp_path: Path) -> None:
+    faces = "usemtl red\nf 1 2 3\nusemtl blue\nf 1 3 4\n"
+    red, blue = "newmtl red\nKd 0.8 0.1 0.1\n", "newmtl blue\nKd 0.1 0.1 0.8\nnewmtl red\nKd 0 1 0\n"
+    (tmp_path / "my red.mtl").write_text(red)
+    for line in (
+        "mtllib red.mtl blue.mtl\n",
+        "mtllib red.mtl\nmtllib blue.mtl # and more\n",
+        "mtllib my red.mtl\nmtllib blue.mtl\n",
+        "mtllib my red.mtl blue.mtl\n",
+        'mtllib "my red.mtl"\nmtllib .\\blue.mtl\n',
+    ):
+        parts, notes = read(tmp_path, line + POINTS + faces, red=red, blue=blue)
+        colors = [list(part.surface.color) for part in parts if part.surface.color is not None]
+        assert notes == [] and colors == [pytest.approx([0.8, 0.1, 0.1]), pytest.approx([0.1, 0.1, 0.8])]
+    _, notes = read(tmp_path, "mtllib gone.mtl blue.mtl\n" + POINTS + faces, blue="newmtl blue\nKd 0 0 1\n")
+    assert notes == [
+        " names the material file 'gone.mtl', which is missing; neutral grey is used instead",
+        " uses the material 'red', which its .mtl file lacks; neutral grey is used instead",
+    ]
+
+
+def test_comments_may_stand_anywhere(tmp_path: Path) -> None:
+    pixels = picture(tmp_path, "wood #2.png")
+    part, notes = material(tmp_path, "# a colour", "  Kd 0.8 0.1 0.1# red", "d 0.5 # thin", "")
+    assert notes == [] and part.surface.color == pytest.approx([0.8, 0.1, 0.1, 0.5])
+    part, notes = material(tmp_path, "map_Kd wood #2.png")
+    assert notes == [] and same(part.surface.texture, pixels)
+    lines = [line + f" # note {k} 1/1" for k, line in enumerate((MAPPED + USED + FACE).splitlines())]
+    obj = "# made with C:\\tools\\\n" + "\n".join(lines) + "\n   f 1/1 \\\n 2/2 3/3\n"
+    part, notes = material(tmp_path, "Kd 1 0 0", obj=obj)
+    assert notes == [] and areas(part).sum() == pytest.approx(1.5) and part.surface.color is not None
+
+
+def test_names_of_materials_may_hold_blanks_and_signs(tmp_path: Path) -> None:
+    mtl = "newmtl Material  #1\nKd 1 0 0\nnewmtl Material #2\nKd 0 0 1\nnewmtl my wood # brown\nKd 0 1 0\n"
+    faces = "usemtl Material #1\nf 1 2 3\nusemtl Material #2\nf 1 3 4\nusemtl my  wood\nf 1 2 4\n"
+    parts, notes = read(tmp_path, "mtllib a.mtl\n" + POINTS + faces, a=mtl)
+    assert notes == [] and [list(part.surface.color) for part in parts if part.surface.color is not None] == [
+        [1.0, 0.0, 0.0],
+        [0.0, 0.0, 1.0],
+        [0.0, 1.0, 0.0],
+    ]
+
+
+def test_tr_without_d_is_transparency_and_said_to_be_ambiguous(tmp_path: Path) -> None:
+    part, (note,) = material(tmp_path, "Kd 0.8 0.1 0.1", "Tr 0.7")
+    assert part.surface.color == pytest.approx([0.8, 0.1, 0.1, 0.3])
+    assert note.startswith(
+        "the material 'm' has Tr 0.7 and no d: it is taken for transparency, which makes its opacity 0.3;"
+    )
+    for lines in (["Tr 0"], ["d 1"], ["d 1", "Tr 0"], ["d 1", "Tr 1"]):
+        part, notes = material(tmp_path, "Kd 0.8 0.1 0.1", *lines)
+        assert notes == [] and part.surface.color == pytest.approx([0.8, 0.1, 0.1])
+    part, notes = material(tmp_path, "Kd 0.8 0.1 0.1", "d 0.3", "Tr 0.9")
+    assert part.surface.color is not None and part.surface.color[3] == pytest.approx(0.3)
+    assert notes == ["the material 'm' has Tr 0.9 beside d 0.3, which it contradicts; d is taken for its opacity"]
+    assert material(tmp_path, "d 0.3")[0].surface.color == pytest.approx([0.5, 0.5, 0.5, 0.3])
+
+
+def test_roughness_and_metallic(tmp_path: Path) -> None:
+    part, notes = material(tmp_path, "Kd 1 1 1", "Pr 0.25", "Pm 1")
+    assert notes == [] and (part.surface.roughness, part.surface.metallic) == (0.25, 1.0)
+    pixels = picture(tmp_path, "rm.png")
+    part, notes = material(tmp_path, "Pr 0.25", "map_Pr -imfchan g rm.png", "map_Pm -imfchan b -mm 0 0.5 rm.png")
+    assert part.surface.roughness == pytest.approx(pixels[:, :, 1].mean(), abs=1e-6)
+    assert part.surface.metallic == pytest.approx(pixels[:, :, 2].mean() / 2.0, abs=1e-6)
+    assert notes == ["textures of roughness and metallic are replaced by their means"]
+
+
+def test_what_is_there_twice_is_said(tmp_path: Path) -> None:
+    part, notes = material(tmp_path, "Kd 1 0 0", "Kd 0 1 0 0.5", "d 1", "d 1", "newmtl m", "Kd 0 0 1")
+    assert part.surface.color == pytest.approx([0.0, 1.0, 0.0])
+    assert notes == [
+        "a.mtl has the material 'm' more than once; the first counts",
+        "earlier material statement 'Kd' is left out",
+        "fourth number of 'Kd' is left out",
+    ]
+
+
+def test_a_material_without_library_is_said(tmp_path: Path) -> None:
+    _, notes = read(tmp_path, POINTS + "usemtl wood\nf 1 2 3\nusemtl paint\nf 1 3 4\n")
+    assert notes == [" uses materials and names no material file (mtllib); neutral grey is used instead"]
+
+
+# --- what OBJ files have ----------------------------------------
+
+
+def test_colors_of_vertices_times_the_color_of_the_material(tmp_path: Path) -> None:
+    colored = "".join(f"v {x} {y} 0 {x} {y} 0.5\n" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    for kd, said in ((1.0, []), (0.5, ["colours of vertices are multiplied by the Kd of their material"])):
+        part, notes = material(tmp_path, f"Kd {kd} {kd} {kd}", "Tr 0", obj=colored + USED + "f 1 2 3 4\n")
+        at = part.vertices[part.faces]
+        expected = srgb_to_linear(np.concatenate([at[:, :, :2], np.full_like(at[:, :, :1], 0.5)], axis=2))
+        assert notes == said and part.colors == pytest.approx(expected, abs=1e-6)
+        assert part.surface.color == pytest.approx([kd] * 3)
+    picture(tmp_path, "wood.png")
+    part, notes = material(tmp_path, "map_Kd wood.png", obj=colored + MAPPED.replace(POINTS, "") + USED + FACE)
+    assert part.colors is None and notes == ["colours of vertices are left out where there is a texture"]
+    assert material(tmp_path, "map_Kd wood.png", obj=MAPPED.replace(" 0\n", " 0 1 1 1\n") + USED + FACE)[1] == []
+
+
+@pytest.mark.parametrize(
+    ("rest", "color", "said"),
+    [
+        ("0.2 0.4 0.6", (0.2, 0.4, 0.6), ""),
+        ("51 102 153", (0.2, 0.4, 0.6), ""),
+        ("0.2 0.4 0.6 1", (0.2, 0.4, 0.6), ""),
+        ("0.2 0.4 0.6 0.5", (0.2, 0.4, 0.6), "opacities of vertices, the seventh number of 'v' is left out"),
+        ("1", None, ""),
+        ("2.5", None, "weights of vertices, the fourth number of 'v' is left out"),
+    ],
+)
+def test_numbers_after_the_coordinates(
+    tmp_path: Path, rest: str, color: tuple[float, float, float] | None, said: str
+) -> None:
+    (part,), notes = read(tmp_path, "".join(f"v {k % 2} {k // 2} 0 {rest}\n" for k in range(3)) + "f 1 2 3\n")
+    assert notes == ([said] if said else [])
+    assert (part.colors is None) == (color is None)
+    if color is not None and part.colors is not None:
+        assert linear_to_srgb(part.colors[0, 0].astype(np.float32)) == pytest.approx(color, abs=1e-4)
+
+
+def test_zbrush_keeps_colors_in_comments(tmp_path: Path) -> None:
+    (part,), notes = read(tmp_path, POINTS + "#MRGB ffff0000ff00ff00\n#MRGB ff0000ffffffffff\nf 1 2 3 4\n")
+    assert notes == [] and part.colors is not None
+    assert part.colors[0].tolist() == [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+def test_a_face_without_smoothing_is_flat(tmp_path: Path) -> None:
+    roof = "v 0 0 0\nv 1 0 0.2\nv 1 1 0.2\nv 0 1 0\nv 2 0 0\nv 2 1 0\n"
+    faces = "f 1 2 3 4\nf 2 5 6 3\n"
+    flat, smooth = (import_roof(tmp_path, roof + said + faces) for said in ("s off\n", ""))
+    assert len(np.unique(flat.round(4), axis=0)) == 2 and len(np.unique(smooth.round(4), axis=0)) > 2
+    assert np.array_equal(import_roof(tmp_path, roof + "s 0 # off\n" + faces), flat)
+    _, notes = read(tmp_path, roof + "s 1\n" + faces)
+    assert notes == ["smoothing groups are left out: its normals are made, with creases at sharp edges"]
+    normals = "vn 0 0 1\ns 1\nf 1//1 2//1 3//1 4//1\n"
+    assert read(tmp_path, roof + normals)[1] == []
+
+
+def import_roof(folder: Path, obj: str) -> np.ndarray:
+    """The normals (V, 3) of an imported OBJ."""
+    (folder / "roof.obj").write_text(obj)
+    return import_object(folder / "roof.obj").mesh.normals
+
+
+def test_concave_polygons_keep_their_area(tmp_path: Path) -> None:
+    shape = ((0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3))
+    points = "".join(f"v {x} {y} {z}\n" for z in (0, 0.4) for x, y in shape)
+    sides = "".join(f"f {k + 1} {(k + 1) % 8 + 1} {(k + 1) % 8 + 9} {k + 9}\n" for k in range(8))
+    (part,), notes = read(tmp_path, points + "f 8 7 6 5 4 3 2 1\nf 9 10 11 12 13 14 15 16\n" + sides)
+    assert notes == [] and areas(part).sum() == pytest.approx(20.4) and len(part.faces) == 28
+
+
+def test_indices_of_every_form(tmp_path: Path) -> None:
+    normals = "vn 0 0 1\nvn 0 0 1\n"
+    obj = (
+        MAPPED + normals + "f 1/1/1 2/2/2 3/3/1\nf 1/1 3/3 4/4\nf 1//1 2//2 4//1\nfo -4/-4/-1 -3/-3/-1 -1/-1\nf 2 3 4\n"
+    )
+    parts, notes = read(tmp_path, obj + "v 9 9 9\nf -2 -3 -4\n")
+    assert notes == [] and [len(part.faces) for part in parts] == [3, 3]
+    bare, mapped = parts
+    assert bare.uvs is None and mapped.uvs is not None
+    np.testing.assert_allclose(mapped.uvs[mapped.faces], mapped.vertices[mapped.faces][:, :, :2])
+    assert bare.vertices[bare.faces[-1]].tolist() == [[0, 1, 0], [1, 1, 0], [1, 0, 0]]
+
+
+LEFT = {
+    "l 1 2 3": "lines, statement 'l' is left out",
+    "p 1": "points, statement 'p' is left out",
+    "curv 0 1 1 2": "curves and curved surfaces, statement 'curv' is left out",
+    "cstype bezier": "curves and curved surfaces, statement 'cstype' is left out",
+    "vp 0.5": "curves and curved surfaces, statement 'vp' is left out",
+    "lod 3": "statement 'lod' is left out",
+    "bevel on": "statement 'bevel' is left out",
+    "usemap brick": "statement 'usemap' is left out",
+    "call more.obj": "statement 'call' is left out",
+    "vx 1 2 3": "statement 'vx' is left out",
+    "bevel off": "",
+    "lod 0": "",
+    "g side top": "",
+    "o box": "",
+}
+"""Statements of OBJ files, and what is said of them."""
+SAID = {
+    "Ka 0.2 0.2 0.2": "",
+    "Ks 0.5 0.5 0.5": "",
+    "Ns 250": "",
+    "Ni 1.45": "",
+    "illum 2": "",
+    "illum 7": "illumination model '7' is left out",
+    "Tf 1 1 1": "",
+    "Tf 1 0.5 0.5": "material statement 'Tf' is left out",
+    "Pc 0": "",
+    "Pcr 0.03": "material statement 'Pcr' is left out",
+    "Ps 0.5": "material statement 'Ps' is left out",
+    "aniso 0.0": "",
+    "anisor 0.5": "material statement 'anisor' is left out",
+    "map_Ks gloss.png": "material statement 'map_Ks' is left out",
+    "map_Ka wood.png": "",
+    "disp -mm 0 2 high.png": "material statement 'disp' is left out",
+    "decal sticker.png": "material statement 'decal' is left out",
+    "refl -type sphere sky.png": "material statement 'refl' is left out",
+    "gloss_factor 3": "material statement 'gloss_factor' is left out",
+    "Pr 0.5": "",
+    "Ke 1 1 1": "",
+    "Ke black": "the emission 'black' is no colour; it is left out",
+}
+"""Lines of material files, and what is said of them."""
+OPTIONS = {
+    "-s 2 2": "",
+    "-o 0.5": "",
+    "-mm 0 1": "",
+    "-blendu on": "",
+    "-cc off": "",
+    "-blendv off": "texture option '-blendv of map_Kd' is left out",
+    "-t 0 0 0": "",
+    "-t 1 1": "texture option '-t of map_Kd' is left out",
+    "-texres 64": "texture option '-texres of map_Kd' is left out",
+    "-bm 2": "texture option '-bm of map_Kd' is left out",
+    "-imfchan g": "texture option '-imfchan of map_Kd' is left out",
+    "-colorspace sRGB": "",
+    "-boost 3": "texture option '-boost of map_Kd' is left out",
+}
+"""Options of a texture, and what is said of them."""
+
+
+def chosen(lines: dict[str, str]) -> st.SearchStrategy[list[str]]:
+    """Some of the lines, of each keyword one at most."""
+    return st.lists(st.sampled_from(sorted(lines)), unique_by=lambda line: line.split()[0], max_size=6)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a texture."""
+    found = tmp_path_factory.mktemp("obj")
+    picture(found, "wood.png")
+    return found
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    chosen(LEFT), chosen(SAID), chosen(OPTIONS), st.sampled_from(["", " # so", "\t#1"]), st.sampled_from(["\n", "\r\n"])
+)
+def test_whatever_a_file_has_is_read_or_named(
+    folder: Path, statements: list[str], lines: list[str], options: list[str], comment: str, newline: str
+) -> None:
+    words = ("newmtl m", "Kd 1 1 1", *lines, " ".join(("map_Kd", *options, "wood.png")))
+    (folder / "a.mtl").write_bytes(newline.join(f"{line}{comment}" for line in words).encode())
+    whole = [*MAPPED.splitlines(), *USED.splitlines(), *statements, *FACE.splitlines()]
+    (folder / "a.obj").write_bytes((newline.join(f"{line}{comment}" for line in whole) + newline).encode())
+    (part,), notes = read_parts(folder / "a.obj", (folder / "a.obj").read_bytes())
+    said = [*(LEFT[one] for one in statements), *(SAID[one] for one in lines), *(OPTIONS[one] for one in options)]
+    if "Pc 0" in lines:
+        said = [one for one in said if "Pcr" not in one]
+    if any("no colour" in one for one in said):  # the maps lie at the same place all the same
+        assert part.surface.emission is None
+    assert sorted(notes) == sorted(f"a.obj: {one}" for one in said if one)
+    assert part.surface.texture is not None and areas(part).sum() == pytest.approx(1.0)
+    assert part.surface.roughness == (0.5 if "Pr 0.5" in lines else None)
+    scale, offset = (2.0, 2.0) if "-s 2 2" in options else (1.0, 1.0), (0.5 if "-o 0.5" in options else 0.0, 0.0)
+    assert part.uvs == pytest.approx(part.vertices[:, :2] * np.array(scale) + np.array(offset))
