@@ -10,7 +10,9 @@ import json
 import math
 import os
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -41,6 +43,31 @@ _KINDS = (
     (stat.S_ISCHR, "a device; name an ordinary file"),
     (stat.S_ISBLK, "a device; name an ordinary file"),
 )
+
+
+_ROOT: ContextVar[str | None] = ContextVar("the file that others are read for", default=None)
+_OPENED: dict[str, dict[str, None]] = {}
+
+
+@contextmanager
+def reading(path: Path | str) -> Iterator[None]:
+    """Files that are opened inside are parts of this one (see `opened_for`), unless it is part of another itself."""
+    token = _ROOT.set(_ROOT.get() or os.path.abspath(path))
+    try:
+        yield
+    finally:
+        _ROOT.reset(token)
+
+
+def note_opened(path: Path | str) -> None:
+    """Remember that a file was read; `open_regular` does it itself."""
+    own = os.path.abspath(path)
+    _OPENED.setdefault(_ROOT.get() or own, {})[own] = None
+
+
+def opened_for(path: Path | str) -> list[str]:
+    """Return the files that this process has read for a file: itself, and what it names, in order, by full path."""
+    return list(_OPENED.get(os.path.abspath(path), {}))
 
 
 def either(endings: Sequence[str]) -> str:
@@ -97,10 +124,12 @@ def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     try:
         _check(path, os.fstat(descriptor), expected, limit)
-        return os.fdopen(descriptor, "rb")
+        file = os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
         raise
+    note_opened(path)
+    return file
 
 
 def read_bytes(path: Path, expected: str, limit: int) -> bytes:

@@ -1,18 +1,23 @@
-"""Whether `explain` tells planted failures, and nothing where there is none.
+"""Whether `explain` tells planted failures, and nothing where there is none; and whether its intervals hold.
 
-    python benchmarks/explain.py [--seeds 10] [--rows 10000] [--noise 0.05]
+    python benchmarks/explain.py [--seeds 10] [--rows 10000] [--noise 0.05] [--samples 300]
 
 Each law makes a model wrong; a share of the answers is turned round. A law counts as told where the rules name its
 parameters, no other one, and its bounds to a twentieth of their range.
+
+Then answers, yes or no, are drawn from known accuracies, and it is counted in how many samples the interval of what
+decides has the true share, of the parameters that decide and of one that does not.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 
 import numpy as np
 
+from advsearch.explanations.importance import find_importance
 from advsearch.explanations.observations import Factor, Mask, Numbers, Observations
 from advsearch.explanations.rules import CountedRule, find_rules
 
@@ -64,12 +69,57 @@ def is_told(law: str, rules: list[CountedRule]) -> bool:
     return True
 
 
+ACCURACIES = {
+    "5, 12, 22 % by distance": lambda x: (
+        0.05 + 0.17 * (x[:, 0] < 1 / 3) + 0.07 * ((x[:, 0] >= 1 / 3) & (x[:, 0] < 2 / 3))
+    ),
+    "steep in one": lambda x: 1.0 / (1.0 + np.exp(-10.0 * (x[:, 0] - 0.5))),
+    "two of them": lambda x: 1.0 / (1.0 + np.exp(-4.0 * (x[:, 0] - 0.5) - 3.0 * (x[:, 1] - 0.5))),
+    "one of two, not both": lambda x: np.where((x[:, 0] > 0.5) != (x[:, 1] > 0.5), 0.9, 0.15),
+    "rarely right": lambda x: 0.02 + 0.1 * (x[:, 0] > 0.7),
+    "nearly certain": lambda x: np.where(x[:, 0] > 0.6, 0.02, 0.98),
+    "end-on and from the side": lambda x: np.where(np.abs(np.cos(2.0 * np.pi * x[:, 0])) > 0.8, 0.28, 0.71),
+}
+"""Accuracies over three parameters in [0, 1], (n, 3) to (n,); the third decides nothing."""
+
+
+def true_shares(accuracy: Callable[[Numbers], Numbers], rows: int) -> list[float]:
+    """The shares of the three parameters with the parts that so many rows have, from a million points."""
+    x = np.random.default_rng(0).random((1_000_000, 3))
+    at, parts = accuracy(x), min(20, max(2, round(rows ** (1 / 3))))
+    found = []
+    for column in x.T:
+        means = np.array([at[np.minimum((column * parts).astype(int), parts - 1) == k].mean() for k in range(parts)])
+        found.append(float(means.var() / (at.mean() * (1.0 - at.mean()))))
+    return [one if one > 1e-4 else 0.0 for one in found]
+
+
+def coverage(name: str, rows: int, samples: int) -> str:
+    """In how many samples the intervals have the true shares, and how wide they are."""
+    accuracy = ACCURACIES[name]
+    true, hit, width = true_shares(accuracy, rows), np.zeros(3), np.zeros(3)
+    factors = tuple(Factor(one) for one in ("x", "y", "z"))
+    for seed in range(samples):
+        generator = np.random.default_rng(seed)
+        x = generator.random((rows, 3))
+        right = generator.random(rows) < accuracy(x)
+        for one in find_importance(Observations(factors, x, right)):
+            if len(one.places) == 1:
+                (place,), (low, high) = one.places, one.interval
+                hit[place] += low <= true[place] <= high
+                width[place] += high - low
+    each = zip(true, hit / samples, 50 * width / samples, strict=True)
+    told = ", ".join(f"{100 * share:.1f} %: {held:.1%} +-{half:.0f}" for share, held, half in each)
+    return f"{name:26s} {rows:6d} rows, true share: covered +-points  {told}"
+
+
 def main() -> None:
-    """Print a row for each law."""
+    """Print a row for each law, then one for each accuracy and number of rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--rows", type=int, default=10_000)
     parser.add_argument("--noise", type=float, default=0.05)
+    parser.add_argument("--samples", type=int, default=300)
     args = parser.parse_args()
     for law in LAWS:
         begun, told, rules = time.process_time(), 0, 0
@@ -78,10 +128,13 @@ def main() -> None:
             values = generator.uniform(LOW, HIGH, (args.rows, len(FACTORS)))
             values[:, 4:] = values[:, 4:].astype(int)
             right = ~(wrong(law, values) ^ (generator.random(args.rows) < args.noise))
-            found = find_rules(*Observations(FACTORS, values, right).halves(seed), seed=seed)
+            found = find_rules(*Observations(FACTORS, values, right).halves(seed), seed=seed).told
             told, rules = told + is_told(law, found), rules + len(found)
         seconds = (time.process_time() - begun) / args.seeds
-        print(f"{law:26s} told {told} of {args.seeds}, {rules} rules in all, {seconds:.1f} CPU s each")
+        print(f"{law:26s} told {told} of {args.seeds}, {rules} rules in all, {seconds:.1f} CPU s each", flush=True)
+    for name in ACCURACIES:
+        for rows in (120, 1000):
+            print(coverage(name, rows, args.samples), flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from advsearch.cli.attack import answer
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import default_name
-from advsearch.runs.results.attack import AttackSummary, UsualAnswer
+from advsearch.runs.results.attack import AttackSummary, PicturedAnswer
 from advsearch.runs.summary import attack_of
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -67,7 +67,7 @@ def _fitted(picture: Image.Image) -> Image.Image:
     return square
 
 
-def _said(answer: UsualAnswer | None) -> str:
+def _said(answer: PicturedAnswer | None) -> str:
     return f"{answer.label}, {percent(answer.probability)}" if answer else "no answer"
 
 

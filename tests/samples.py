@@ -129,9 +129,10 @@ HIGH = {"parameter": "camera.elevation", "unit": "degrees", "over": 60.0, "at_mo
 EXPLAIN: dict[str, Any] = {
     **RUN, "run": "runs/mug-explain-001", "controls": ["camera"], "right": 396, "of": 600, "interval": [0.62, 0.7],
     "sweeps": ["runs/mug-sweep-001"], "object": "mug", "model": "reference", "parameters": ["camera.elevation"],
-    "rules": [{**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "confirmed": COUNTED}], "explained": 0.81,
+    "rules": [{**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "confirmed": COUNTED}],
+    "not_told": {**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "chance": 0.03, "asked": 0.01, "rows": 460},
     "importance": [{"parameters": ["camera.elevation", "light.power"], "share": 0.9, "interval": [0.8, 1.0],
-                    "total": 0.9, "total_interval": [0.8, 1.0]}],
+                    "parts": 36}],
     "envelope": {**COUNTED, "conditions": [HIGH], "accuracy": 0.9, "held": True}, "pairs": [], "renders": 0,
 }  # fmt: skip
 SHARE = {"accuracy": 0.75, "interval": [0.35, 0.97], "right": 6, "count": 8}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -27,16 +28,16 @@ from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.explanations.clusters import find_clusters
 from advsearch.explanations.envelope import Envelope, find_envelope
-from advsearch.explanations.importance import Importance, find_importance
+from advsearch.explanations.importance import FactorWeight, find_importance
 from advsearch.explanations.observations import Factor, Observations, observed
 from advsearch.explanations.renders import along, inside, lies_inside
-from advsearch.explanations.rules import Conditions, CountedRule, RuleCondition, covered, find_rules
+from advsearch.explanations.rules import CHANCE, Conditions, CountedRule, RuleCondition, covered, find_rules
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.progress import NullProgress, Progress
 from advsearch.recipes.table import Answered, rows_of
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, find_run
-from advsearch.runs.results.base import INTERRUPTED, Interval
+from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.explain import (
     ConditionRow,
     EnvelopeRow,
@@ -46,6 +47,7 @@ from advsearch.runs.results.explain import (
     NearestRight,
     ParameterWeight,
     RightOf,
+    RuleNotTold,
     RuleRow,
 )
 from advsearch.runs.results.recipe import RecipeResult
@@ -99,9 +101,10 @@ def explain_from_config(
     found = observed([(_shown(row), row.correct) for row in rows])
     choosing, counting = found.halves(config.seed)
     progress.stage("seeking rules on one half of the rows")
-    rules = find_rules(choosing, counting, config.seed)
+    sought = find_rules(choosing, counting, config.seed)
+    rules = sought.told
     progress.stage("measuring which parameters matter")
-    importance = find_importance(choosing, counting, config.seed)
+    importance = find_importance(found)
     envelope = find_envelope(choosing, counting, config.accuracy)
     with RunDirectory.of(config, resumed) as run:
         renders = _Renders(run.path, progress, config, found)
@@ -122,8 +125,8 @@ def explain_from_config(
             total=len(found),
             interval=clopper_pearson(right, len(found)),
             rules=table,
-            explained=None if importance is None else importance.explained,
-            importance=[] if importance is None else _weights(importance, found.factors),
+            not_told=None if sought.next is None else _not_told(sought.next, found),
+            importance=_weights(importance, found.factors),
             envelope=None if envelope is None else _envelope_row(envelope, found.factors, config.accuracy),
             pairs=pairs,
             pairs_sought=min(config.pairs, len(found) - right),
@@ -176,22 +179,13 @@ def _together(names: Iterator[str] | Sequence[str]) -> str:
     return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
 
 
-def _cautions(rows: Sequence[Answered], importance: Importance | None) -> list[str]:
+def _cautions(rows: Sequence[Answered], importance: Sequence[FactorWeight]) -> list[str]:
     right = sum(row.correct for row in rows)
     if right in (0, len(rows)):
         return [f"The model is {'right' if right else 'wrong'} in every row: there is nothing to tell apart."]
-    if importance is not None and not importance.weights:
-        return [_unexplained(importance.explained)]
+    if all(one.interval[0] <= 0.0 for one in importance):
+        return ["No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
     return []
-
-
-def _unexplained(share: float) -> str:
-    """Say of a small share of the variance that it is one; it is under 0 where the mean answer would have told more."""
-    if share > 0.0:
-        text = f"told {100 * share:.1f} % of the variance of the others"
-    else:
-        text = "told the others no better than how often they are right does"
-    return f"No importance is given: a forest that was fitted to some of the rows {text}."
 
 
 # ---- renders --------------------------------------------------------------------------------------------------------
@@ -442,18 +436,31 @@ def _condition_row(one: RuleCondition, factor: Factor) -> ConditionRow:
     )
 
 
-def _weights(importance: Importance, factors: Sequence[Factor]) -> list[ParameterWeight]:
+def _weights(importance: Sequence[FactorWeight], factors: Sequence[Factor]) -> list[ParameterWeight]:
     return [
         ParameterWeight(
             parameters=[factors[place].name for place in one.places],
             share=one.share,
-            interval=_between(one.share, one.half_width),
-            total=None if len(one.places) > 1 else one.total,
-            total_interval=None if len(one.places) > 1 else _between(one.total, one.total_half_width),
+            interval=one.interval,
+            parts=one.parts,
         )
-        for one in importance.weights
+        for one in importance
     ]
 
 
-def _between(middle: float, half_width: float) -> Interval:
-    return middle - half_width, middle + half_width
+def _not_told(rule: CountedRule, found: Observations) -> RuleNotTold:
+    times = rule.times_needed()
+    return RuleNotTold(
+        conditions=_condition_rows(rule.conditions, found.factors),
+        **vars(right_of(rule.right, rule.of)),
+        elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
+        chance=rule.chance,
+        asked=CHANCE,
+        rows=None if times is None else round_up(times * len(found)),
+    )
+
+
+def round_up(rows: float) -> int:
+    """Return a number of rows with two digits that mean something: 173.2 becomes 180."""
+    step: int = 10 ** max(0, math.floor(math.log10(rows)) - 1)
+    return math.ceil(rows / step) * step

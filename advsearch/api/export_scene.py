@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import advsearch
+from advsearch import seeds
 from advsearch.api.attack import judged_alone, problem_from_config
 from advsearch.api.replay import kept_answer
 from advsearch.config import AttackConfig
@@ -72,7 +73,9 @@ def answer_of(run: str | Path) -> AnsweredRun:
     if summary.adversarial is None:
         raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to export")
     problem, _ = problem_from_config(judged_alone(AttackConfig.from_yaml(folder / CONFIG)))
-    return AnsweredRun(folder, problem, problem.whole(kept_answer(folder, problem)))
+    trial = summary.adversarial.trial  # where conditions vary, those of the picture that the run keeps
+    draw = None if trial is None else seeds.stream(problem.seed, "verification", trial)
+    return AnsweredRun(folder, problem, problem.whole(kept_answer(folder, problem), draw))
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:

@@ -236,5 +236,5 @@ def _row(way: Way, condition: RetrialCondition, retrials: Retrials, u: torch.Ten
         condition=way.text,
         ending=checked.ending.value,
         clean=control_group(retrials.clean(condition), condition.spp),
-        verified=verified_rate(checked.adversarial, checked.adversarial_trials),
+        verified=verified_rate(checked),
     )

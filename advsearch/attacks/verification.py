@@ -134,6 +134,8 @@ class Verification:
         clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
             group is the shorter.
         renders: renders spent here.
+        outcomes: of each trial of the second group, whether it is a success; None where it does not count, as under
+            its conditions the clean configuration is wrong.
     """
 
     ending: Ending
@@ -144,6 +146,18 @@ class Verification:
     clean_trials: tuple[Judgement, ...]
     adversarial_trials: tuple[Judgement, ...]
     renders: int
+    outcomes: tuple[bool | None, ...]
+
+    @property
+    def counting(self) -> tuple[Judgement, ...]:
+        """The trials that the rate is of; all of them where none counts."""
+        trials = zip(self.adversarial_trials, self.outcomes, strict=True)
+        return tuple(trial for trial, outcome in trials if outcome is not None) or self.adversarial_trials
+
+    @property
+    def successes(self) -> tuple[Judgement, ...]:
+        """The trials that are a success."""
+        return tuple(trial for trial, outcome in zip(self.adversarial_trials, self.outcomes, strict=True) if outcome)
 
 
 def run_trials(
@@ -249,8 +263,12 @@ def verify(
 
     never = (lambda done: False) if not curtailed else lost
     adversarial = run_trials(render_trial, u, spp=spp, seed=seed, trials=trials, on_trial=on_trial, until=never)
-    counted = max(1, rule.counted(clean[: len(adversarial)]))
-    successes = sum(rule.succeeded(trial, beside) for trial, beside in zip(adversarial, clean, strict=False))
+    outcomes = tuple(
+        rule.succeeded(trial, beside) if beside.right or not rule.conditional else None
+        for trial, beside in zip(adversarial, clean, strict=False)
+    )
+    counted = max(1, len(outcomes) - outcomes.count(None))
+    successes = outcomes.count(True)
     verified = Trials(successes, counted, spp)
     ending = rule.verdict(claim, control, verified)
     reason = (
@@ -258,4 +276,4 @@ def verify(
         f"right in {control.successes} of {trials}."
     )
     renders = len(adversarial) + (trials if own else 0)
-    return Verification(ending, reason, u, control, verified, tuple(clean), adversarial, renders)
+    return Verification(ending, reason, u, control, verified, tuple(clean), adversarial, renders, outcomes)

@@ -27,7 +27,7 @@ def answer(result: ExplainResult) -> str:
         clusters_text,
         envelope_text,
         explain_text,
-        explained_text,
+        not_told_text,
         pair_text,
         pairs_text,
         rule_text,
@@ -38,8 +38,9 @@ def answer(result: ExplainResult) -> str:
 
     parts = [explain_text(result)]
     parts += [f"{number + 1}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules)]
+    parts += [not_told_text(result)] if result.not_told else []
     if result.importance:
-        heads = f"What decides (Sobol indices; {explained_text(result)} of the answers' variance are explained):"
+        heads = "What decides: share of the answers' variance, by which part of its values a parameter lies in"
         parts.append(f"{heads}\n{output.columns([list(WEIGHT_HEADS), *weight_rows(result)])}")
     parts.append(f"Envelope. {envelope_text(result)}")
     parts += [f"One thing changed. {pairs_text(result)}"] if result.pairs_sought else []

@@ -52,7 +52,7 @@ def answer(result: RegionResult) -> str:
         return "Stopped before the box was known.\n\n" + output.columns(cost)
     verdict = (
         f"The model is {result.verdict} in {result.same} of {result.samples} fresh samples of this box: "
-        f"with 95 % confidence in at least {100.0 * result.interval[0]:.1f} % of it."
+        f"with 95 % confidence in at least {percent(result.interval[0])} of it."
     )
     rows = [["parameter", "from", "to", "centre", "unit"]]
     rows += [[one.name, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.centre:.4g}", one.unit] for one in result.box]

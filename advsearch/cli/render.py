@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 from advsearch.cli import output
 from advsearch.cli.question import QuestionCommand
+from advsearch.report.phrases import seen_cells, seen_text
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.render import ClassAnswer, RenderResult
+    from advsearch.runs.results.render import RenderResult
 
 HELP = "render a picture of a scene, and say what the model sees in it"
 EXAMPLES = (
@@ -25,16 +26,12 @@ def text(result: RenderResult) -> str:
     lines += [f"{result.answered}: with the answers drawn in"] if result.answered else []
     lines += [""]
     if len(result.views) == 1:
-        rows = [[one.label, _percent(one)] for one in result.views[0].answers]
+        rows = [seen_cells(result.task, one) for one in result.views[0].answers]
         return "\n".join([*lines, f"Model {result.model} sees", output.columns(rows)])
     rows = [["azimuth", f"model {result.model} sees"]]
     for view in result.views:
-        rows.append([f"{view.azimuth:g}", ", ".join(f"{one.label} {_percent(one)}".strip() for one in view.answers)])
+        rows.append([f"{view.azimuth:g}", "; ".join(seen_text(result.task, one) for one in view.answers)])
     return "\n".join([*lines, output.columns(rows)])
-
-
-def _percent(answer: ClassAnswer) -> str:
-    return "" if answer.probability is None else f"{100 * answer.probability:.1f} %"
 
 
 COMMAND = QuestionCommand("render", text)

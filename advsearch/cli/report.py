@@ -144,9 +144,25 @@ def _run(folder: Path) -> EvidenceRun:
             command_line=f"advsearch run {folder / CONFIG}",
         )
     result = read_result(folder)
-    found = evidence_of(name, result, [*claims_of(result), *_photos(folder)], settings, made)
+    found = evidence_of(name, result, [*claims_of(result), *_photos(folder)], settings, made, _judged_by(settings))
     few = [QUICK] if _of_quick_recipe(folder) else []
     return found.model_copy(update={"excluded": [*few, *found.excluded]})
+
+
+def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
+    """The options of the task that a run was judged by; nothing of one that is not to be had here."""
+    from dataclasses import fields
+
+    from advsearch.options import FROM_RUN
+    from advsearch.tasks import make_task
+
+    given: Any = settings.get("task")
+    if given is None:
+        return {}
+    with suppress(AdvsearchError):
+        task = make_task(given)
+        return {one.name: getattr(task, one.name) for one in fields(task) if one.metadata != FROM_RUN}
+    return {}
 
 
 def _photos(folder: Path) -> list[Claim]:

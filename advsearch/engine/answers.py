@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from advsearch.described import Value
 from advsearch.engine.loading import PictureSettings, Scene
 from advsearch.engine.rendering import render, sight_of
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.report.phrases import seen_text
 from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Answer, Facts, Task
 
@@ -121,7 +123,7 @@ def _advice(task: Task, model: Model, scene: Scene, pictures: PictureSettings) -
     """What the model answers to a clean picture, and how to take the first of these for right."""
     looked = render(scene, model, task=task, spp=LOOK_SPP, **vars(pictures))
     answers = looked.views[0].answers
-    listed = ", ".join(f"{answer.label!r} {100 * (answer.probability or 0.0):.1f} %" for answer in answers)
+    listed = ", ".join(seen_text(task.name, replace(answer, label=repr(answer.label))) for answer in answers)
     return (
         f"model {model.name} calls a clean picture of it {listed}; name what is right, such as "
         f'`label="{_term(model, answers[0])}"`'

@@ -15,7 +15,14 @@ from advsearch.engine.record import Findings
 from advsearch.engine.rows import verified_rate
 from advsearch.engine.verifier import Verifier
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import DescribedValue, DifferentFailure, DifferentFailures, FailingShare
+from advsearch.runs.results.attack import (
+    DescribedValue,
+    DifferentFailure,
+    DifferentFailures,
+    FailingShare,
+    PicturedAnswer,
+)
+from advsearch.tasks import Judgement
 
 TRIED = 8
 """Different failures that are tried, at most: the first of the list."""
@@ -80,9 +87,14 @@ def _described(problem: Problem, findings: Findings, number: int, failure: Found
         configuration={name: DescribedValue.of(value) for name, value in problem.describe(failure.u).items()},
         objective=failure.objective,
         holds=None if checked is None else checked.ending is Ending.FOUND,
-        verified=None if checked is None else verified_rate(checked.adversarial, checked.adversarial_trials),
+        verified=None if checked is None else verified_rate(checked),
         picture=None if checked is None else f"images/{_picture(number)}.png",
+        pictured=None if checked is None else _pictured(checked.adversarial_trials[0]),
     )
+
+
+def _pictured(first: Judgement) -> PicturedAnswer:
+    return PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0)
 
 
 def _picture(number: int) -> str:

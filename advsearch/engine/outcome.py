@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
 from torch import Tensor
 
-from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
+from advsearch.engine.domains import domain_of
 from advsearch.engine.failures import described_failures, write_failures
-from advsearch.engine.pictures import write_artifacts, write_object, write_pictures
+from advsearch.engine.pictures import Shown, trial_to_show, write_artifacts, write_object, write_pictures
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -28,6 +27,7 @@ from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
 from advsearch.report.studies import search_axes
+from advsearch.report.wording import number_text
 from advsearch.runs import store
 from advsearch.runs.answer import write_answer
 from advsearch.runs.export import to_pandas
@@ -46,6 +46,7 @@ from advsearch.runs.results.attack import (
     NotFinite,
     ObjectiveValues,
     PathSegments,
+    PicturedAnswer,
     PredictionError,
     Printability,
     PrintCost,
@@ -54,23 +55,18 @@ from advsearch.runs.results.attack import (
     SharedWork,
     SmallestEpsilon,
     TriedObjective,
-    UsualAnswer,
     VerificationSamples,
     VerifiedRate,
 )
-from advsearch.runs.results.base import Formation, MovedValue
-from advsearch.scene.formation import to_8_bit
+from advsearch.runs.results.base import Formation, MovedValue, VariedValue
 from advsearch.tasks import Judgement
-from advsearch.tasks.base import mean, typical
+from advsearch.tasks.base import mean
 from advsearch.viewer.attack_page import write_report
 
 T = TypeVar("T")
 
 MOST_NUMBERS = 4096
 """Numbers of a distribution that a summary names, at most."""
-
-PICTURE_SPP = 16
-"""Samples a pixel of the pictures that are kept, unless verification needed more: they are what the model saw there."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,8 @@ class AttackResult:
         summary: what `summary.json` holds.
         run: the run directory, or None if it was not kept.
         u: (d,) the configuration that was verified; the start where nothing was searched.
-        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration.
+        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration, as in the trial that
+            the summary names; its `clean` has what the model says of it.
         adversarial: the same of `u`.
         artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w, 3) sRGB in [0, 1].
         search: the search's own log and claim.
@@ -168,54 +165,43 @@ def summarise(
     search = findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
-    verified = findings.sample_count is not None and not findings.interrupted  # whoever presses Ctrl-C is in a hurry
-    spp = max(PICTURE_SPP, findings.spp) if verified else PICTURE_SPP
-    noise = seeds.stream(problem.seed, "pictures")
-    stages.progress.stage("making the pictures and the report", hint=f"pictures of {spp} samples a pixel")
-    with torch.no_grad():
-        linear = {
-            "clean": problem.renderer.radiance(problem.whole(start), noise, spp),
-            "adversarial": problem.renderer.radiance(problem.whole(u), noise, spp),
-        }
-    clean, adversarial = (
-        to_8_bit(problem.space.picture(problem.whole(at), problem.renderer.formation.display(radiance)))
-        for at, radiance in zip((start, u), linear.values(), strict=True)
-    )
+    stages.progress.stage("making the pictures and the report")
+    trial = None if findings.interrupted else trial_to_show(findings)  # whoever presses Ctrl-C is in a hurry
+    clean, adversarial = (Shown.of(problem, findings, at, trial) for at in (start, u))
     space = problem.searched_space
     artifacts = space.artifacts(u)
     run = recorder.run
     warnings = [*warnings, *_remarks(findings, problem, recorder)]
     if run is not None:
-        write_pictures(run, problem, findings, linear, {"clean": clean, "adversarial": adversarial}, u)
+        write_pictures(run, problem, findings, {"clean": clean, "adversarial": adversarial})
         write_failures(run, problem, findings)
         write_artifacts(run, artifacts)
         write_object(run, problem, u)
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         write_answer(run.path, u.numpy())
-    summary = _summary(asked, problem, findings, clean, adversarial, u)
-    where = {"run": None if run is None else str(run.path), "warnings": warnings}
+    summary = _summary(asked, problem, findings, clean, adversarial)
+    kept = {"run": None if run is None else str(run.path), "warnings": warnings}
     shared = SharedWork.of_facts(recorder.ahead.facts, recorder.machines.known)
     summary = summary.model_copy(
-        update={**where, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
+        update={**kept, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
     )
     if run is not None:
         run.write_summary(summary)
         write_report(run.path)
         if not findings.interrupted:
             run.finish()
-    return AttackResult(summary, None if run is None else run.path, u, clean, adversarial, artifacts, search)
+    return AttackResult(
+        summary, None if run is None else run.path, u, clean.picture, adversarial.picture, artifacts, search
+    )
 
 
 # ---- the summary ----------------------------------------------------------------------------------------------------
 
 
-def _summary(
-    asked: Question, problem: Problem, findings: Findings, clean: Tensor, adversarial: Tensor, u: Tensor
-) -> AttackSummary:
+def _summary(asked: Question, problem: Problem, findings: Findings, clean: Shown, adversarial: Shown) -> AttackSummary:
     """All but where it is kept, how long it took and what there is to say."""
     task, search, baseline = problem.task, findings.search, findings.baseline
-    judgement = typical(findings.clean) if findings.clean else problem.judge(clean, problem.whole(problem.domain.start))
     controls = problem.searched_space.controls
     budgets = {bound.name: bound.budget for bound in controls}
     depth = problem.renderer.scene.max_depth
@@ -235,18 +221,18 @@ def _summary(
         goal=task.goal,
         target=list(task.target_names) or None,
         over=[bound.name for bound in problem.space.controls[len(controls) :]],
+        conditions=_conditions(problem),
         ending=_ending(findings, problem).value,
         image_formation=Formation.of(problem.renderer.formation),
         gradient_plan=problem.plan_summary(problem.plan),
         light_path_segments=PathSegments(search=problem.search_depth or depth, verification=depth),
         clean=CleanAnswer(
-            **vars(judgement.answer),
-            payload=judgement.payload,
-            correct=judgement.right,
+            **_answer(clean),
+            correct=clean.judgement.right,
             moved=[MovedValue.of(one) for one in problem.space.moved],
             control=_control(findings),
         ),
-        adversarial=_adversarial(problem, findings, adversarial, u),
+        adversarial=None if search is None else PicturedAnswer(**_answer(adversarial)),
         verified=_verified(findings.verification),
         tried_objective=TriedObjective(
             clean=_objective_over(findings.clean),
@@ -311,7 +297,7 @@ def _print_cost(problem: Problem, findings: Findings) -> PrintCost | None:
     verified, other, search = findings.verification, findings.unprinted_verification, findings.unprinted
     if verified is None or other is None or search is None:
         return None
-    ours, theirs = (verified_rate(one.adversarial, one.adversarial_trials) for one in (verified, other))
+    ours, theirs = (verified_rate(one) for one in (verified, other))
     return PrintCost(
         steps=len(search.history),
         margin_with=ours.margin,
@@ -327,14 +313,9 @@ def _alone(values: dict[str, T]) -> T | dict[str, T]:
     return next(iter(values.values())) if len(values) == 1 else values
 
 
-def _adversarial(problem: Problem, findings: Findings, picture: Tensor, u: Tensor) -> UsualAnswer | None:
-    """What the model usually answers on the search's answer."""
-    if findings.search is None:
-        return None
-    verification = findings.verification
-    trials = verification.adversarial_trials if verification else (problem.judge(picture, problem.whole(u)),)
-    usual = typical(trials)
-    return UsualAnswer(**vars(usual.answer), payload=usual.payload)
+def _answer(shown: Shown) -> dict[str, Any]:
+    """What the model says of a picture that is kept."""
+    return {**vars(shown.judgement.answer), "payload": shown.judgement.payload, "trial": shown.trial}
 
 
 def _control(findings: Findings) -> ControlGroup | None:
@@ -366,6 +347,30 @@ def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
         if name in names and isinstance(low, float) and isinstance(high, float) and low < high:
             given |= {"low": low, "high": high}
         found[name] = FoundValue.of(given)
+    return found
+
+
+def _conditions(problem: Problem) -> dict[str, VariedValue]:
+    """What the conditions are drawn from, of single numbers and names."""
+    found: dict[str, VariedValue] = {}
+    if problem.conditions is None:
+        return found
+    start = problem.whole(problem.domain.start)
+    for group, (block, _) in zip(problem.space.groups, domain_of(problem.space.controls).parts(), strict=True):
+        if group.size != 1 or group.begin < len(problem.domain.start):
+            continue
+        values, options = [], max(block.options, 1)
+        for share in [0.0, 1.0] if not block.options else [(k + 0.5) / options for k in range(options)]:
+            moved = start.clone()
+            moved[group.begin] = share
+            values.append(problem.space.describe(moved).get(group.name))
+        told = [one["value"] for one in values if one is not None]
+        unit = next((str(one["unit"]) for one in values if one is not None), "")
+        numbers = [float(one) for one in told if isinstance(one, (int, float))]
+        if numbers and not block.options:
+            found[group.name] = VariedValue(unit=unit, low=min(numbers), high=max(numbers))
+        elif told:
+            found[group.name] = VariedValue(unit=unit, names=[number_text(one) for one in told])
     return found
 
 
@@ -470,7 +475,7 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
     """Rates, and what the model answered in the trials that it got wrong."""
     if verification is None:
         return None
-    return verified_rate(verification.adversarial, verification.adversarial_trials)
+    return verified_rate(verification)
 
 
 def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[str]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,9 +19,10 @@ from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.scene.description import OBJECT
 from advsearch.scene.exporting.gltf import PosedMesh, posed, web_glb
+from advsearch.scene.formation import to_8_bit
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.simpler import simpler
-from advsearch.tasks import Mark
+from advsearch.tasks import Judgement, Mark
 
 MOST_FACES = 30_000
 """Faces of the meshes that are kept to turn; of more, as many are shown."""
@@ -29,33 +31,84 @@ NEAR = 2.0
 """How far from the object's middle another mesh may be to be shown with it, in the object's extent."""
 
 
-def write_pictures(
-    run: RunDirectory,
-    problem: Problem,
-    findings: Findings,
-    linear: dict[str, Tensor],
-    seen: dict[str, Tensor],
-    u: Tensor,
-) -> None:
+PICTURE_SPP = 16
+"""Samples a pixel of the pictures that are kept where nothing was tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """The picture of a configuration that is kept, and what is true of this picture alone.
+
+    Attributes:
+        whole: the configuration of the whole space, with the conditions of this picture.
+        radiance: (H, W, 3) linear.
+        picture: (H, W, 3) sRGB as the model sees it, 8-bit values in [0, 1].
+        judgement: what the task says of the model's answer to it.
+        trial: number of the trial that it is of; None where nothing was tried.
+    """
+
+    whole: Tensor
+    radiance: Tensor
+    picture: Tensor
+    judgement: Judgement
+    trial: int | None
+
+    @classmethod
+    def of(cls, problem: Problem, findings: Findings, u: Tensor, trial: int | None) -> Shown:
+        """Render the searched controls at `u` as they are in a trial; as the scene comes, where that is None."""
+        seed = seeds.stream(problem.seed, *(("pictures",) if trial is None else ("verification", trial)))
+        whole, spp = problem.whole(u, None if trial is None else seed), PICTURE_SPP if trial is None else findings.spp
+        with torch.no_grad():
+            radiance = problem.renderer.radiance(whole, seed, spp)
+            picture = to_8_bit(problem.space.picture(whole, problem.renderer.formation.display(radiance)))
+        return cls(whole, radiance, picture, problem.judge(picture, whole), trial)
+
+
+def trial_to_show(findings: Findings) -> int | None:
+    """Return the trial whose pictures are kept, of the clean scene and of the answer, which see the same conditions.
+
+    It is the first with the most frequent answer among the successes (else among the trials that count), if there is
+    one beside which the clean scene has its own most frequent answer. None where nothing was tried.
+    """
+    checked, clean = findings.verification, _labels(findings.clean)
+    if checked is None:
+        return clean.index(_usual(clean)) if clean else None
+    answers = _labels(checked.adversarial_trials)
+    usual, usual_clean = _usual(_labels(checked.successes or checked.counting)), _usual(clean)
+    ranks = [
+        (answer == usual and outcome is bool(checked.successes), answer == usual, beside == usual_clean)
+        for answer, outcome, beside in zip(answers, checked.outcomes, clean, strict=False)
+    ]
+    return ranks.index(max(ranks))
+
+
+def _labels(trials: Sequence[Judgement]) -> list[str]:
+    return [trial.answer.label for trial in trials]
+
+
+def _usual(labels: Sequence[str]) -> str:
+    """The most frequent label; the first of equals."""
+    return Counter(labels).most_common(1)[0][0]
+
+
+def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, shown: Mapping[str, Shown]) -> None:
     """Write the pictures of the clean and the adversarial scene, of their difference, of trials and of the search.
 
     Args:
         run: gets them.
         problem: that was attacked.
         findings: of the attack.
-        linear: (H, W, 3) radiance by "clean" and "adversarial".
-        seen: the pictures (H, W, 3) that the model sees, likewise.
-        u: (d,) of the adversarial one.
+        shown: "clean" and "adversarial".
     """
     gain = problem.renderer.formation.gain
-    for name, at in (("clean", problem.domain.start), ("adversarial", u)):
-        run.save_image(name, seen[name])
-        run.save_exr(name, linear[name] * gain)
-        save_marked(run, name, seen[name], problem.marks(seen[name], problem.whole(at)))
+    for name, one in shown.items():
+        run.save_image(name, one.picture)
+        run.save_exr(name, one.radiance * gain)
+        save_marked(run, name, one.picture, problem.marks(one.picture, one.whole))
         if problem.aovs:
-            surfaces, file = problem.renderer.surfaces(problem.whole(at)), run.path / IMAGES / f"{name}.aov.exr"
+            surfaces, file = problem.renderer.surfaces(one.whole), run.path / IMAGES / f"{name}.aov.exr"
             images.write_layers(file, surfaces.layers(problem.aovs, OBJECT), surfaces.notes(problem.aovs))
-    run.save_image("difference", images.difference(seen["clean"], seen["adversarial"]))
+    run.save_image("difference", images.difference(shown["clean"].picture, shown["adversarial"].picture))
     checked = findings.verification
     kind = "verification" if findings.beaten is None else "baseline verification"
     for number in range(min(KEPT, len(checked.adversarial_trials) if checked else 0)):
@@ -66,7 +119,10 @@ def write_pictures(
         run.save_image(name, picture)
         save_marked(run, name, picture, problem.marks(picture, problem.whole(checked.u, seed)))
     if findings.frames:
-        run.save_animation("search", [*findings.frames, seen["adversarial"].numpy()])
+        last = shown["adversarial"].picture
+        if problem.conditions is not None and findings.search is not None:  # the frames see the scene as it comes
+            last = Shown.of(problem, findings, problem.domain.project(findings.search.best_u), None).picture
+        run.save_animation("search", [*findings.frames, last.numpy()])
 
 
 def save_marked(run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]) -> None:

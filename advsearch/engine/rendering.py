@@ -23,6 +23,7 @@ from advsearch.models.switches import plainly
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked
+from advsearch.report.phrases import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import write_exr, write_layers, write_png
 from advsearch.runs.results.base import Formation
@@ -150,7 +151,9 @@ class Rendering:
 
     @property
     def _captions(self) -> list[list[str]]:
-        return [[f"azimuth {view.azimuth:g}", *map(_caption, view.answers)] for view in self.views]
+        return [
+            [f"azimuth {view.azimuth:g}", *(seen_text(self.task, one) for one in view.answers)] for view in self.views
+        ]
 
     def result(
         self, out: Path, size: tuple[int, int], warnings: Sequence[str], answered: Path | None = None
@@ -274,10 +277,6 @@ def _facts(
 def sight_of(surfaces: Surfaces) -> Sight:
     """Return what a task judges by, of what the camera sees."""
     return Sight(surfaces.seen(OBJECT), surfaces.depth)
-
-
-def _caption(answer: Answer) -> str:
-    return answer.label if answer.probability is None else f"{answer.probability:.1%} {answer.label}"
 
 
 def writable(path: str | Path, views: int) -> Path:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from advsearch.attacks import Trials, count_right
+from advsearch.attacks import Trials, Verification, count_right
 from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.report.wording import count
 from advsearch.runs.results.attack import ControlGroup, VerifiedRate
@@ -96,9 +96,14 @@ def judgement_of(row: Row) -> Judgement:
     return Judgement(score, margin, right, answer, row.payload, row.objective)
 
 
-def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:
-    """Return the rate of a success, how often each such answer was given, and the mean score of what is a number."""
-    labels = Counter(trial.answer.label for trial in trials if trial.success)
+def verified_rate(checked: Verification) -> VerifiedRate:
+    """Return the rate of a success, with how often each such answer was given and the mean score of the trials."""
+    return rate_of(checked.adversarial, checked.counting, checked.successes)
+
+
+def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:
+    """Return a rate with the answers of its successes and the mean score of those that are a number."""
+    labels = Counter(trial.answer.label for trial in successes)
     return VerifiedRate(
         successes=rate.successes,
         trials=rate.trials,

@@ -259,7 +259,7 @@ def _values(trial: Judgement) -> list[float | None]:
 
 def _rank(verification: Verification) -> tuple[bool, int, float]:
     """How bad an answer is for the model: found, then successes, then the mean margin."""
-    scores = [trial.score for trial in verification.adversarial_trials]
+    scores = [trial.score for trial in verification.counting]
     mean = sum(scores) / len(scores)
     mean = mean if mean == mean else -math.inf
     return verification.ending is Ending.FOUND, verification.adversarial.successes, mean

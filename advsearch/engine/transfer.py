@@ -75,7 +75,7 @@ class Transfer:
 
 
 def _cell(name: str, checked: Verification) -> MatrixCell:
-    verified = verified_rate(checked.adversarial, checked.adversarial_trials)
+    verified = verified_rate(checked)
     return MatrixCell(model=name, ending=checked.ending.value, verified=verified)
 
 

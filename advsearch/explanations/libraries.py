@@ -7,7 +7,7 @@ from typing import Any
 
 from advsearch.errors import InputError
 
-PACKAGES = {"sklearn": "scikit-learn", "SALib": "SALib"}
+PACKAGES = {"sklearn": "scikit-learn"}
 """Names on the package index, by that of a module."""
 
 

@@ -8,6 +8,7 @@ other half of the rows, which no choice has seen, says whether a rule holds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -28,8 +29,11 @@ KEPT = 0.97
 """Share of its weighted relative accuracy that a rule keeps when a condition is left out."""
 PASSES, BOUNDS = 3, 250
 """How often all bounds of a rule are moved, and to how many places (quantiles) of their factor."""
-CHANCE = 1e-3
-"""Probability that any rule is told where there is none: each is tested at a fifth of it (Bonferroni)."""
+CHANCE = 0.01
+"""Probability that any rule is told that is none. Rules are tested one after the other, each only where all before it
+were told, so that each may be tested at all of it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995)."""
+MOST_NEEDED = 1_000_000
+"""Rows up to which it is said how many a rule would take."""
 LEAST_GAP = 0.1
 """By how much more often the model is wrong under a rule than elsewhere, at least."""
 
@@ -88,6 +92,52 @@ class CountedRule:
     right_elsewhere: int
     of_elsewhere: int
 
+    @property
+    def chance(self) -> float:
+        """The probability of so few right answers under it, or fewer, if they were spread by chance: Fisher's exact
+        test, one-sided."""
+        return _chance(self.right, self.of, self.right_elsewhere, self.of_elsewhere)
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is told: rows that did not choose it show it, and more than chance would."""
+        return self._gap >= LEAST_GAP and self.chance <= CHANCE
+
+    @property
+    def _gap(self) -> float:
+        if not self.of or not self.of_elsewhere:
+            return 0.0
+        return self.right_elsewhere / self.of_elsewhere - self.right / self.of
+
+    def times_needed(self) -> float | None:
+        """How many times as many rows, of the same shares, would tell it; None where no number would."""
+        if self._gap < LEAST_GAP:
+            return None
+        counts = (self.right, self.of, self.right_elsewhere, self.of_elsewhere)
+        times, own = 1.0, self.of + self.of_elsewhere
+        while own * times <= MOST_NEEDED:
+            if _chance(*(round(one * times) for one in counts)) <= CHANCE:
+                return times
+            times *= 1.05
+        return None
+
+
+def _chance(right: int, of: int, right_elsewhere: int, of_elsewhere: int) -> float:
+    return float(hypergeom.cdf(right, of + of_elsewhere, right + right_elsewhere, of))
+
+
+@dataclass(frozen=True)
+class FoundRules:
+    """What was found.
+
+    Attributes:
+        told: the rules, the weightiest first.
+        next: the best one after these, which is not told; None where there is none to try.
+    """
+
+    told: list[CountedRule]
+    next: CountedRule | None
+
 
 def covered(conditions: Conditions, found: Observations) -> Mask:
     """Return which rows (n,) lie under all conditions."""
@@ -97,8 +147,8 @@ def covered(conditions: Conditions, found: Observations) -> Mask:
     return mask
 
 
-def find_rules(choosing: Observations, counting: Observations, seed: int) -> list[CountedRule]:
-    """Return the rules under which the model is wrong more often than elsewhere, the weightiest first.
+def find_rules(choosing: Observations, counting: Observations, seed: int) -> FoundRules:
+    """Return the rules under which the model is wrong more often than elsewhere.
 
     Args:
         choosing: rows that rules are chosen on.
@@ -112,27 +162,18 @@ def find_rules(choosing: Observations, counting: Observations, seed: int) -> lis
     for number in range(MOST_RULES):
         conditions = _best(choosing, seeds.stream(seed, "rules", number))
         if not conditions:
-            break
+            return FoundRules(rules, None)
         inside = covered(conditions, counting)
         rule = _counted(conditions, counting.right[inside], counting.right[~inside])
-        if not _holds(rule):
-            break
+        if not rule.holds:
+            return FoundRules(rules, rule)
         rules.append(rule)
         choosing, counting = choosing.where(~covered(conditions, choosing)), counting.where(~inside)
-    return rules
+    return FoundRules(rules, None)
 
 
 def _counted(conditions: Conditions, inside: Mask, elsewhere: Mask) -> CountedRule:
     return CountedRule(conditions, int(inside.sum()), len(inside), int(elsewhere.sum()), len(elsewhere))
-
-
-def _holds(rule: CountedRule) -> bool:
-    """Whether rows that did not choose it show it: Fisher's exact test, one-sided."""
-    if not rule.of or not rule.of_elsewhere:
-        return False
-    gap = rule.right_elsewhere / rule.of_elsewhere - rule.right / rule.of
-    total, right = rule.of + rule.of_elsewhere, rule.right + rule.right_elsewhere
-    return gap >= LEAST_GAP and float(hypergeom.cdf(rule.right, total, right, rule.of)) <= CHANCE / MOST_RULES
 
 
 def _best(found: Observations, seed: int) -> Conditions:
@@ -153,7 +194,7 @@ def _best(found: Observations, seed: int) -> Conditions:
         return ()
     while len(best) > 1:
         shorter = max((best[:k] + best[k + 1 :] for k in range(len(best))), key=weight)
-        if weight(shorter) < KEPT * reached:
+        if reached - weight(shorter) > max((1.0 - KEPT) * reached, _error(shorter, best, found)):
             break
         best = shorter
     for _ in range(PASSES):
@@ -161,6 +202,12 @@ def _best(found: Observations, seed: int) -> Conditions:
             moved = [(*best[:place], one, *best[place + 1 :]) for one in _moved(best[place], found)]
             best = max([best, *moved], key=weight)
     return best
+
+
+def _error(shorter: Conditions, longer: Conditions, found: Observations) -> float:
+    """The standard error of what conditions add to the weighted relative accuracy, so that few rows choose few."""
+    left_out = int((covered(shorter, found) & ~covered(longer, found)).sum())
+    return math.sqrt(left_out * float(found.right.var())) / len(found)
 
 
 def _moved(condition: RuleCondition, found: Observations) -> Iterator[RuleCondition]:

@@ -30,6 +30,7 @@ from advsearch.runs.results.photos import PhotoAgreement
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.sweep import SweepSummary
+from advsearch.settings import split_names
 
 RULES = (
     "Each claim is about the run's own model, object, environment, label and settings, and about nothing else.",
@@ -121,11 +122,24 @@ def _sweep(result: SweepSummary) -> Iterator[Claim]:
     elif result.sampler != "random" or result.grid:
         how = f"configurations drawn by the sampler {result.sampler}" + (" at each point of a grid" * bool(result.grid))
         note = " The interval is that of independent draws, which these are not."
-    yield _claim("measured", f"The model is right in {_share(extent)} {how}.{note}", extent)
+    models = [row for row in result.axes if row.axis == "model"]
+    if len(split_names(result.model)) < 2 or not models:
+        how += _in_each(result)
+        yield _claim("measured", f"The model is right in {_share(extent)} {how}.{note}", extent)
+    for row in models:  # they are shown the same pictures, so that answers of several are not independent
+        own = Extent(what=extent.what, count=row.correct, total=row.configurations, interval=row.interval or (0.0, 1.0))
+        yield _claim("measured", f"The model {row.value} is right in {_share(own)} {how}{_in_each(result)}.{note}", own)
     worst = result.worst.verified if result.worst else None
     if worst is not None:
         text = f"In the worst of these configurations the model is wrong in {wording.rate_text(worst)}."
         yield _claim("measured", f"{text} No search looked for a worse one.", _extent("wrong", worst))
+
+
+def _in_each(result: SweepSummary) -> str:
+    """That there are as many in each of several objects and environments, which are not drawn."""
+    several = {name: sum(row.axis == name for row in result.axes) for name in ("object", "environment")}
+    each = [f"each of the {count} {name}s" for name, count in several.items() if count > 1]
+    return f", as many in {' and '.join(each)}" if each else ""
 
 
 def _gap(result: GapResult) -> Iterator[Claim]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from advsearch.report import wording
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import Result
+from advsearch.runs.results.base import Result, VariedValue
 from advsearch.runs.results.evidence import Claim, Evidence, EvidenceRun
 from advsearch.runs.results.sweep import SweepSummary
 
@@ -16,7 +16,12 @@ NOT_NOTED = "not noted: the run is older than that"
 
 
 def evidence_of(
-    name: str, result: Result, claims: Sequence[Claim], settings: Mapping[str, object], made: Mapping[str, str]
+    name: str,
+    result: Result,
+    claims: Sequence[Claim],
+    settings: Mapping[str, object],
+    made: Mapping[str, str],
+    judged_by: Mapping[str, object] | None = None,
 ) -> EvidenceRun:
     """Return a run with what a reader needs to judge its claims.
 
@@ -26,6 +31,7 @@ def evidence_of(
         claims: what it stands for.
         settings: as its run.yaml has them.
         made: versions and digests, as the run noted them; empty of older runs.
+        judged_by: the options of its task by name, such as thresholds.
     """
     values = {field: getattr(result, field) for field in type(result).model_fields}
 
@@ -33,7 +39,7 @@ def evidence_of(
     right = values.get("label_set") or settings.get("label")
     about = {
         "Object": str(objects or ""),
-        "Environment": str(values.get("environment") or ""),
+        "Environment": _lit_by(result),
         "Model": str(values.get("model") or ""),
         "Task": str(values.get("task") or ""),
         "Counts as right": ", ".join(right) if isinstance(right, list) else str(right or "the object's own label"),
@@ -47,12 +53,21 @@ def evidence_of(
         claims=list(claims),
         about={key: text for key, text in about.items() if text},
         searched=searched_lines(result, settings),
-        measured=_measured(result, settings),
+        measured=_measured(result, settings, judged_by or {}),
         excluded=_excluded(result, claims),
         cost={"Renders": _renders(values.get("renders")), "Time": wording.seconds_text(seconds.get("total"))},
         made_with=dict(made) or {"versions and files": NOT_NOTED},
         command_line=str(values.get("command_line") or ""),
     )
+
+
+def _lit_by(result: Result) -> str:
+    """What lights it, or that this is among what varied."""
+    name = str(getattr(result, "environment", "") or "")
+    moving = [*getattr(result, "over", ()), *getattr(result, "controls", ())]
+    if not {"environment", "sky"} & {one.partition(":")[0] for one in moving} or not name:
+        return name
+    return f"varied, see below; the clean scene has {name}" if isinstance(result, AttackSummary) else f"{name}, varied"
 
 
 def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
@@ -66,6 +81,7 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
             if one.low is not None and one.high is not None
         ]
         lines += [wording.over_text(result)] if result.over else []
+        lines += [f"{name}: {_span(one)}, by chance" for name, one in result.conditions.items()]
     elif isinstance(result, SweepSummary):
         lines += _axes(result)
     given = settings.get("controls") or {}
@@ -73,7 +89,7 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
         own = given.get(control) if isinstance(given, Mapping) else None
         if own:
             lines.append(f"{control}, as set: {json.dumps(own, ensure_ascii=False)}")
-        elif not any(control in line for line in lines):
+        elif not any(line.startswith((control, f"{control}.")) for line in lines):
             lines.append(f"{control}: everything that it searches by default")
     for name in ("epsilon", "epsilons"):
         value = settings.get(name)
@@ -83,22 +99,31 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
 
 
 def _axes(result: SweepSummary) -> list[str]:
-    """The values of each axis of a sweep: a range, or names."""
+    """The values of each axis of a sweep: a declared range, or names."""
     spans: dict[str, list[Any]] = {}
     units = {row.axis: row.unit for row in result.axes}
     for row in result.axes:
         spans.setdefault(row.axis, []).append(row.value)
     lines = []
     for axis, values in spans.items():
+        if axis in result.drawn:
+            continue
         if all(isinstance(one, tuple) for one in values):
             low, high = min(one[0] for one in values), max(one[1] for one in values)
             lines.append(f"{axis}: {low:.4g} to {high:.4g} {units[axis]}".rstrip())
         else:
             lines.append(f"{axis}: {', '.join(map(wording.number_text, values))} {units[axis]}".rstrip())
-    return lines
+    return lines + [f"{name}: {_span(one)}, drawn by chance" for name, one in result.drawn.items()]
 
 
-def _measured(result: Result, settings: Mapping[str, object]) -> dict[str, str]:
+def _span(one: VariedValue) -> str:
+    if one.low is None or one.high is None:
+        return " or ".join(one.names or ["something"])
+    return f"{one.low:.4g} to {one.high:.4g} {'' if one.unit == '1' else one.unit}".rstrip()
+
+
+def _measured(result: Result, settings: Mapping[str, object], judged_by: Mapping[str, object]) -> dict[str, str]:
+    worst = isinstance(result, SweepSummary)
     facts = {
         "Policy": getattr(result, "policy", None),
         "Objective": getattr(result, "objective", None),
@@ -106,21 +131,24 @@ def _measured(result: Result, settings: Mapping[str, object]) -> dict[str, str]:
         "Steps": settings.get("steps"),
         "Seed": getattr(result, "seed", None),
         "Samples a pixel": getattr(result, "spp", None) or settings.get("spp"),
-        "Trials": settings.get("trials"),
+        "Trials of the worst configuration" if worst else "Trials": settings.get("trials"),
+        "Judged with": ", ".join(f"{name} {wording.number_text(one)}" for name, one in judged_by.items() if one),
     }
-    named = {name: str(value) for name, value in facts.items() if value is not None}
+    named = {name: str(value) for name, value in facts.items() if value not in (None, "")}
     if isinstance(result, AttackSummary) and result.verified is not None:
-        named["Verification"] = (
-            f"{result.verified.trials} renders with fresh seeds, {result.verified.spp} samples a pixel"
-        )
+        rated, control = result.verified, result.clean.control
+        counting = f"{rated.trials} renders with fresh seeds"
+        if result.over and control is not None and control.trials > rated.trials:
+            counting += f" that count, those of {control.trials} in which the clean scene is right"
+        named["Verification"] = f"{counting}, {rated.spp} samples a pixel"
     formation = getattr(result, "image_formation", None)
-    return {**named, "Pictures": wording.formation_text(formation)} if formation else named
+    gains = getattr(result, "gains", None)
+    return {**named, "Pictures": wording.formation_text(formation, gains)} if formation else named
 
 
 def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
     """What a reader has to know beside the claims: what stood still, what failed, the run's own warnings."""
-    controls = ", ".join(getattr(result, "controls", ()))
-    lines = [f"Nothing but what stands under Searched varied{f' ({controls})' if controls else ''}."]
+    lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
     if isinstance(result, AttackSummary):
         lines += [one for one in wording.remarks(result) if one not in result.warnings]
         bad = result.non_finite
@@ -172,7 +200,7 @@ def sections(one: EvidenceRun) -> dict[str, list[str]]:
     """Return what stands beside the claims of a run, in lines under their headings."""
     found = {
         "On what": [f"{name}: {text}" for name, text in one.about.items()],
-        "Searched": one.searched,
+        "What varied": one.searched,
         "Measured how": [f"ended as: {one.ending}", *(f"{name}: {text}" for name, text in one.measured.items())],
         "Excluded, and to be known": one.excluded,
         "Budget": [f"{name}: {text}" for name, text in one.cost.items()],

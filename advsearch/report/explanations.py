@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from advsearch.report import wording
+from advsearch.report.phrases import percent, percent_number
+from advsearch.report.wording import interval_text
 from advsearch.runs.results.explain import (
     ConditionRow,
     ExplainResult,
@@ -15,7 +17,7 @@ from advsearch.runs.results.explain import (
     RuleRow,
 )
 
-WEIGHT_HEADS = ("parameters", "decides", "95 %", "with others", "95 %")
+WEIGHT_HEADS = ("parameters", "decides", "95 % interval", "by parts")
 """Of the columns of the importance."""
 MOST_WEIGHTS = 12
 """Rows of it that are shown."""
@@ -27,8 +29,8 @@ def explain_text(result: ExplainResult) -> str:
     """Return the first thing that a reader should know, in a sentence."""
     if not result.rules:
         return (
-            f"No rule tells where the model is wrong: it is right in {share_text(result)}, and no rule of few "
-            "conditions holds on rows that did not choose it."
+            f"No rule is told from chance in {result.total:,} rows, of which one half chooses and the other counts: "
+            f"the model is right in {share_text(result)}."
         )
     return f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
 
@@ -36,10 +38,26 @@ def explain_text(result: ExplainResult) -> str:
 def rule_text(number: int, rule: RuleRow) -> str:
     """Return a rule as a sentence."""
     rest = "elsewhere" if number == 0 else "in what no rule before covers"
-    others = 100 * rule.elsewhere.right / rule.elsewhere.total
-    text = f"{conditions_text(rule.conditions)}: right in {share_text(rule)}; {rest} {others:.0f} %."
+    text = f"{conditions_text(rule.conditions)}: right in {share_text(rule)}; {rest} {share_text(rule.elsewhere)}."
     fresh = rule.confirmed
     return text if fresh is None else f"{text} Fresh renders inside it: right in {share_text(fresh)}."
+
+
+def not_told_text(result: ExplainResult) -> str:
+    """Return the best rule that is not told, why not, and how many rows it would take; empty where there is none."""
+    rule = result.not_told
+    if rule is None:
+        return ""
+    others = f"{rule.elsewhere.right} of {rule.elsewhere.total}"
+    text = (
+        f"Not told{' either' if result.rules else ''}, but the best that one half of the rows suggests: "
+        f"{conditions_text(rule.conditions)}. In the other half the model is right in {rule.right} of {rule.total} "
+        f"under it and in {others} elsewhere"
+    )
+    if rule.rows is None:
+        return f"{text}, which is no difference that more rows would tell."
+    shown = f"chance does that with a probability of {rule.chance:.2g}, and at most {rule.asked:g} is asked"
+    return f"{text}; {shown}. About {rule.rows:,} rows with these shares would tell it: sweep more."
 
 
 def conditions_text(conditions: Sequence[ConditionRow]) -> str:
@@ -51,8 +69,8 @@ def share_text(counted: RightOf) -> str:
     """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
     if not counted.total:
         return "none of 0"
-    low, high = counted.interval
-    return f"{100 * counted.right / counted.total:.0f} % ({100 * low:.0f} to {100 * high:.0f}) of {counted.total:,}"
+    low, high = map(percent_number, counted.interval)
+    return f"{percent(counted.right / counted.total)} ({low} to {high}) of {counted.total:,}"
 
 
 def envelope_text(result: ExplainResult) -> str:
@@ -102,31 +120,12 @@ def cluster_text(one: FailureCluster) -> str:
     return f"{one.failures}: {answers}"
 
 
-def explained_text(result: ExplainResult) -> str:
-    """Return how much of the answers' variance the importance accounts for."""
-    return f"{100 * (result.explained or 0.0):.0f} %"
-
-
 def weight_rows(result: ExplainResult) -> list[list[str]]:
     """Return a row for each parameter and each pair of them."""
-    rows = []
-    for one in result.importance[:MOST_WEIGHTS]:
-        total = one.total is not None and one.total_interval is not None
-        rows.append(
-            [
-                " with ".join(one.parameters),
-                f"{100 * max(one.share, 0.0):.0f} %",
-                _interval(one.interval),
-                f"{100 * max(one.total or 0.0, 0.0):.0f} %" if total else "",
-                _interval(one.total_interval) if one.total_interval else "",
-            ]
-        )
-    return rows
-
-
-def _interval(interval: tuple[float, float]) -> str:
-    low, high = (100 * min(max(one, 0.0), 1.0) for one in interval)
-    return f"{low:.0f} to {high:.0f}"
+    return [
+        [" with ".join(one.parameters), percent(one.share), interval_text(one.interval), str(one.parts or "")]
+        for one in result.importance[:MOST_WEIGHTS]
+    ]
 
 
 def _value(value: str | float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 from advsearch.described import NOT_A_NUMBER
@@ -33,6 +34,9 @@ _UNITS = {
     "lengths of the clean features": ("feature_distance",),
 }
 
+MOST_DECIMALS = 6
+"""Of a percentage."""
+
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
 
@@ -54,10 +58,20 @@ def percent(share: float | None) -> str:
 
 
 def percent_number(share: float) -> str:
-    """Return ``83`` for 0.83; see `percent`."""
+    """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98`` for 0.99979.
+
+    Within five of 0 or 100 it has one decimal, and nearer to them as many as show how far it is away.
+    """
     value = 100.0 * share
-    near_end = (99.0 < value < 100.0 and round(value) == 100) or (0.0 < value < 1.0 and round(value) == 0)
-    return f"{min(max(value, 0.1), 99.9):.1f}" if near_end else f"{value:.0f}"
+    away = min(value, 100.0 - value)
+    if away >= 5.0 or away <= 0.0:
+        return f"{value:.0f}"
+    decimals = min(max(1, -math.floor(math.log10(away))), MOST_DECIMALS)
+    text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
+    if text not in ("0", "100"):
+        return text
+    least = 10.0**-decimals
+    return f"under {least:.{decimals}f}" if text == "0" else f"over {100.0 - least:.{decimals}f}"
 
 
 def with_article(name: str) -> str:
@@ -109,18 +123,21 @@ def wanted(objective: str, thing: str) -> str:
 
 
 def cells(task: str, answer: Said) -> list[str]:
-    """Return an answer and its number, for a table: ``["vase", "91 %"]``, ``["no cup found", "best 0.12"]``."""
+    """Return an answer and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
+    0.12"]``.
+    """
     label, share = answer.label, answer.probability
     if share is None:
         return [label, ""]
     if task == DETECTION:
-        none = label.startswith(_NONE)
-        return [f"{label} found", f"best {share:.2f}"] if none else [label, f"score {share:.2f}"]
+        if label.startswith(_NONE):
+            return [f"{label} found", f"best score of {label.removeprefix(_NONE)} {share:.2f}"]
+        return [label, f"score {share:.2f}"]
     return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share)]
 
 
 def answer_text(task: str, answer: Said) -> str:
-    """Return an answer on one line: ``vase, 91 %``, ``no cup found (best 0.12)``."""
+    """Return an answer on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
     label, number = cells(task, answer)
     if task == SEGMENTATION and number and label.startswith(_NONE):
         return f"{label} found, accuracy over the object's pixels {percent(answer.probability)}"
@@ -129,6 +146,22 @@ def answer_text(task: str, answer: Said) -> str:
     if task == DETECTION and number:
         return f"{label} ({number})"
     return f"{label}, {number}" if number else label
+
+
+def seen_cells(task: str, answer: Said) -> list[str]:
+    """Return one of the answers to a whole picture, for a table: ``["cup", "score 0.77"]``, ``["mug", "91 %"]``."""
+    if answer.probability is None:
+        return [answer.label, ""]
+    if task == DETECTION:
+        return [answer.label, f"score {answer.probability:.2f}"]
+    share = percent(answer.probability)
+    return [answer.label, f"{share} of the picture" if task == SEGMENTATION else share]
+
+
+def seen_text(task: str, answer: Said) -> str:
+    """Return the same on one line: ``cup (score 0.77)``, ``mug 91 %``."""
+    label, number = seen_cells(task, answer)
+    return f"{label} ({number})" if task == DETECTION and number else f"{label} {number}".rstrip()
 
 
 def calls(task: str, thing: str, label: str) -> str:

@@ -249,13 +249,28 @@ def print_cost_text(summary: AttackSummary) -> str:
     return f"{margins} (another search of {count(cost.steps, 'step')}, {cost.verified.trials} trials each): {said}"
 
 
-def formation_text(formation: Formation) -> str:
-    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops, gain 1.35``."""
+def formation_text(formation: Formation, gains: Mapping[str, float] | None = None) -> str:
+    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops, gain 1.35``.
+
+    Args:
+        formation: of the pictures.
+        gains: of several scenes, by their names.
+    """
     height, width = formation.resolution
     denoised = "not denoised" if formation.denoiser == "none" else f"denoised ({formation.denoiser})"
     exposure = f"exposure {number_text(formation.exposure)} stops"
     made = f"{height} x {width} pixels, {formation.filter} filter, {denoised}, {exposure}"
-    return f"{made}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
+    if formation.gain is not None:
+        gain = f"gain {number_text(formation.gain)}"
+    else:
+        each = "; ".join(f"{gain_name(name)} {number_text(value)}" for name, value in (gains or {}).items())
+        gain = "a gain for each scene" + (f": {each}" if each else "")
+    return f"{made}, sampler {formation.sampler}, {gain}"
+
+
+def gain_name(name: str) -> str:
+    """Return an object and an environment without their folders."""
+    return ", ".join(short_name(one) for one in name.split(", "))
 
 
 def number_text(value: Any) -> str:

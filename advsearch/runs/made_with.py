@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
+
+from advsearch.files import opened_for
 
 NOTE = "made with"
 """The note: a list, with an entry for each sitting."""
@@ -50,24 +53,39 @@ def changed_file(before: Sequence[Mapping[str, object]], now: Mapping[str, str])
 
 
 def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return the SHA-256 of each file that settings name, in hexadecimal; what is bundled or gone has none."""
+    """Return the SHA-256 of each file that settings name, in hexadecimal, and of each that was read for it: materials,
+    pictures and buffers that a mesh or a scene names. What is bundled or gone has none."""
     from advsearch.settings.configuration import FILES
 
-    found = {}
-    for name in FILES:
-        for path in _paths(settings.get(name)):
+    found: dict[str, str] = {}
+    for name, value in settings.items():
+        for path in _paths(value):
             with suppress(OSError, ValueError):
-                if Path(path).is_file():
+                own = os.path.abspath(path)
+                parts = opened_for(own)
+                if (parts or name in FILES) and Path(path).is_file():
                     found[path] = _digest(Path(path))
+                for part in parts:
+                    if part != own and Path(part).is_file():
+                        found[os.path.join(os.path.dirname(path), os.path.relpath(part, os.path.dirname(own)))] = (
+                            _digest(Path(part))
+                        )
     return found
 
 
 def _paths(value: object) -> Iterator[str]:
-    """What may be a file in ``a.pt2,reference@weights.safetensors``, or in a list of such."""
-    for one in value if isinstance(value, list) else [value]:
-        if isinstance(one, str):
-            for name in one.split(","):
-                yield from dict.fromkeys([name.strip(), name.rpartition("@")[2].strip()])
+    """What may be a file in ``a.pt2,reference@weights.safetensors`` or ``scene.glb#NODE``, in lists and mappings."""
+    if isinstance(value, Mapping):
+        for one in value.values():
+            yield from _paths(one)
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _paths(one)
+    elif isinstance(value, str):
+        for name in value.split(","):
+            yield from dict.fromkeys(
+                one.strip() for one in (name, name.rpartition("@")[2], name.partition("#")[0]) if one.strip()
+            )
 
 
 def _digest(path: Path) -> str:

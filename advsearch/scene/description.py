@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import reading
 from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
@@ -370,7 +372,8 @@ def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None, giv
 
     if up is not None:
         raise InputError("up: the first camera of a Mitsuba scene says which way is up; leave `up` out")
-    found = import_plugins(scene, shape)
+    with reading(scene) if isinstance(scene, Path) else nullcontext():
+        found = import_plugins(scene, shape)
     idle = [name for name in given if name.startswith("material.")]
     if found.object.surface is not None and idle:
         raise InputError(f"`set` {idle[0]}: the object has a surface of Mitsuba's own, without it; leave it out")
@@ -380,7 +383,8 @@ def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None, giv
 def _scene(path: Path, node: str, up: str | None) -> ImportedScene:
     if up is not None:
         raise InputError("up: glTF files have y up; leave `up` out")
-    return import_scene(path, node)
+    with reading(path):
+        return import_scene(path, node)
 
 
 def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
@@ -391,7 +395,8 @@ def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
-        return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
+        with reading(spec):
+            return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
     if up is not None:
         raise InputError(
             f"up: bundled objects stand upright already; leave `up` out, or give a file instead of {spec!r}"
@@ -405,7 +410,8 @@ def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset | None
     if spec == NO_MAP:
         return None
     if is_path(spec):
-        return environments.import_environment(Path(spec))
+        with reading(spec):
+            return environments.import_environment(Path(spec))
     return library.load_environment(str(spec))
 
 

@@ -20,7 +20,7 @@ from advsearch.report.method import PLAN_HEADS, method_facts, plan_rows, plan_te
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, is_command, marks_text, objective_label
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
-from advsearch.runs.results.attack import AttackSummary, FoundValue, UsualAnswer
+from advsearch.runs.results.attack import AttackSummary, DifferentFailure, FoundValue, PicturedAnswer
 from advsearch.runs.summary import attack_of
 from advsearch.viewer.document import data_script, data_url, document, scrolled
 from advsearch.viewer.study_page import facts_table, heading, named, table
@@ -140,7 +140,7 @@ def _pictures(data: RunData) -> Html:
     return join(
         element("h2", "What the model sees"),
         compare,
-        _section("", shown),
+        _section("", shown, note=_same_conditions(summary)),
         _section("What it answers", answered, "large", marks_text(summary.task)),
         _details("Pictures of the verification", [_figure(data, name, "", _trial(name)) for name in trials], "small"),
         search if data.frames else None,
@@ -164,7 +164,7 @@ def _failures(data: RunData) -> Html:
     if known is None:
         return Html("")
     shown = [
-        _figure(data, one.picture, answered_text(one), range_text(one))
+        _figure(data, one.picture, _failure_caption(data.summary, one), range_text(one))
         for one in known.listed
         if one.picture and one.holds
     ]
@@ -175,6 +175,10 @@ def _failures(data: RunData) -> Html:
         element("div", *shown, class_="pictures") if shown else None,
         table(FAILURE_HEADS, rows) if rows else None,
     )
+
+
+def _failure_caption(summary: AttackSummary, one: DifferentFailure) -> str:
+    return answered_text(one) if one.pictured is None else answer_text(summary.task, one.pictured)
 
 
 def _rates(summary: AttackSummary) -> Html:
@@ -319,7 +323,18 @@ def _figure(data: RunData, name: str, heading: str, caption: str) -> Html | None
     return element("figure", picture, element("figcaption", label, ": " if heading else None, caption))
 
 
-def _answer(summary: AttackSummary, answer: UsualAnswer | None) -> str:
+def _same_conditions(summary: AttackSummary) -> str:
+    """Which of many conditions the pictures show."""
+    trial = summary.clean.trial
+    if not summary.over:
+        return ""
+    where = " and ".join(summary.over)
+    if trial is None:
+        return f"Both with the {where} that the scene comes with."
+    return f"Both of trial {trial}, with the same {where}; in other trials they, and what the model says, are others."
+
+
+def _answer(summary: AttackSummary, answer: PicturedAnswer | None) -> str:
     return "no answer recorded" if answer is None else answer_text(summary.task, answer)
 
 

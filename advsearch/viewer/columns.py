@@ -9,7 +9,7 @@ import json
 import math
 from array import array
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, cast
@@ -22,6 +22,9 @@ from advsearch.files import JsonObject
 from advsearch.runs.store import NAME, Row, Store
 
 KIND = "sweep"
+
+EDGES = "parts of ranges"
+"""The note of a run that says where the range of each drawn parameter is cut: the ends of the parts, by name."""
 
 MOST_LEVELS = 65535
 """Different names of one axis, or answers, that are told apart; further ones are one: "others"."""
@@ -48,12 +51,14 @@ class Column:
         unit: its unit; empty for names.
         levels: the names that occur; None for numbers.
         data: (n,) float32, NaN where a row has none; or uint16, the places of the names in `levels`.
+        edges: of the parts that it is shown in, ascending; None of one that is shown value by value.
     """
 
     name: str
     unit: str
     levels: tuple[str, ...] | None
     data: Array
+    edges: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +102,12 @@ class Columns:
             for (name, one), start in zip(arrays, starts[:-1], strict=True)
         ]
         parameters = [
-            {"name": one.name, "unit": one.unit, "levels": None if one.levels is None else list(one.levels)}
+            {
+                "name": one.name,
+                "unit": one.unit,
+                "levels": None if one.levels is None else list(one.levels),
+                "edges": None if one.edges is None else list(one.edges),
+            }
             for one in self.parameters
         ]
         head = {
@@ -141,7 +151,17 @@ def read_columns(run: Path, after: int = 0, most: int | None = None) -> Columns:
         FileFormatError: the results cannot be read.
     """
     with Store(run / NAME, read_only=True) as store:
-        return columns_of(islice(store.rows(KIND, after=after), most))
+        found, edges = columns_of(islice(store.rows(KIND, after=after), most)), store.noted(EDGES)
+    known = edges if isinstance(edges, dict) else {}
+    cut = (replace(one, edges=_edges(known.get(one.name))) for one in found.parameters)
+    return replace(found, parameters=tuple(cut))
+
+
+def _edges(noted: object) -> tuple[float, ...] | None:
+    """The ends of parts, as a run notes them; None of what is something else."""
+    if not isinstance(noted, list) or len(noted) < 2 or not all(isinstance(one, (int, float)) for one in noted):
+        return None
+    return tuple(map(float, noted))
 
 
 def columns_of(rows: Iterable[Row]) -> Columns:

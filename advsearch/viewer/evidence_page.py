@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from advsearch.report.evidence_runs import sections
 from advsearch.report.markup import Html, element, join
+from advsearch.report.wording import interval_text
 from advsearch.runs.results.evidence import Evidence, EvidenceRun
 from advsearch.viewer.document import document
 from advsearch.viewer.study_page import again, facts_table, heading, table
@@ -33,7 +34,7 @@ def _run(one: EvidenceRun) -> Html:
             claim.kind,
             claim.statement,
             f"{claim.extent.count} of {claim.extent.total}" if claim.extent else "",
-            "{:.1f} to {:.1f} %".format(*(100 * end for end in claim.extent.interval)) if claim.extent else "",
+            interval_text(claim.extent.interval) if claim.extent else "",
         ]
         for claim in one.claims
     ]

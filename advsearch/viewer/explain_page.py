@@ -12,7 +12,7 @@ from advsearch.report.explanations import (
     conditions_text,
     envelope_text,
     explain_text,
-    explained_text,
+    not_told_text,
     pair_text,
     pairs_text,
     share_text,
@@ -39,17 +39,18 @@ def explain_page(run: Path, result: ExplainResult) -> str:
     ]
     note = (
         "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % "
-        "Clopper-Pearson intervals. Chance alone would tell any rule in one of a thousand cases at most."
+        "Clopper-Pearson intervals. Chance alone would tell any rule in one of a hundred cases at most."
     )
     weights = weight_rows(result)
     decides = (
-        "Sobol indices of a forest that was fitted to the rows: the share of the variance that a parameter decides "
-        f"alone (two: together), and with all others. It explains {explained_text(result)} of the variance of "
-        "answers that it was not fitted to."
+        "The share of the variance of the answers, right or wrong, that is between parts of a parameter's values with "
+        "equally many rows: its first-order Sobol index, by parts. Two parameters stand together where they decide "
+        "more than each by itself. What differs inside a part is not counted."
     )
     main = element(
         "main",
         join(element("h2", "Rules"), table(RULE_HEADS, rules), element("p", note, class_="soft")) if rules else None,
+        element("p", not_told_text(result)) if result.not_told else None,
         join(element("h2", "What decides"), table(WEIGHT_HEADS, weights), element("p", decides, class_="soft"))
         if weights
         else None,

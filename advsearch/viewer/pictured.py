@@ -12,7 +12,7 @@ from advsearch.described import Value
 from advsearch.errors import InputError
 from advsearch.runs.directory import AOV_FOLDER, CONFIG, IMAGES
 from advsearch.runs.fiftyone import Pictured
-from advsearch.runs.results.attack import AttackSummary, UsualAnswer
+from advsearch.runs.results.attack import AttackSummary, PicturedAnswer
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME, Row, Store
@@ -62,21 +62,21 @@ def _attacked(run: Path, summary: AttackSummary) -> Iterator[Pictured]:
     size = summary.image_formation.resolution
     found = summary.configuration or {}
     values = {name: cast("Value", {"value": one.value, "unit": one.unit}) for name, one in found.items()}
-    usual = [("clean", replace(_usual("clean", summary.clean), correct=summary.clean.correct))]
+    shown = [("clean", replace(_row("clean", summary.clean), correct=summary.clean.correct))]
     if summary.adversarial is not None:
-        usual.append(("adversarial", replace(_usual("adversarial", summary.adversarial), values=values)))
+        shown.append(("adversarial", replace(_row("adversarial", summary.adversarial), values=values)))
     kind = "baseline verification" if summary.answer_from else "verification"
     with Store(run / NAME, read_only=True) as store:
         trials = [
             (f"verification-{row.step:02d}", replace(row, values=values | dict(row.values))) for row in store.rows(kind)
         ]
-    for name, row in (*usual, *trials):
+    for name, row in (*shown, *trials):
         file = run / IMAGES / f"{name}.png"
         if file.is_file() and not file.is_symlink():
             yield Pictured(name, row, file, None, size)
 
 
-def _usual(kind: str, answer: UsualAnswer) -> Row:
-    """What a model usually answers as a row; the answer of one trial is a row of its own."""
+def _row(kind: str, answer: PicturedAnswer) -> Row:
+    """What a model says of a picture as a row."""
     probability = None if answer.probability is None or math.isnan(answer.probability) else answer.probability
     return Row(kind, 0, label=answer.label, label_index=answer.index, probability=probability, payload=answer.payload)

@@ -9,20 +9,23 @@ from __future__ import annotations
 import base64
 import gzip
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
-from advsearch.report.phrases import beside_text, is_command, percent
+from advsearch.report.phrases import answer_text, beside_text, is_command, percent
 from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
 from advsearch.runs.summary import read_result
+from advsearch.settings import read_yaml
 from advsearch.viewer.columns import Columns, read_columns
 from advsearch.viewer.document import data_script, data_url, document, scrolled
 from advsearch.viewer.study_page import beside, facts_table, named, table
@@ -67,7 +70,8 @@ def write_page(run: Path, summary: SweepSummary) -> Path:
     """
     columns = read_columns(run)
     write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
-    source = SweepSource(run.name, columns if len(columns.step) <= MOST_ROWS else None, pictures=kept_pictures(run))
+    rows = columns if len(columns.step) <= MOST_ROWS else None
+    source = SweepSource(run.name, rows, pictures=kept_pictures(run))
     return write_text(run / directory.REPORT, page([(run, summary)], [source]), durable=False)
 
 
@@ -82,9 +86,9 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)
     described, data, left_out = [], [], []
-    shown = [(one, summary) for one, (_, summary) in zip(sources, runs, strict=True) if one.rows is not None]
-    for number, (source, summary) in enumerate(shown):
-        described.append(_described(source, number) | ({} if summary is None else _judged(summary)))
+    shown = [(one, *run) for one, run in zip(sources, runs, strict=True) if one.rows is not None]
+    for number, (source, path, summary) in enumerate(shown):
+        described.append(_described(source, number) | (_going_on(path) if summary is None else _judged(summary)))
         if isinstance(source.rows, Columns):
             packed = base64.b64encode(gzip.compress(source.rows.packed(), 6, mtime=0)).decode()
             data.append(element("script", Html(packed), type="application/octet-stream", id=f"rows-{number}"))
@@ -121,6 +125,14 @@ def _described(source: SweepSource, number: int) -> JsonObject:
     elif isinstance(source.rows, Columns):
         pictures["embedded"] = dict(kept.embedded(source.rows, MOST_EMBEDDED))
     return {**described, "pictures": pictures}
+
+
+def _going_on(run: Path) -> JsonObject:
+    """The task of a sweep that has no result yet, as far as its settings can be read."""
+    with suppress(AdvsearchError):
+        given = read_yaml(run / directory.CONFIG).get("task")
+        return {"task": str(given.get("name") if isinstance(given, Mapping) else given).partition("=")[0]}
+    return {}
 
 
 def _judged(summary: SweepSummary) -> JsonObject:
@@ -236,7 +248,8 @@ def _worst_text(summary: SweepSummary) -> str:
     if worst is None:
         return ""
     where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
-    told, rate = f"{where}: the model answers {worst.claimed.label}", worst.verified
+    said = answer_text(summary.task, worst.pictured or worst.claimed)
+    told, rate = f"{where}: the model answers {said}", worst.verified
     if rate is None:
         return f"{told}."
     return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."
@@ -265,11 +278,12 @@ def _table(rows: Sequence[AxisRow]) -> Html:
 
 
 def _cost(path: Path, summary: SweepSummary) -> Html:
+    formed = summary.image_formation
     facts = {
         "Ending": summary.ending,
         "Time": wording.seconds_text(summary.seconds["total"]),
         "Samples a pixel": str(summary.spp),
-        "Image formation": wording.formation_text(summary.image_formation) if summary.image_formation else "",
+        "Image formation": wording.formation_text(formed, summary.gains) if formed else "",
         "Seed": str(summary.seed),
         "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"])
         if is_command(summary.command_line)

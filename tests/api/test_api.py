@@ -225,6 +225,38 @@ def test_conditions_are_other_ones_in_every_trial_and_the_same_for_both_groups(
     assert adversarial in ([], clean)  # nothing, if the clean scene is wrong in half of them
 
 
+def test_over_conditions_caption_and_payload_are_of_the_picture_and_labels_of_the_trials_that_count(
+    scene: advsearch.Scene, level: float, tmp_path: Path
+) -> None:
+    """Each trial sees another exposure, so that the model answers each with another probability, and some clean ones
+    wrongly."""
+    over = {"camera": {"exposure": [-1.5, 0.2]}}
+    fast = {**FAST, "trials": 24}
+    result = advsearch.attack(scene, model(level - 0.01), over=over, draws=2, epsilon=0.5, run=tmp_path / "run", **fast)
+    summary = result.summary
+    assert summary.verified and summary.clean.control and summary.adversarial
+    assert 12 <= summary.clean.control.correct < 24, "some, and not all, trials have to count"
+    assert summary.verified.trials == summary.clean.control.correct
+    assert sum(summary.verified.labels.values()) == summary.verified.successes <= summary.verified.trials
+    assert list(summary.conditions) == ["camera.exposure"]
+    drawn = summary.conditions["camera.exposure"]
+    assert (drawn.unit, drawn.low, drawn.high) == ("stops", -1.5, pytest.approx(0.2))
+    trial = summary.clean.trial
+    assert trial is not None and trial == summary.adversarial.trial
+    with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
+        rows = {kind: {row.step: row for row in store.rows(kind)} for kind in ("control", "verification")}
+    for kind, said, picture in (
+        ("control", summary.clean, result.clean),
+        ("verification", summary.adversarial, result.adversarial),
+    ):
+        with torch.no_grad():
+            shares = model(level - 0.01)(picture).softmax(dim=-1).flatten()
+        assert said.probability == pytest.approx(float(shares.max()), abs=1e-6), "the caption is of the picture"
+        row = rows[kind][trial]
+        assert (row.label, row.probability) == (said.label, pytest.approx(said.probability, abs=1e-6))
+    assert len({round(row.probability or 0.0, 6) for row in rows["control"].values()}) > 12
+
+
 def test_nan_logits_during_the_search_end_it_and_are_counted(
     scene: advsearch.Scene, level: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,6 @@ from advsearch.api import explain as explaining
 from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
-from advsearch.explanations.importance import Importance
 from advsearch.explanations.observations import Factor, Observations
 from advsearch.explanations.renders import along, inside, lies_inside
 from advsearch.explanations.rules import CountedRule, RuleCondition
@@ -177,14 +176,23 @@ FOUND = Observations(
 )
 
 
-@pytest.mark.parametrize(
-    ("share", "text"),
-    [(0.031, "told 3.1 % of the variance of the others."), (-0.203, "no better than how often they are right does.")],
-)
-def test_a_share_of_the_variance_under_0_is_no_share(share: float, text: str) -> None:
-    rows = [Answered("", {"object": "mug"}, {}, "mug", right) for right in (True, False)]
-    (caution,) = explaining._cautions(rows, Importance(share, ()))
-    assert caution.endswith(text) and "-" not in caution
+def test_of_answers_without_a_law_it_is_said_that_nothing_decides_and_how_many_rows_a_rule_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    faint = stored(tmp_path / "faint", lambda elevation: np.random.default_rng(int(1e6 * elevation)).random() < 0.5)
+    asked = ["explain", str(faint), "--confirm", "0", "--pairs", "0", "--clusters", "0", "--run", str(tmp_path / "run")]
+    assert main(asked) == 0
+    said = capsys.readouterr().out
+    assert "No rule is told from chance in 600 rows, of which one half chooses and the other counts" in said
+    assert "No parameter is shown to decide anything" in said
+    kept = read_result(tmp_path / "run")
+    assert isinstance(kept, ExplainResult) and kept.rules == []
+    rule = kept.not_told
+    assert rule is not None and rule.chance > rule.asked == 0.01 and f"right in {rule.right} of {rule.total}" in said
+    assert rule.rows is None or (
+        rule.rows > 600 and f"About {rule.rows:,} rows with these shares would tell it" in said
+    )
+    assert all(one.interval[0] == 0.0 < one.interval[1] < 0.05 for one in kept.importance)
 
 
 def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:

@@ -44,9 +44,10 @@ from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.axes import axis_values, on_grid, read_axes
 from advsearch.engine.sweeps.batch import KIND
 from advsearch.engine.sweeps.loop import Sweep
-from advsearch.engine.sweeps.points import BINS, Points
+from advsearch.engine.sweeps.points import Points, parts_of_ranges
 from advsearch.errors import AdvsearchError, InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
+from advsearch.report.wording import formation_text
 from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import plain
@@ -54,6 +55,7 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.scene.formation import ImageFormation
 from advsearch.settings import settings
+from advsearch.viewer.columns import read_columns
 
 SIZE = 16
 LABELS = ("mug", "vase")
@@ -482,6 +484,43 @@ def test_ten_million_draws_start_at_once() -> None:
 # ---- what a sweep says ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("pictures", "parts"), [(10, 2), (120, 4), (500, 10), (10_000_000, 10)])
+def test_a_pair_of_parts_has_several_draws(pictures: int, parts: int) -> None:
+    assert parts_of_ranges(pictures) == parts
+    assert pictures / parts**2 >= 5 or parts == 2
+
+
+def test_each_room_has_its_own_gain_and_ranges_are_the_declared_ones() -> None:
+    drawn = {"camera": {"azimuth": [0, 90]}}
+    rooms = advsearch.sweep("mug", model(), environment="studio,noon", controls=drawn, samples=3).summary
+    own = {name: advsearch.load_scene("mug", environment=name).description.gain for name in ("studio", "noon")}
+    assert rooms.gains == {f"mug, {name}": pytest.approx(gain) for name, gain in own.items()}
+    assert own["studio"] != pytest.approx(own["noon"], rel=1e-3)
+    assert rooms.image_formation and rooms.image_formation.gain is None
+    said = formation_text(rooms.image_formation, rooms.gains)
+    assert said.endswith(f"a gain for each scene: mug, studio {own['studio']:.4g}; mug, noon {own['noon']:.4g}")
+    one = advsearch.sweep("mug", model(), environment="noon", controls=drawn, samples=3).summary
+    assert one.image_formation and one.image_formation.gain == 1.0 and one.gains is None, "of the stand-in"
+    (azimuth,) = one.drawn.values()
+    assert (azimuth.low, azimuth.high, azimuth.unit) == (0.0, pytest.approx(90.0), "degrees")
+
+
+def test_page_and_table_cut_the_declared_range_at_the_same_places(tmp_path: Path) -> None:
+    """Of a logarithmic parameter too, and where a part has no draw: not the range of what happened to be drawn."""
+    drawn = {"camera": {"azimuth": [0, 90], "distance": [1.0, 100.0]}}
+    kept = advsearch.sweep("mug", model(), controls=drawn, samples=60, sampler="random", run=tmp_path / "run")
+    columns = {one.name: one for one in read_columns(tmp_path / "run").parameters}
+    assert columns["camera.azimuth"].edges == pytest.approx((0.0, 30.0, 60.0, 90.0))
+    assert columns["camera.distance"].edges == pytest.approx((1.0, 100 ** (1 / 3), 100 ** (2 / 3), 100.0))
+    for name in ("camera.azimuth", "camera.distance"):
+        rows = [row for row in kept.summary.axes if row.axis == name]
+        edges = columns[name].edges
+        assert edges is not None
+        assert [row.value for row in rows] == list(itertools.pairwise(edges))
+        place = np.searchsorted(np.float32(edges[1:-1]), columns[name].data, side="right")
+        assert [row.configurations for row in rows] == np.bincount(place, minlength=3).tolist()
+
+
 def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), GRID, controls="camera.azimuth", samples=10, run=tmp_path / "run")
     summary = result.summary
@@ -495,7 +534,7 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     assert summary.interval == clopper_pearson(len(right), len(rows))
     assert summary.answers == {"vase": len(rows) - len(right)}
     by_axis = {(row.axis, str(row.value)): row for row in summary.axes}
-    assert len(by_axis) == len(summary.axes) == 6 + 3 + BINS
+    assert len(by_axis) == len(summary.axes) == 6 + 3 + parts_of_ranges(len(rows))
     for name in GRID:
         for value in {row.values[name]["value"] for row in rows}:
             mine = [row for row in rows if row.values[name]["value"] == value]

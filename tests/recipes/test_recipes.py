@@ -20,10 +20,10 @@ from advsearch.config import RecipeConfig, SweepConfig
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.recipes.columns import check_figures
 from advsearch.recipes.description import Recipe, names, read_recipe, titles
-from advsearch.recipes.figures import FIGURES, compute, draw, read_options
+from advsearch.recipes.figures import FIGURES, compute, draw, heat_map, read_options
 from advsearch.recipes.figures.answers import fitting
 from advsearch.recipes.parts import planned
-from advsearch.recipes.table import Answered, Table
+from advsearch.recipes.table import Answered, Table, count_of
 from advsearch.report.recipes import figure_table, told_once
 from advsearch.runs.images import write_png
 from advsearch.runs.results.attack import AnswerDistribution, FoundValue
@@ -341,11 +341,28 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
 # ---- what figures say -----------------------------------------------------------------------------------------------
 
 
+def test_of_few_answers_it_is_not_said_that_none_is_right() -> None:
+    def told(counts: dict[str, tuple[int, int]]) -> list[str]:
+        cells = [count_of(name, *one) for name, one in counts.items()]
+        return heat_map._said(cells, "objects", "environments")
+
+    few = told({"mug with noon": (0, 4), "bowl with noon": (3, 4)})
+    assert few[-1] == "1 of the pairs without a right answer has under 20 configurations: too few to say."
+    assert not any("No answer is right" in one for one in few)
+    many = told({"mug with noon": (0, 40), "bowl with noon": (0, 4), "bowl with loft": (30, 40)})
+    assert (
+        many[-2] == "No answer is right in 1 of 3 pairs: mug with noon (right in 0 of 40 (0 %, 95 % interval 0-9 %))."
+    )
+    assert not any("never" in one for one in many)
+
+
 def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_overlap() -> None:
     shown = figure(
         {"figure": "bars", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
     )
-    assert shown.text[0].startswith("Hardest is noon: right in 5 of 50 (10 %, 95 % interval 3-22 %); easiest is studio")
+    assert shown.text[0].startswith(
+        "Hardest is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); easiest is studio"
+    )
     assert shown.text[1].startswith("The difference is shown")
     assert [one.name for one in shown.bars] == ["studio", "loft", "noon"]
     hidden = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))

@@ -153,3 +153,36 @@ def test_page_and_markdown_have_every_claim_and_exclusion_and_no_markup_of_other
 def test_a_run_without_what_it_was_made_with_says_so() -> None:
     result = samples.attack()
     assert "not noted" in str(evidence_of("a", result, claims_of(result), {}, {}).made_with)
+
+
+def test_evidence_says_what_varied_how_far_and_what_judged() -> None:
+    drawn = {"camera.distance": {"unit": "object sizes", "low": 1.5, "high": 30.0}}
+    counted = {"configurations": 60, "correct": 30, "accuracy": 0.5, "interval": (0.3, 0.6)}
+    rows = [{**counted, "axis": "environment", "unit": "", "value": name} for name in ("cafe", "canteen")]
+    part = {**counted, "axis": "camera.distance", "unit": "object sizes", "value": (1.5, 8.0)}
+    swept = samples.sweep(axes=[*rows, part], drawn=drawn, controls=["camera"], sampler="random", grid={})
+    found = evidence_of("a", swept, claims_of(swept), {"trials": 20}, {}, {"iou": 0.5, "confidence": 0.25, "unit": ""})
+    assert "camera.distance: 1.5 to 30 object sizes, drawn by chance" in found.searched
+    assert "environment: cafe, canteen" in found.searched and not any("by default" in line for line in found.searched)
+    assert found.measured["Judged with"] == "iou 0.5, confidence 0.25"
+    assert found.measured["Trials of the worst configuration"] == "20" and "Trials" not in found.measured
+    assert "as many in each of the 2 environments" in found.claims[0].statement
+    azimuth = {"unit": "degrees", "low": 0.0, "high": 360.0}
+    over = {"camera.azimuth": azimuth, "environment.which": {"unit": "name", "names": ["noon", "studio"]}}
+    many = samples.attack(over=["camera", "environment"], conditions=over, verified=samples.rated(18, trials=18))
+    found = evidence_of("b", many, claims_of(many), {}, {})
+    assert "camera.azimuth: 0 to 360 degrees, by chance" in found.searched
+    assert "environment.which: noon or studio, by chance" in found.searched
+    assert found.about["Environment"] == "varied, see below; the clean scene has studio"
+    assert found.measured["Verification"].startswith("18 renders with fresh seeds that count, those of 20 in which")
+    assert found.excluded[0] == "Nothing varied but what stands under What varied, and the noise of the renders."
+
+
+def test_answers_of_several_models_to_the_same_pictures_are_not_counted_together() -> None:
+    one = {"configurations": 20, "correct": 5, "accuracy": 0.25, "interval": (0.1, 0.5), "axis": "model", "unit": ""}
+    rows = [{**one, "value": name} for name in ("first", "second")]
+    counts = {"configurations": 40, "correct": 10, "accuracy": 0.25}
+    swept = samples.sweep(**counts, model="first,second", axes=rows, ending="finished")
+    said = [claim for claim in claims_of(swept) if "is right in" in claim.statement]
+    assert [claim.extent and claim.extent.total for claim in said] == [20, 20]
+    assert [claim.statement.split()[2] for claim in said] == ["first", "second"]

@@ -78,11 +78,11 @@ def test_a_large_picture_keeps_its_size_and_nothing_changes_nothing() -> None:
     [
         ("classification", Answer("vase", 3, 0.913), "vase, 91 %"),
         ("detection", Answer("cup", 46, 0.762), "cup (score 0.76)"),
-        ("detection", Answer("no cup", None, 0.124), "no cup found (best 0.12)"),
+        ("detection", Answer("no cup", None, 0.124), "no cup found (best score of cup 0.12)"),
         ("detection", Answer("cup elsewhere", None, 0.7), "cup elsewhere (score 0.70)"),
         ("detection", Answer("out of view"), "out of view"),
         ("segmentation", Answer("background", 0, 0.031),
-         "accuracy over the object's pixels 3 %, most often background"),
+         "accuracy over the object's pixels 3.1 %, most often background"),
         ("yaw", Answer("30 degrees"), "30 degrees"),
     ],
 )  # fmt: skip
@@ -111,4 +111,4 @@ def test_margins_and_objectives_in_words() -> None:
     assert len({marks_text(task) for task in ("detection", "segmentation", "yaw")}) == 3
     assert wanted("vanish", "this mug") == "makes the model miss this mug"
     assert wanted("displace", "this mug") == "makes the model see this mug elsewhere"
-    assert cells("detection", Answer("no cup", None, 0.124)) == ["no cup found", "best 0.12"]
+    assert cells("detection", Answer("no cup", None, 0.124)) == ["no cup found", "best score of cup 0.12"]

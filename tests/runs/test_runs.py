@@ -787,7 +787,7 @@ def test_runs_are_listed_with_their_state(home: Path) -> None:
     make("b-found", attack(verified=rated(19), controls=["pose", "light"]))
     make("a-killed", None, rows=3)
     make("c-ctrl-c", attack(ending="interrupted", verified=None))
-    make("d-sweep", sweep(accuracy=0.875))
+    make("d-sweep", sweep(configurations=8, correct=7, accuracy=0.875))
     Path("runs/e-damaged").mkdir()
     Path("runs/e-damaged/results.sqlite").write_bytes(Path("runs/a-killed/results.sqlite").read_bytes()[:100])
     Path("runs/not-a-run").mkdir()
@@ -798,7 +798,7 @@ def test_runs_are_listed_with_their_state(home: Path) -> None:
     assert [one.state for one in found] == ["stopped", "found", "stopped", "finished", "stopped"]
     assert during["c-ctrl-c"] == "running" and during["b-found"] == "found"
     assert [one.rows for one in found] == [3, 2, 2, 2, 0]
-    assert [one.answer for one in found] == ["", "19/20", "", "accuracy 87.5%", ""]
+    assert [one.answer for one in found] == ["", "19/20", "", "right in 7 of 8", ""]
     assert found[1].controls == ("pose", "light") and found[0].controls == ("pose",)
     assert (found[0].object, found[0].command, found[4].object) == ("mug", "attack", "?")
     assert [finished(Path(one.path)) for one in found] == [False, True, False, True, False]

@@ -27,6 +27,7 @@ from samples import (
     rated,
 )
 
+from advsearch.attacks import clopper_pearson
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.report import wording
@@ -338,7 +339,7 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         (
             {"ending": "not verified", "verified": rated(3, 0.032, 0.379)},
             "The search claims an answer that is not confirmed: the model is wrong about this mug in 3 of 20 fresh"
-            " renders (95 % interval 3-38 %).",
+            " renders (95 % interval 3.2-38 %).",
         ),
         (
             {"ending": "already wrong", "clean": {**ATTACK["clean"], "label": "vase"}},
@@ -366,12 +367,12 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         (
             {**TARGET, "target": ["vase", "iron"], "ending": "budget spent", "verified": rated(2, 0.012, 0.317)},
             "No texture within 0.1 (linf) was found that makes the model call this mug a vase or an iron: the model"
-            " calls this mug a vase or an iron in 2 of 20 fresh renders (95 % interval 1-32 %). The budget is spent.",
+            " calls this mug a vase or an iron in 2 of 20 fresh renders (95 % interval 1.2-32 %). The budget is spent.",
         ),
         (
             {**TARGET, "ending": "not verified", "verified": rated(3, 0.032, 0.379)},
             "The search claims an answer that is not confirmed: the model calls this mug a vase in 3 of 20 fresh"
-            " renders (95 % interval 3-38 %).",
+            " renders (95 % interval 3.2-38 %).",
         ),
         (
             {**EASIER, "verified": rated(labels={"mug": 20})},
@@ -380,8 +381,8 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         (
             {**EASIER, "ending": "stalled", "verified": rated(3, 0.032, 0.379)},
             "No texture within 0.1 (linf) was found that makes this mug easier to recognise: the model recognises this"
-            " mug, more surely than in the clean scene, in 3 of 20 fresh renders (95 % interval 3-38 %). The policy had"
-            " nothing more to propose.",
+            " mug, more surely than in the clean scene, in 3 of 20 fresh renders (95 % interval 3.2-38 %). The policy"
+            " had nothing more to propose.",
         ),
         (
             {"over": ["camera"]},
@@ -470,13 +471,23 @@ def test_a_better_random_search_and_a_failing_control_group_are_said() -> None:
     ]
 
 
+def test_the_ends_of_an_interval_have_the_digits_that_fit_and_are_not_clamped() -> None:
+    assert wording.interval_text(clopper_pearson(1, 120)) == "0.02-4.6 %"
+    assert wording.interval_text(clopper_pearson(119, 120)) == "95.4-99.98 %"
+    assert wording.interval_text(clopper_pearson(1, 10_000)) == "0.0003-0.06 %"
+    assert wording.interval_text(clopper_pearson(60, 120)) == "41-59 %"
+
+
 @pytest.mark.parametrize(
     ("share", "text"),
     [
         (1.0, "100 %"),
         (0.0, "0 %"),
         (0.9987, "99.9 %"),
-        (0.99999, "99.9 %"),
+        (0.99999, "99.999 %"),
+        (0.999999999, "over 99.999999 %"),
+        (0.046, "4.6 %"),
+        (0.97, "97 %"),
         (0.8316, "83 %"),
         (0.001, "0.1 %"),
         (None, "unknown"),

@@ -22,6 +22,7 @@ from stored_sweeps import described, make_sweep, serving
 
 from advsearch.api.photos import Photographs
 from advsearch.config import AttackConfig
+from advsearch.report.phrases import answer_text, percent_number
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, LoggedEvaluation
 from advsearch.runs.results.base import Result
@@ -31,6 +32,7 @@ from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.stability import StabilityResult
 from advsearch.runs.store import Row, Store
+from advsearch.tasks import Answer
 from advsearch.viewer import thumbnails
 from advsearch.viewer.attack_page import write_report
 from advsearch.viewer.bundle import write_bundle
@@ -132,7 +134,7 @@ def explored(page: Page) -> None:
     said = page.locator("#explorer").inner_text()
     assert "camera.elevation [degrees]" in said and "light.power" in said and "[1]" not in said
     worst = page.locator('[data-cell="0,1,2"]')
-    assert "pose.yaw 90: right in 2 of 4 (50\xa0%, 6.8\xa0% to 93.2\xa0%)" in str(worst.get_attribute("aria-label"))
+    assert "pose.yaw 90: right in 2 of 4 (50\xa0%, 7\xa0% to 93\xa0%)" in str(worst.get_attribute("aria-label"))
 
     worst.hover()
     until(page, lambda: page.locator(".peek img").count() == 4)
@@ -273,7 +275,7 @@ def test_the_boxes_of_a_detector_lie_on_its_pictures(browser: Browser, tmp_path:
         image, drawing = page.locator(".card img").first.bounding_box(), page.locator(".card svg").first.bounding_box()
         assert image == drawing
         card = page.locator(".card").first
-        until(page, lambda: "no mug found (best 0.90)" in card.inner_text())
+        until(page, lambda: "no mug found (best score of mug 0.90)" in card.inner_text())
         page.get_by_label("Show", exact=True).select_option("wrong")  # "cup", which is none of those that were found
         assert page.locator(".card rect.said").count() == 0 and page.locator(".card rect.true").count() == 6
 
@@ -507,6 +509,27 @@ def test_without_a_script_there_are_still_pictures(
         assert not page.locator("#explorer, #compare, #search, #object").filter(visible=True).count()
         assert page.locator("h1").inner_text()
         assert page.locator("details").first.inner_text()
+
+
+def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) -> None:
+    """Those that the columns name, whatever was drawn; numbers and answers in words are those of the terminal."""
+    code = asset("sweep.js")
+    code = code[code.index("(() => {") : code.index("  // ---- the explorer")]
+    page = browser.new_page()
+    given = "{name: 'd', unit: '', levels: null, edges: [1, 10, 100], data: Float32Array.of(2, 10, 99, 50, 20)}"
+    made = page.evaluate(f"{code} return new Table().axis({given}); }})()")
+    assert made["labels"] == ["1 to 10", "10 to 100"] and made["level"] == [0, 1, 1, 1, 1]
+    numbers = (0.0, 0.0002, 0.0459, 0.5, 0.97, 0.9996, 1.0)
+    assert page.evaluate(f"{code} return {list(numbers)}.map(percentNumber); }})()") == list(
+        map(percent_number, numbers)
+    )
+    for task, label, share in (
+        ("detection", "no car", 0.15),
+        ("detection", "car", 0.8),
+        ("classification", "vase", 0.5),
+    ):
+        said = page.evaluate(f"{code} return said({task!r}, {label!r}, {share}); }})()")
+        assert said == answer_text(task, Answer(label, None, share)).replace(", ", " ").replace(" %", "\u00a0%")
 
 
 def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from advsearch.files import reading
 from advsearch.scene import library
 from advsearch.scene.assets import Material, Mesh, ObjectAsset, normalised
 from advsearch.scene.importing.objects import import_object
@@ -24,7 +25,8 @@ def loaded(spec: str) -> ObjectAsset:
         InputError: there is no such object, or the file cannot be used.
     """
     is_file = "/" in spec or "\\" in spec or Path(spec).suffix != ""
-    return centred(import_object(Path(spec)) if is_file else library.load_object(spec))
+    with reading(spec):
+        return centred(import_object(Path(spec)) if is_file else library.load_object(spec))
 
 
 def centred(asset: ObjectAsset) -> ObjectAsset:

@@ -16,7 +16,7 @@ from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import PictureSettings, Scene, framed
 from advsearch.engine.sweeps.axes import Axis, on_grid
-from advsearch.engine.sweeps.points import BINS, Drawn, Points
+from advsearch.engine.sweeps.points import Drawn, Points
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.scene.description import ENVIRONMENT
@@ -136,7 +136,8 @@ class Job:
         """The configurations of a space; those with an answer have the draws of those without it."""
         scenes = len(self.places) // 2 if self.places[0].answer else 0
         domain = domain_of(space.controls)
-        return Points(space, domain, self.axes, self.samples, self.sampler, self.pictures.seed, scenes)
+        among = len(self.places)
+        return Points(space, domain, self.axes, self.samples, self.sampler, self.pictures.seed, scenes, among)
 
     def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
         """What is true of a configuration, as the task of a model needs it.
@@ -220,7 +221,8 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     drawn = []
     for versions in zip(*(points.drawn for _, points in bound), strict=True):
         same = all(one.parts == versions[0].parts for one in versions)
-        drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=_shares()))
+        shares = tuple([k / first.parts, (k + 1) / first.parts] for k in range(first.parts))
+        drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=shares, settled=False))
     return first, tuple(drawn)
 
 
@@ -232,7 +234,3 @@ def _check_draws(place: NamedScene, space: Space) -> None:
                 f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes it; "
                 "leave it out of one of the two"
             )
-
-
-def _shares() -> tuple[list[float], ...]:
-    return tuple([k / BINS, (k + 1) / BINS] for k in range(BINS))

@@ -9,6 +9,7 @@ order, ends bit for bit as one that was not.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,6 +21,7 @@ from advsearch.attacks.product import batches
 from advsearch.cluster.executor import Done, Executor, InProcess
 from advsearch.described import Value
 from advsearch.engine.going_on import finite, same
+from advsearch.engine.loading import framed
 from advsearch.engine.machines import Machines
 from advsearch.engine.memory import Memory
 from advsearch.engine.pictures import save_marked
@@ -54,6 +56,7 @@ from advsearch.runs.results.sweep import (
 from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
+from advsearch.viewer.columns import EDGES
 from advsearch.viewer.sweep_page import write_page
 
 NOT_FINITE = "pictures not finite"
@@ -67,6 +70,9 @@ TELL_SECONDS = 0.1
 
 MOST_WAITING = 10_000
 """Batches that wait for an earlier one to be counted; where there are more, all rows are counted again at the end."""
+
+MOST_METERED = 256
+"""Scenes whose gains a summary lists; of more it has none."""
 
 READ_AT_ONCE = 256
 """Pictures whose places are worked out at once when rows are read back."""
@@ -88,6 +94,8 @@ class Sweep:
         self.job, self.run, self.stages = job, run, Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
         self.points, self._shown = check_all(job)
+        if run is not None:
+            run.store.set_note(EDGES, json.dumps({one.name: one.edges for one in self._shown if one.edges}))
         self.per_scene, self.models = self.points.count, len(job.models)
         self.total = len(job.places) * self.per_scene * self.models
         self.samples = job.spp
@@ -141,7 +149,7 @@ class Sweep:
                 tally = self._go_through(left, tally)
                 worst = self._claimed(tally)
                 if worst is not None:
-                    worst = worst.model_copy(update={"verified": self._verified(worst)})
+                    worst = worst.model_copy(update=self._verified(worst))
                 if self.job.surface and self.run is not None:
                     self.stages.begin("surface", "tracing the surface that was seen", self.total)
                     rows = self.run.store.rows(KIND)
@@ -342,22 +350,23 @@ class Sweep:
             values={name: DescribedValue.of(value) for name, value in row.values.items()},
             seed=self._seeds(points.draw(picks.number)),
             label_set=list(task.truth_names(truth)),
-            claimed=WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload),
+            claimed=_claim_of(seen),
             verified=None,
         )
 
-    def _verified(self, worst: WorstConfiguration) -> WorstVerified | None:
-        """What fresh renders say of it; keeps a picture."""
+    def _verified(self, worst: WorstConfiguration) -> dict[str, object]:
+        """What fresh renders say of it, and what the model says of the picture that is kept."""
         points, picks, model = self._find(worst.configuration)
         view = self._batches.open(picks.number // self.per_scene)
         u = points.configurations(picks)[0]
         checked = check_worst(view, self.job, model, u, self.run, self.stages)
-        if self.run is not None:
-            spp = max(PICTURE_SPP, checked.spp if checked else 0)
-            picture = view.picture(model, u, worst.seed, spp)
-            self.run.save_image("worst", picture)
-            save_marked(self.run, "worst", picture, view.marks(model, u, picture))
-        return checked
+        if self.run is None:
+            return {"verified": checked}
+        spp = max(PICTURE_SPP, checked.spp if checked else 0)
+        picture = view.picture(model, u, worst.seed, spp)
+        self.run.save_image("worst", picture)
+        save_marked(self.run, "worst", picture, view.marks(model, u, picture))
+        return {"verified": checked, "pictured": _claim_of(view.judge(model, u, picture))}
 
     def _find(self, index: int) -> tuple[Points, Picks, int]:
         """A configuration by its number: its scene's points, its picture, its model."""
@@ -373,6 +382,10 @@ class Sweep:
         job, seconds = self.job, self.stages.seconds
         view, checked = self._batches.view, worst.verified if worst else None
         swept = seconds.get("sweep", 0.0)
+        formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
+        gains = self._gains() if formation else {}
+        if formation is not None and len(set(gains.values())) != 1:
+            formation = formation.model_copy(update={"gain": None})
         summary = SweepSummary(
             run=None if self.run is None else str(self.run.path),
             object=job.object,
@@ -381,7 +394,9 @@ class Sweep:
             environment=self.points.environment or job.environment,
             controls=[control.name for control in job.controls],
             ending=ending,
-            image_formation=Formation.of(next(iter(view.renderers.values())).formation) if view else None,
+            image_formation=formation,
+            gains=gains if len(gains) > 1 else None,
+            drawn={one.name: one.varied for one in self._shown},
             planned=self.total,
             **vars(rate(tally.correct, tally.seen)),
             not_finite=tally.not_finite,
@@ -415,6 +430,16 @@ class Sweep:
             write_page(self.run.path, summary)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
 
+    def _gains(self) -> dict[str, float]:
+        """The gain of each scene, by object and environment, where there are not too many to meter."""
+        if len(self.job.places) > MOST_METERED:
+            return {}
+        size = self.job.sizes[0]
+        return {
+            f"{place.object}, {place.environment}": framed(place.scene.description, size).gain
+            for place in self.job.places
+        }
+
     def _beside(self, tally: Tally) -> BesideAnswer | None:
         """The clean scene and the answer of a run, where there is one."""
         if not self._pairs:
@@ -436,6 +461,10 @@ class Sweep:
                 "check takes: noise may take part in it."
             )
         return remarks
+
+
+def _claim_of(seen: Judgement) -> WorstClaim:
+    return WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload)
 
 
 def carry_out(job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None) -> SweepResult:

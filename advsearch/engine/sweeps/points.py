@@ -7,6 +7,7 @@ is compared in pairs, without an answer and with it, has the same ones.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,10 +26,12 @@ from advsearch.controls.base import BoundControl, Value
 from advsearch.controls.numbers import BoundNumbers
 from advsearch.controls.values import Fixed, OneOf, Range, to_value
 from advsearch.engine.sweeps.axes import Axis
+from advsearch.runs.results.base import VariedValue
 from advsearch.scene.description import ENVIRONMENT
 
-BINS = 10
-"""Equal parts into which the range of a drawn parameter is cut for the table."""
+MOST_PARTS, FEWEST_PARTS = 10, 2
+LEAST_IN_A_CELL = 5
+"""Draws that a cell of the map over two drawn parameters has on average, at least, where there are enough."""
 
 MOST_QUASI = 64
 """Numbers of a group up to which Sobol points are used; more (a texture) are drawn pseudo-randomly."""
@@ -69,12 +72,37 @@ class Drawn:
         unit: of the values.
         column: of `Picks.shares`.
         parts: what each part of [0, 1] stands for: a pair of ends, or a value of a list.
+        settled: whether these are its values in every scene.
     """
 
     name: str
     unit: str
     column: int
     parts: tuple[Any, ...]
+    settled: bool = True
+
+    @property
+    def varied(self) -> VariedValue:
+        """What it was drawn from."""
+        ends = [end for part in self.parts if isinstance(part, list) for end in part]
+        if ends:
+            return VariedValue(unit=self.unit, low=min(ends), high=max(ends))
+        return VariedValue(unit=self.unit, names=[str(one) for one in self.parts])
+
+    @property
+    def edges(self) -> list[float] | None:
+        """The ends of the parts, ascending; None of a list."""
+        if not self.settled or not all(isinstance(part, list) for part in self.parts):
+            return None
+        return sorted({end for part in self.parts for end in part})
+
+
+def parts_of_ranges(pictures: int) -> int:
+    """Return into how many equal parts the range of a drawn parameter is cut, by the pictures of the whole sweep.
+
+    The table, the map and the page (viewer/columns.py) show these parts.
+    """
+    return min(max(FEWEST_PARTS, math.isqrt(pictures // LEAST_IN_A_CELL)), MOST_PARTS)
 
 
 class Points:
@@ -88,8 +116,10 @@ class Points:
         sampler: of the draws.
         seed: root.
         scenes: number of scenes after which the draws come again, so that what is compared has the same; 0 for never.
+        among: how many scenes the sweep has.
 
     Attributes:
+        parts: into how many the range of a drawn parameter is cut.
         grid: sizes of the axes and the number of points.
         count: pictures of the scene.
         drawn: what the table shows of the draws.
@@ -97,10 +127,19 @@ class Points:
     """
 
     def __init__(
-        self, space: Space, domain: Domain, axes: Sequence[Axis], samples: int, sampler: str, seed: int, scenes: int = 0
+        self,
+        space: Space,
+        domain: Domain,
+        axes: Sequence[Axis],
+        samples: int,
+        sampler: str,
+        seed: int,
+        scenes: int = 0,
+        among: int = 1,
     ) -> None:
         self.grid = Product(tuple(len(axis.values) for axis in axes))
         self.samples, self.count = samples, self.grid.count * samples
+        self.parts = parts_of_ranges(self.count * among)
         self._again = scenes * self.count
         self._space, self._domain, self._axes = space, domain, tuple(axes)
         self._start = domain.start.numpy().astype(np.float64)
@@ -156,8 +195,10 @@ class Points:
         found = []
         for number in range(block.size):
             low, high = (float(ends[part.start + number]) for ends in (self._lower, self._upper))
-            edges = to_value(spec, parameter.log, torch.linspace(low, high, BINS + 1, dtype=torch.float64)).tolist()
-            parts = tuple([edges[k], edges[k + 1]] for k in range(BINS))
+            edges = to_value(
+                spec, parameter.log, torch.linspace(low, high, self.parts + 1, dtype=torch.float64)
+            ).tolist()
+            parts = tuple([edges[k], edges[k + 1]] for k in range(self.parts))
             found.append(Drawn(full + (f".{number}" if parameter.shape else ""), parameter.unit, first + number, parts))
         return found
 

@@ -115,9 +115,12 @@ class SweptScene:
 
     def trial(self, number: int, u: Tensor, seed: int, spp: int) -> Judgement:
         """What one model says of one configuration."""
-        size = self._job.sizes[number]
-        picture = self._pictures(self.renderers[size], u[None], [seed], spp)
-        return self._judged(number, picture, u[None], [self._spaces[size].describe(u)])[0]
+        return self.judge(number, u, self.picture(number, u, seed, spp))
+
+    def judge(self, number: int, u: Tensor, picture: Tensor) -> Judgement:
+        """What one model says of the picture (H, W, 3) of one configuration."""
+        values = self._spaces[self._job.sizes[number]].describe(u)
+        return self._judged(number, picture[None], u[None], [values])[0]
 
     def truth(self, number: int, u: Tensor, values: Mapping[str, Value]) -> Truth:
         """What is true of a configuration, as the task of one model needs it.

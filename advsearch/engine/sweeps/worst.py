@@ -14,7 +14,7 @@ from advsearch.attacks import Trials, choose_spp, run_trials
 from advsearch.attacks.sample_count import most_samples
 from advsearch.attacks.verification import RenderTrial
 from advsearch.engine.record import Stages
-from advsearch.engine.rows import judgement_of, trial_row, verified_rate
+from advsearch.engine.rows import judgement_of, rate_of, trial_row
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
@@ -81,7 +81,8 @@ def check_worst(
     trials = run_trials(render, u, spp=count.spp, seed=seed, trials=job.trials, on_trial=keep)
     settled = count.converged or len(ladder) == 1
     renders = count.renders + len(trials)
-    rate = verified_rate(Trials(sum(trial.success for trial in trials), len(trials), count.spp), trials)
+    wrong = [trial for trial in trials if trial.success]
+    rate = rate_of(Trials(len(wrong), len(trials), count.spp), trials, wrong)
     return WorstVerified(**vars(rate), converged=settled, renders=renders)
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from advsearch.recipes.figures.base import Kind, Options, extremes, plural
+from advsearch.recipes.figures.base import Kind, Options, extremes, plural, rate
 from advsearch.recipes.table import Table, count_of
 from advsearch.report.recipes import bare
 from advsearch.runs.results.recipe import HeatMapFigure, NamedCount
+
+ENOUGH = 20
+"""Configurations of a pair of which it is said that none is right: the interval of 0 of 20 ends at 17 %."""
 
 SHORT = 4
 """Letters that stand level under a column."""
@@ -56,9 +59,13 @@ def _named(value: str, column: str) -> str:
 
 def _said(cells: list[NamedCount], rows: str, columns: str) -> list[str]:
     known = [one for one in cells if one.configurations]
-    never = [one.name for one in known if one.correct == 0]
-    some = "; ".join(never[:4]) + (" and others" if len(never) > 4 else "")
-    said = [f"In {len(never)} of {len(known)} pairs the model is never right: {some}."] if never else []
+    none = [one for one in known if one.correct == 0]
+    enough = [one for one in none if one.configurations >= ENOUGH]
+    some = "; ".join(f"{one.name} ({rate(one)})" for one in enough[:4]) + ("; and others" if len(enough) > 4 else "")
+    said = [f"No answer is right in {len(enough)} of {len(known)} pairs: {some}."] if enough else []
+    if few := len(none) - len(enough):
+        have = "have" if few > 1 else "has"
+        said.append(f"{few} of the pairs without a right answer {have} under {ENOUGH} configurations: too few to say.")
     return [*extremes(cells, "The lowest pair", "the highest", f"pairs of {rows} and {columns}"), *said]
 
 

@@ -7,7 +7,16 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, Payload, SceneResult
+from advsearch.runs.results.base import (
+    CleanScene,
+    Fields,
+    Formation,
+    Interval,
+    Number,
+    Payload,
+    SceneResult,
+    VariedValue,
+)
 from advsearch.runs.results.plan import PlannedGradient
 
 
@@ -26,13 +35,16 @@ class FoundValue(DescribedValue):
     high: float | None = Field(default=None, description="the most")
 
 
-class UsualAnswer(Fields):
-    """What the model usually answers in trials of a configuration."""
+class PicturedAnswer(Fields):
+    """What the model says of the picture that is kept, which is that of a trial with the usual answer."""
 
     label: str
     index: int | None = Field(description="of the class")
-    probability: Number | None = Field(description="the mean over the trials with that answer")
-    payload: Payload = Field(default=None, description="what the task keeps of the first of these; absent without")
+    probability: Number | None = Field(description="of this answer; of a detector the score of the box")
+    payload: Payload = Field(default=None, description="what else the task keeps of it; absent without")
+    trial: int | None = Field(
+        default=None, description="number of the trial, the same for both pictures; absent where nothing was tried"
+    )
 
 
 class ControlGroup(Fields):
@@ -45,10 +57,10 @@ class ControlGroup(Fields):
     not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
-class CleanAnswer(CleanScene, UsualAnswer):
-    """What the model usually answers on the clean scene."""
+class CleanAnswer(CleanScene, PicturedAnswer):
+    """What the model says of the picture of the clean scene that is kept."""
 
-    correct: bool
+    correct: bool = Field(description="whether that is right")
     control: ControlGroup | None = Field(description="trials of the clean scene, and in how many it is right")
 
 
@@ -56,12 +68,12 @@ class VerifiedRate(Fields):
     """Trials with fresh seeds, and how many of them are a success."""
 
     successes: int
-    trials: int
+    trials: int = Field(description="that count: over conditions that vary, those whose clean scene is right")
     rate: float
     interval: Interval
     spp: int = Field(description="samples a pixel")
-    labels: dict[str, int] = Field(description="how often each wrong answer was given")
-    margin: Number = Field(description="mean over the trials, in logits")
+    labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
+    margin: Number = Field(description="mean over these trials, in logits; of a detector in log-odds")
     not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
@@ -127,6 +139,7 @@ class DifferentFailure(Fields):
     holds: bool | None = Field(description="whether it is verified; null if it was not tried")
     verified: VerifiedRate | None = Field(description="trials that ended as soon as that was clear; null: not tried")
     picture: str | None = Field(description="the first of these trials; null if there is none")
+    pictured: PicturedAnswer | None = Field(default=None, description="of that picture; absent if there is none")
 
 
 class FailingShare(Fields):
@@ -288,11 +301,14 @@ class AttackSummary(SceneResult):
     goal: str = Field(description="`a wrong answer`, `a target answer` or `a right answer`: what counts as success")
     target: list[str] | None = Field(description="the targets' names")
     over: list[str] = Field(description="the controls that varied by chance")
+    conditions: dict[str, VariedValue] = Field(
+        default={}, description="what they were drawn from; absent without, and of parameters of many numbers"
+    )
     image_formation: Formation
     gradient_plan: PlannedGradient
     light_path_segments: PathSegments
     clean: CleanAnswer
-    adversarial: UsualAnswer | None = Field(description="on the search's answer; null if nothing was searched")
+    adversarial: PicturedAnswer | None = Field(description="of the search's answer; null if nothing was searched")
     verified: VerifiedRate | None = Field(description="trials of the answer; null if nothing was verified")
     tried_objective: TriedObjective | None = Field(default=None, description="the objective over these trials")
     baseline: BaselineSearch | None = Field(default=None, description="the random search; absent without `baseline`")

@@ -124,6 +124,15 @@ class MovedValue(Fields):
     used: float | str = Field(description="the value that the clean scene has instead")
 
 
+class VariedValue(Fields):
+    """What a value was drawn from by chance."""
+
+    unit: str
+    low: float | None = Field(default=None, description="the least; absent of names")
+    high: float | None = Field(default=None, description="the most; absent of names")
+    names: list[str] | None = Field(default=None, description="of which one was drawn; absent of numbers")
+
+
 class CleanScene(Fields):
     """The scene that a search starts from."""
 
@@ -138,7 +147,9 @@ class Formation(Fields):
     sampler: str = Field(description="sampler of pixels")
     exposure: float = Field(description="stops over the metered one")
     resolution: tuple[int, int] = Field(description="[height, width], pixels")
-    gain: float = Field(description="from radiance to display-linear values")
+    gain: float | None = Field(
+        description="from radiance to display-linear values; null where scenes have gains of their own"
+    )
 
 
 def plain(value: Any) -> Any:

@@ -36,14 +36,23 @@ class RuleRow(RightOf):
     confirmed: RightOf | None = Field(description="fresh renders drawn inside the rule; null where none were asked for")
 
 
+class RuleNotTold(RightOf):
+    """The best rule that is not told from chance, counted on rows that did not choose it."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold")
+    elsewhere: RightOf = Field(description="rows under no rule so far")
+    chance: float = Field(description="how likely so few right answers are by chance (Fisher's exact test)")
+    asked: float = Field(description="how unlikely they would have to be")
+    rows: int | None = Field(description="of so many rows, with these shares, it would be told; null where of none")
+
+
 class ParameterWeight(Fields):
     """What one parameter, or two together, decide of the answer."""
 
     parameters: list[str]
-    share: Number = Field(description="Sobol index: of one alone, or of two beyond what each does alone")
-    interval: Interval
-    total: Number | None = Field(description="of one with all that it does together with others; null for two")
-    total_interval: Interval | None
+    share: Number = Field(description="of the variance of the answers, by which of its parts a value lies in")
+    interval: Interval = Field(description="of the share, 95 %")
+    parts: int = Field(default=0, description="into how many its values were cut, of two all pairs of parts")
 
 
 class EnvelopeRow(RightOf):
@@ -96,10 +105,8 @@ class ExplainResult(RunResult, RightOf):
     model: str
     parameters: list[str] = Field(description="what varies in all of the rows")
     rules: list[RuleRow]
-    explained: float | None = Field(
-        description="share of the variance of the answers that the importance accounts for; null where all are the same"
-    )
-    importance: list[ParameterWeight] = Field(description="empty where next to nothing is explained")
+    not_told: RuleNotTold | None = Field(default=None, description="the next rule, which is not told; absent without")
+    importance: list[ParameterWeight] = Field(description="empty where all answers are the same")
     envelope: EnvelopeRow | None = Field(description="null where no box promises it")
     pairs: list[NearestRight]
     pairs_sought: int = Field(

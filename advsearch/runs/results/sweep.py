@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork, VerifiedRate
-from advsearch.runs.results.base import Fields, Formation, Interval, Number, Payload, RunResult, having
+from advsearch.runs.results.base import Fields, Formation, Interval, Number, Payload, RunResult, VariedValue, having
 
 AxisValue = int | float | str | tuple[float, float]
 """A number, a name, or both ends of a part of a range."""
@@ -49,7 +49,7 @@ class SweepMap(Fields):
 
 
 class WorstClaim(Fields):
-    """What the sweep saw at its worst."""
+    """What the model says of one picture of the worst configuration."""
 
     label: str
     index: int | None
@@ -72,8 +72,9 @@ class WorstConfiguration(Fields):
     values: Annotated[dict[str, DescribedValue], having("object", "model")]
     seed: int
     label_set: list[str] = Field(description="the names that count as right there")
-    claimed: WorstClaim
+    claimed: WorstClaim = Field(description="of the sweep's own picture")
     verified: WorstVerified | None = Field(description="null where it was not rendered again")
+    pictured: WorstClaim | None = Field(default=None, description="of the picture that is kept; absent without")
 
 
 class SurfacePart(Fields):
@@ -158,6 +159,12 @@ class SweepSummary(CountedAnswers, RunResult):
     )
     worst: WorstConfiguration | None
     grid: dict[str, int] = Field(description="how many values each axis of the grid has")
+    gains: dict[str, float] | None = Field(
+        default=None, description="the gain of each scene, by object and environment; absent of one scene"
+    )
+    drawn: dict[str, VariedValue] = Field(
+        default={}, description="what each value was drawn from, of parameters of few numbers"
+    )
     samples: int = Field(description="draws at each point of the grid")
     sampler: str | None = Field(description="of the draws; null without any")
     spp: int = Field(description="samples a pixel")
@@ -180,8 +187,8 @@ class SweepSummary(CountedAnswers, RunResult):
 
     @property
     def brief(self) -> str:
-        """The accuracy; beside an answer, that without and with it."""
+        """How many are right; beside an answer, that without and with it."""
         if self.beside and self.beside.pairs:
             rates = self.beside.pairs[0]
             return f"accuracy {rates.clean.accuracy:.1%}, {rates.answer.accuracy:.1%} with {self.beside.answer}"
-        return "" if self.accuracy is None else f"accuracy {self.accuracy:.1%}"
+        return f"right in {self.correct} of {self.configurations}" if self.configurations else ""

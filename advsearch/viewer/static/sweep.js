@@ -3,7 +3,7 @@
 "use strict";
 (() => {
   const MOST_LEVELS = 40; // different numbers of a parameter that are shown one by one; of more, parts of its range
-  const PARTS = 12; // into which a range is cut
+  const PARTS = 10; // into which a range is cut of which the rows do not say the parts
   const SHOWN = 48; // pictures of the gallery at once
   const FOLLOW = 3000; // milliseconds between two looks at a sweep that goes on
   const MAP = [[0, 34, 78], [42, 63, 108], [87, 93, 109], [127, 124, 117], [166, 157, 117], [210, 193, 101], [254, 232, 56]];
@@ -40,7 +40,19 @@
 
   // ---- numbers -----------------------------------------------------------------------------------------------------
 
-  const percent = (share) => (share === null ? "none" : `${Math.abs(share * 100 - Math.round(share * 100)) < 0.05 ? Math.round(share * 100) : (share * 100).toFixed(1)}\u00a0%`);
+  // As `percent_number` in advsearch/report/phrases.py.
+  function percentNumber(share) {
+    const value = 100 * share, away = Math.min(value, 100 - value);
+    if (away >= 5 || away <= 0) return String(Math.round(value));
+    return String(Number(value.toFixed(Math.min(Math.max(1, -Math.floor(Math.log10(away))), 6))));
+  }
+  const percent = (share) => (share === null ? "none" : `${percentNumber(share)}\u00a0%`);
+  // An answer with its number, by what judges answers: as `cells` there.
+  function said(task, label, share) {
+    if (share === null) return label;
+    if (task === "detection") return label.startsWith("no ") ? `${label} found (best score of ${label.slice(3)} ${share.toFixed(2)})` : `${label} (score ${share.toFixed(2)})`;
+    return task === "segmentation" ? `accuracy ${percent(share)}, most often ${label}` : `${label} ${percent(share)}`;
+  }
   const short = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(4))));
   // The last part of each path, with as much before it as tells it from the others; names stay as they are.
   function shortened(names) {
@@ -154,10 +166,11 @@
         const names = given.levels !== null;
         let mine = this.parameters.find((one) => one.name === given.name && (one.levels !== null) === names);
         if (!mine) {
-          mine = { name: given.name, unit: given.unit, levels: names ? [] : null, data: null };
+          mine = { name: given.name, unit: given.unit, levels: names ? [] : null, edges: given.edges, data: null };
           if (names && before) mine.levels.push("none");
           this.parameters.push(mine);
         }
+        if (String(mine.edges) !== String(given.edges)) mine.edges = null; // sweeps over different ranges
         mine.data = grown(mine.data, names ? Uint16Array : Float32Array, names ? undefined : NaN);
         const from = arrays[`parameter ${number}`];
         if (names) this.put(mine.data, from, this.places(mine.levels, given.levels), before);
@@ -189,13 +202,18 @@
       return made;
     }
 
-    axis({ name, unit, levels, data }) {
+    axis({ name, unit, levels, edges, data }) {
       if (levels) return { name, unit, labels: shortened(levels), full: levels, level: data, names: true };
       const seen = new Set();
       for (let k = 0; k < data.length && seen.size <= MOST_LEVELS; k++) if (!Number.isNaN(data[k])) seen.add(data[k]);
+      const parts = Boolean(edges) || seen.size > MOST_LEVELS;
       const level = new Uint16Array(data.length);
       let labels, place;
-      if (seen.size <= MOST_LEVELS) {
+      if (edges) { // the parts of the table in the terminal (engine/sweeps/points.py), ascending
+        const inner = Float32Array.from(edges.slice(1, -1));
+        labels = edges.slice(1).map((end, k) => `${short(edges[k])} to ${short(end)}`);
+        place = (value) => inner.reduce((sum, edge) => sum + (value >= edge), 0);
+      } else if (!parts) {
         const sorted = [...seen].sort((a, b) => a - b);
         labels = sorted.map(short);
         const index = new Map(sorted.map((value, k) => [value, k]));
@@ -220,7 +238,7 @@
         } else level[k] = place(data[k]);
       }
       if (missing) labels = [...labels, "none"];
-      return { name, unit, labels, level, names: false, parts: seen.size > MOST_LEVELS };
+      return { name, unit, labels, level, names: false, parts };
     }
   }
 
@@ -431,7 +449,7 @@
           const cell = [part, row, column], value = values[place];
           const pinned = state.cell && state.cell.every((one, k) => one === cell[k]);
           const words = this.words(cell, counts, place, value);
-          const written = value === null ? "" : state.measure === "accuracy" ? String(Math.round(100 * value)) : short(Number(value.toPrecision(2)));
+          const written = value === null ? "" : state.measure === "accuracy" ? percentNumber(value) : short(Number(value.toPrecision(2)));
           return make("td", {}, make("button", { type: "button", class: value === null ? "cell none" : "cell", style: value === null ? {} : colour(shade(value)), "aria-label": words, "aria-pressed": pinned ? "true" : "false", tabindex: row === stop[1] && column === stop[2] ? 0 : -1, "data-cell": cell.join(",") }, written));
         })));
         rows.reverse();
@@ -514,7 +532,7 @@
     legend(low, high, shade) {
       const steps = Array.from({ length: 9 }, (_, k) => low + ((high - low) * k) / 8);
       const unit = { accuracy: "accuracy in %", margin: "mean margin; above 0: wrong", count: "configurations" }[this.state.measure];
-      const text = (value) => (this.state.measure === "accuracy" ? String(Math.round(100 * value)) : short(Number(value.toPrecision(2))));
+      const text = (value) => (this.state.measure === "accuracy" ? percentNumber(value) : short(Number(value.toPrecision(2))));
       this.parts.legend.replaceChildren(make("span", {}, unit), ...steps.map((value, k) => make("span", { class: "swatch", style: colour(shade(value)) }, k % 4 ? "" : text(value))));
     }
 
@@ -622,10 +640,7 @@
     // What was answered, with its probability or score: of an object that was missed, the best score that did not count.
     answered(k) {
       const { answer, probability, source } = this.table.columns, label = this.table.answers[answer[k]] || "no answer";
-      if (probability[k] === NO_PROBABILITY) return label;
-      if (this.table.sources[source[k]].task !== "detection") return `${label} ${percent(Math.round(probability[k] / 100) / 100)}`;
-      const score = (probability[k] / 10000).toFixed(2);
-      return label.startsWith("no ") ? `${label} found (best ${score})` : `${label} (score ${score})`;
+      return said(this.table.sources[source[k]].task, label, probability[k] === NO_PROBABILITY ? null : probability[k] / 10000);
     }
 
     card(k, open) {

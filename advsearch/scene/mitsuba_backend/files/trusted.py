@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
+from advsearch.files import note_opened
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
 from advsearch.scene.environments import import_environment, read_light
@@ -63,6 +64,7 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
         for candidate in (str(name), os.path.basename(str(name))):
             found = Path(os.path.realpath(os.path.join(path.parent, candidate)))
             if found.is_file() and found.is_relative_to(os.path.realpath(path.parent)):
+                note_opened(found)
                 return found
         raise FileFormatError(f"{path}: {kind} needs {shown(str(name))}; write its name as it is in the folder")
 
