@@ -52,9 +52,13 @@ def split_at_corners(
         flat: as in `ImportedPart`.
     """
     given = [one for one in (points, normals, uvs) if one is not None]
-    key = np.zeros(points.index.size, dtype=np.int64)
-    for one in given:  # numbered anew each time, so that the product of the counts does not overflow
-        key = np.unique(key * (len(one.values) + 1) + one.index.reshape(-1) + 1, return_inverse=True)[1].reshape(-1)
+    key, most = np.zeros(points.index.size, dtype=np.int64), 1
+    for one in given:
+        if most * (len(one.values) + 1) >= 2**63:  # numbered anew, so that it does not overflow
+            key = np.unique(key, return_inverse=True)[1].reshape(-1)
+            most = len(key)
+        key = key * (len(one.values) + 1) + one.index.reshape(-1) + 1
+        most *= len(one.values) + 1
     _, first, faces = np.unique(key, return_index=True, return_inverse=True)
 
     def rows(one: Looked | None) -> Array | None:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-MOST_WORK = 100_000_000
+MOST_WORK = 50_000_000
 """Points that are compared with ears, in all; then the polygons that are left are cut up as fans."""
 
 _FLAT = 1e-9  # twice the area of a triangle, as a share of that of its polygon, up to which it has none
