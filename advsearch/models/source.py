@@ -34,6 +34,8 @@ class Source:
         batch_limits: (fewest, most) images at once.
         dtype: floating type of the input.
         device: where its weights are.
+        of_names: of a network that compares pictures with texts and has no classes of its own: makes a classifier of
+            the names and the prompts that they stand in.
     """
 
     module: Callable[[torch.Tensor], Any]
@@ -47,6 +49,7 @@ class Source:
     batch_limits: tuple[int, int] = (1, 64)
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
+    of_names: Callable[[tuple[str, ...], tuple[str, ...]], Source] | None = None
 
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:

@@ -32,7 +32,7 @@ class Measured(TypedDict, total=False):
     channels: str
 
 
-def processor_of(transformers: Any, name: str, where: Mapping[str, str]) -> Any:
+def processor_of(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
     """Return the image processor of a repository or a folder; None where it has none. It never runs code of its own."""
     there = (
         transformers.utils.cached_file(name, file, _raise_exceptions_for_missing_entries=False, **where)
@@ -62,7 +62,8 @@ def measured(processor: Any, spec: str) -> Measured:
         values: Array = np.asarray(processor(images=picture, return_tensors="np")["pixel_values"], np.float64)
         if values.ndim != 4 or values.shape[:2] != (1, 3):
             raise _other(spec, processor, f"answers with an array of shape {values.shape} in place of (1, 3, H, W)")
-        return values[0]
+        picked: Array = values[0]
+        return picked
 
     black = shown((0, 0, 0))
     offset = black.mean(axis=(1, 2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from torch.nn import functional
 from advsearch.errors import ModelError
 from advsearch.models.model import ModelWarning
 from advsearch.models.source import Source, source_of
-from advsearch.models.zoo import timm
+from advsearch.models.zoo import timm, zero_shot
 from advsearch.models.zoo.library import library, reading
 from advsearch.models.zoo.processors import Measured, measured, processor_of
 
@@ -25,6 +26,8 @@ KINDS = {
     "ForObjectDetection": "AutoModelForObjectDetection",
 }
 """What the name of an architecture has in it, as ``DeiTForImageClassificationWithTeacher``, and what builds it."""
+COMPARES = "compares pictures with texts"
+"""The kind of an architecture such as ``CLIPModel``."""
 TIMM = "timm_wrapper"
 """The kind of a repository of timm."""
 ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has made as 'hf:FOLDER'"
@@ -32,6 +35,8 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network that classifies, segments or finds objects.
+
+    One that compares pictures with texts gets its classes from its user (`zero_shot`).
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
     image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
@@ -59,17 +64,18 @@ def load(spec: str) -> Source:
             return timm.load_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
-        kind = _kind(architecture, spec)
-        maker = getattr(transformers, KINDS[kind])
+        kind = _kind(architecture, getattr(transformers, architecture, None), spec)
+        maker = getattr(transformers, KINDS.get(kind, "AutoModel"))
         network, found = maker.from_pretrained(
             name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
         )
         _check_whole(found, spec)
         processor = processor_of(transformers, name, where)
         described = Measured() if processor is None else measured(processor, spec)
+        tokenizer = None if kind in KINDS else _tokenizer(transformers, name, where)
     if processor is None:
         warnings.warn(_UNPREPARED.format(spec=spec), ModelWarning, stacklevel=3)
-    return _source(network, kind, name.rstrip("/").rpartition("/")[2], described)
+    return _source(network, kind, name.rstrip("/").rpartition("/")[2], described, tokenizer)
 
 
 _UNPREPARED = (
@@ -90,8 +96,8 @@ def of_network(network: nn.Module) -> Source | None:
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
         return None
     spec = type(network).__name__
-    kind, origin = _kind(spec, spec), str(getattr(network, "name_or_path", "") or "")
-    described = None
+    kind, origin = _kind(spec, network, spec), str(getattr(network, "name_or_path", "") or "")
+    described = tokenizer = None
     if origin:
         try:
             with reading(spec, ""):
@@ -99,30 +105,49 @@ def of_network(network: nn.Module) -> Source | None:
                 described = None if processor is None else measured(processor, spec)
         except ModelError:  # it is not there any more: said below
             described = None
+    if kind not in KINDS:
+        with reading(spec, "Load it with from_pretrained, from where its tokenizer is beside it"):
+            tokenizer = _tokenizer(transformers, origin, {"local_files_only": True})
     if described is None:
         warnings.warn(_UNPREPARED.format(spec=spec), ModelWarning, stacklevel=4)
-    return _source(network, kind, spec, described or Measured())
+    return _source(network, kind, spec, described or Measured(), tokenizer)
 
 
-def _source(network: Any, kind: str, name: str, described: Measured) -> Source:
+def _tokenizer(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
+    return transformers.AutoTokenizer.from_pretrained(name, trust_remote_code=False, **where)
+
+
+def _source(network: Any, kind: str, name: str, described: Measured, tokenizer: Any) -> Source:
+    if kind == COMPARES:
+        return zero_shot.unnamed(network, tokenizer, name, described)
     labels = getattr(network.config, "id2label", None) or {}
     names = tuple(str(labels[key]) for key in sorted(labels, key=int))
     if all(re.fullmatch(r"LABEL_\d+", one) for one in names):  # what transformers puts where there are no names
         names = ()
-    module: nn.Module = {
+    made: dict[str, Callable[[], nn.Module]] = {
         "ForImageClassification": lambda: _Classifier(network),
         "ForSemanticSegmentation": lambda: _Segmenter(network),
         "ForObjectDetection": lambda: _Detector(network, len(labels)),
-    }[kind]()
-    return source_of(module, name, labels=names or None, **described)
+    }
+    return source_of(made[kind](), name, labels=names or None, **described)
 
 
-def _kind(architecture: str, spec: str) -> str:
-    """Return which of `KINDS` an architecture is of; a ModelError says what it is otherwise."""
+def _kind(architecture: str, network: Any, spec: str) -> str:
+    """Return which of `KINDS` an architecture is of, or `COMPARES`; a ModelError says what it is otherwise.
+
+    Args:
+        architecture: by name.
+        network: of it, or its class.
+        spec: the model, for messages.
+    """
     kind = next((kind for kind in KINDS if kind in architecture), None)
+    if kind is None and zero_shot.compares(network):
+        zero_shot.check_size_fixed(network, spec)
+        return COMPARES
     if kind is None:
         raise ModelError(
-            f"model {spec}: is a {architecture}; expected one of {', '.join(KINDS)}. Wrap another in an "
+            f"model {spec}: is a {architecture}; expected one of {', '.join(KINDS)}, or one that compares "
+            "pictures with texts, as CLIPModel. Wrap another in an "
             "nn.Module whose answer a task can judge, your own too, and give that from Python"
         )
     return kind
