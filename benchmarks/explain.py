@@ -69,14 +69,14 @@ def is_told(law: str, rules: list[CountedRule]) -> bool:
     return True
 
 
-ACCURACIES = {
+ACCURACIES: dict[str, Callable[[Numbers], Numbers]] = {
     "5, 12, 22 % by distance": lambda x: (
         0.05 + 0.17 * (x[:, 0] < 1 / 3) + 0.07 * ((x[:, 0] >= 1 / 3) & (x[:, 0] < 2 / 3))
     ),
     "steep in one": lambda x: 1.0 / (1.0 + np.exp(-10.0 * (x[:, 0] - 0.5))),
     "two of them": lambda x: 1.0 / (1.0 + np.exp(-4.0 * (x[:, 0] - 0.5) - 3.0 * (x[:, 1] - 0.5))),
     "one of two, not both": lambda x: np.where((x[:, 0] > 0.5) != (x[:, 1] > 0.5), 0.9, 0.15),
-    "rarely right": lambda x: 0.02 + 0.1 * (x[:, 0] > 0.7),
+    "rarely right": lambda x: np.where(x[:, 0] > 0.7, 0.12, 0.02),
     "nearly certain": lambda x: np.where(x[:, 0] > 0.6, 0.02, 0.98),
     "end-on and from the side": lambda x: np.where(np.abs(np.cos(2.0 * np.pi * x[:, 0])) > 0.8, 0.28, 0.71),
 }

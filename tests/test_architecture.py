@@ -251,7 +251,7 @@ def _imports(statement: ast.stmt, package: str) -> bool:
 
 # -- what is heavy ---------------------------------------------------------------------------------------------------
 
-LATE = ("torch", "mitsuba", "drjit", "scipy", "trimesh", "matplotlib", "pyarrow")
+LATE = ("torch", "mitsuba", "drjit", "scipy", "matplotlib", "pyarrow")
 SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
 
 
@@ -274,12 +274,12 @@ def test_nothing_heavy_is_imported_before_it_is_needed(code: str) -> None:
 
 
 def test_an_attack_on_what_is_bundled_needs_little() -> None:
-    """torch's compilers take two seconds, and only files of `torch.export` need them; trimesh takes half a second, and
-    only other meshes need it; a quarter goes to scipy.stats, which draws from nets."""
+    """torch's compilers take two seconds, and only files of `torch.export` need them; a quarter of one goes to
+    scipy.stats, which draws from nets."""
     code = (
         "import sys, advsearch.api.attack, advsearch.models.reference\n"
         "advsearch.api.attack.load_scene('mug', 'studio')\n"
-        "print([m for m in ('torch._dynamo', 'trimesh', 'networkx', 'scipy.stats') if m in sys.modules])"
+        "print([m for m in ('torch._dynamo', 'networkx', 'scipy.stats') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

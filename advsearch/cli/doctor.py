@@ -37,7 +37,7 @@ OPTIONAL = {"pyarrow": "advsearch export does not write Parquet"}
 
 PROBE = (sys.executable, "-m", "advsearch.cli.doctor_probe")
 
-_SMALL_PACKAGES = ("OpenEXR", "imageio", "matplotlib", "cma", "trimesh", "xatlas", "pyarrow")
+_SMALL_PACKAGES = ("OpenEXR", "imageio", "matplotlib", "cma", "xatlas", "pyarrow")
 _NO_FIX_NEEDED = ""
 
 

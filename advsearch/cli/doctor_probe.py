@@ -142,15 +142,6 @@ def cma() -> str:
     return f"pycma {library.__version__.split()[0]}"
 
 
-def trimesh() -> str:
-    """Make a cube."""
-    import trimesh
-
-    if abs(trimesh.creation.box().volume - 1.0) > 1e-6:
-        raise ArithmeticError("a cube's volume came out wrong")
-    return ""
-
-
 def xatlas() -> str:
     """Unwrap a triangle."""
     import numpy as np
@@ -171,7 +162,6 @@ TRIALS: dict[str, Callable[[], str]] = {
     "matplotlib": matplotlib,
     "cma": cma,
     "pyarrow": pyarrow,
-    "trimesh": trimesh,
     "xatlas": xatlas,
     "render": render,
     "mitsuba-oidn": denoise,

@@ -98,8 +98,6 @@ def load_environment(name: str) -> EnvironmentAsset:
 def _mesh(content: bytes) -> Mesh:
     """Decode a binary PLY as `scenes/` writes it: vertices, normals and texture coordinates, then triangles.
 
-    It is read here because trimesh takes half a second to import.
-
     Raises:
         ValueError: it is another PLY.
     """

@@ -107,9 +107,9 @@ def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Ma
     return alone, float(alone.sum()) / max(1, int(read.sum()))
 
 
-def texel_area(mesh: Mesh, shape: tuple[int, int]) -> Floats:
+def texel_area(mesh: Mesh, resolution: int | tuple[int, int]) -> Floats:
     """Return the surface area that each texel stands for, (h, w) in squared mesh units; 0 where no chart is."""
-    return rasterised(mesh, shape).areas()
+    return rasterised(mesh, resolution).areas()
 
 
 def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:

@@ -240,7 +240,7 @@ def test_over_conditions_caption_and_payload_are_of_the_picture_and_labels_of_th
     assert sum(summary.verified.labels.values()) == summary.verified.successes <= summary.verified.trials
     assert list(summary.conditions) == ["camera.exposure"]
     drawn = summary.conditions["camera.exposure"]
-    assert (drawn.unit, drawn.low, drawn.high) == ("stops", -1.5, pytest.approx(0.2))
+    assert drawn.unit == "stops" and (drawn.low, drawn.high) == pytest.approx((-1.5, 0.2))
     trial = summary.clean.trial
     assert trial is not None and trial == summary.adversarial.trial
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
@@ -253,7 +253,7 @@ def test_over_conditions_caption_and_payload_are_of_the_picture_and_labels_of_th
             shares = model(level - 0.01)(picture).softmax(dim=-1).flatten()
         assert said.probability == pytest.approx(float(shares.max()), abs=1e-6), "the caption is of the picture"
         row = rows[kind][trial]
-        assert (row.label, row.probability) == (said.label, pytest.approx(said.probability, abs=1e-6))
+        assert row.label == said.label and row.probability == pytest.approx(said.probability, abs=1e-6)
     assert len({round(row.probability or 0.0, 6) for row in rows["control"].values()}) > 12
 
 

@@ -39,11 +39,11 @@ SMALL: dict[str, Any] = {
 
 
 @pytest.fixture
-def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, int]]:
+def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, int | None]]:
     """Objects and steps of the attacks of a measurement; their stand-in finds an answer for books."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "labels.json").write_text(json.dumps(list(load().labels)))
-    done: list[tuple[str, int]] = []
+    done: list[tuple[str, int | None]] = []
 
     def attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
         done.append((config.object, config.steps))
@@ -56,7 +56,9 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
     return done
 
 
-def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_trains_measures_and_goes_on(
+    attacks: list[tuple[str, int | None]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     given = {**SMALL, "labels": "labels.json", "run": "run"}
     config = HardenConfig(**given)
     given.pop("model")
@@ -101,7 +103,7 @@ def work_of(config: HardenConfig, run: RunDirectory, course: Course) -> hardenin
     return hardening.Hardening(run, course, scenes, NullProgress())
 
 
-def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int]]) -> None:
+def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,light", "labels": "labels.json"})
     with RunDirectory.create_for(config) as run:
         course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), 0.1, 1, 0)
@@ -117,7 +119,9 @@ def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks
     shutil.rmtree(run.path)
 
 
-def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(attacks: list[tuple[str, int]]) -> None:
+def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
+    attacks: list[tuple[str, int | None]],
+) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,haze", "labels": "labels.json"})
     with RunDirectory.create_for(config) as run:
         course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), 0.1, 1, 0)
@@ -134,7 +138,7 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(attack
     shutil.rmtree(run.path)
 
 
-def test_workers_do_what_this_process_does(attacks: list[tuple[str, int]]) -> None:
+def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
     wanted: list[harden_scenes.Wanted] = [
         Drawing(TRAINING, 1, ("texture",), 1, 1),
@@ -155,7 +159,7 @@ def test_workers_do_what_this_process_does(attacks: list[tuple[str, int]]) -> No
                 torch.testing.assert_close(one.picture(one.texture.u), other.picture(other.texture.u))
 
 
-def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int]]) -> None:
+def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**SMALL, labels="labels.json")
     rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
     with RunDirectory.create_for(config) as run:
@@ -172,7 +176,7 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
 
 
 def test_a_round_ends_with_the_part_of_the_way_that_is_best(
-    attacks: list[tuple[str, int]], monkeypatch: pytest.MonkeyPatch
+    attacks: list[tuple[str, int | None]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = HardenConfig(**SMALL, labels="labels.json")
     net = torch.nn.Linear(2, 3)
@@ -217,7 +221,7 @@ def test_quick_is_less_of_what_nothing_is_said_of() -> None:
     ],
 )
 def test_what_cannot_be_hardened_is_refused_in_words(
-    attacks: list[tuple[str, int]], given: dict[str, Any], text: str
+    attacks: list[tuple[str, int | None]], given: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(InputError, match=text):
         hardening.harden_from_config(HardenConfig(**{**SMALL, "labels": "labels.json", **given}))

@@ -42,7 +42,7 @@ from advsearch.runs.store import Row
 from advsearch.scene.parameters import Parameter
 from advsearch.settings import Config, settings
 
-HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL", "trimesh")
+HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL")
 
 Api = Callable[..., Any]
 
@@ -119,7 +119,7 @@ def test_help_of_attack_shows_every_setting_with_range_and_default(capsys: pytes
         assert f"{setting.flag} " in text
         if setting.form != "switch":
             assert setting.expects in text and setting.unit in text
-    assert "a whole number from 1 to 1000000 (default: 40)" in text
+    assert "a whole number from 1 to 1000000 (default: 40; for textures and the like with --over " in text
     assert "in texels (default: chosen from the object's own)" in text
 
 

@@ -180,7 +180,7 @@ def test_a_cluster_is_an_address_a_file_or_this_machine(tmp_path: Path) -> None:
     assert set(CLASSES.values()) == {"dask_jobqueue", "dask_kubernetes.operator"}
 
 
-SCRIPTS = {
+ASKING = {
     "ask()": False,
     "with open(__file__):\n    ask()": False,
     "def main():\n    ask()\nmain()": False,
@@ -191,7 +191,7 @@ SCRIPTS = {
 }
 
 
-@pytest.mark.parametrize("text", SCRIPTS)
+@pytest.mark.parametrize("text", ASKING)
 def test_a_script_that_every_worker_would_run_again_is_told_what_to_do(tmp_path: Path, text: str) -> None:
     script = tmp_path / "script.py"
     begin = "from advsearch.cluster.opening import place_of\ndef ask():\n    place_of(2, None)\n"
@@ -200,8 +200,8 @@ def test_a_script_that_every_worker_would_run_again_is_told_what_to_do(tmp_path:
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environ, check=False)
     last = done.stderr.strip().rpartition("\n")[2]
     wanted = f'workers: expected {script} to ask under `if __name__ == "__main__":`, got a call outside of it, in line'
-    assert (wanted in last) is not SCRIPTS[text], done.stderr
-    assert SCRIPTS[text] or done.stderr.count("\n") < 20
+    assert (wanted in last) is not ASKING[text], done.stderr
+    assert ASKING[text] or done.stderr.count("\n") < 20
 
 
 def test_a_script_that_comes_through_a_pipe_has_no_workers() -> None:

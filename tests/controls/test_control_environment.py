@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls import make_control
+from advsearch.controls import Space, make_control
 from advsearch.errors import AdvsearchError, FileFormatError, InputError
 
 SIZE = 16
@@ -49,9 +49,9 @@ def test_each_looks_as_the_scene_in_it(maps: tuple[str, str]) -> None:
 def test_beside_a_bundled_one_the_table_stays_and_is_said(maps: tuple[str, str]) -> None:
     scene = advsearch.load_scene("mug", environment="noon")
     renderer = scene.renderer({"environment": {"which": ["own", *maps]}}, resolution=SIZE, denoise="none")
+    assert isinstance(renderer.space, Space) and renderer.space.scene is not None
     assert renderer.space.describe(torch.tensor([0.5]))["environment.which"]["value"] == maps[0]
     np.testing.assert_allclose(renderer(renderer.start, 0, 16), shown(scene, "pose"), atol=2e-5)
-    assert renderer.space.scene is not None
     assert "red, blue: the object stands on the scene's table" in renderer.space.scene.notes[-1]
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import Trials
-from advsearch.engine.rows import control_group, judgement_of, trial_row, verified_rate
+from advsearch.engine.rows import control_group, judgement_of, rate_of, trial_row
 from advsearch.errors import InputError
 from advsearch.report import wording
 from advsearch.report.phrases import calls, cells
@@ -35,12 +35,12 @@ def test_a_row_has_no_name_and_comes_back_as_what_it_was() -> None:
 
 def test_trials_without_a_number_are_counted_and_means_are_of_the_others() -> None:
     trials = [NOTHING, WRONG, RIGHT, NOTHING]
-    rate = verified_rate(Trials(1, 4, 16), trials)
+    rate = rate_of(Trials(1, 4, 16), trials, [WRONG])
     assert (rate.not_a_number, rate.margin, rate.labels) == (2, 1.0, {"vase": 1})
     control = control_group(trials, 16)
     assert (control.correct, control.trials, control.not_a_number) == (1, 4, 2)
-    assert math.isnan(verified_rate(Trials(0, 2, 16), [NOTHING, NOTHING]).margin)
-    assert "not_a_number" not in verified_rate(Trials(1, 2, 16), [WRONG, RIGHT]).to_dict()
+    assert math.isnan(rate_of(Trials(0, 2, 16), [NOTHING, NOTHING], []).margin)
+    assert "not_a_number" not in rate_of(Trials(1, 2, 16), [WRONG, RIGHT], [WRONG]).to_dict()
 
 
 def told(successes: int, nothing: int) -> AttackSummary:

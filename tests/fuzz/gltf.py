@@ -316,7 +316,10 @@ def looks(random: Random) -> Case:
             texture["sampler"] = random.choice((0, 0, 0, 1))
     if what in ("sampler", "transform"):
         moved = {"offset": [random.choice(numbers)] * 2, "scale": [random.choice(numbers), 1.0]}
-        moved |= random.choice(({}, {"rotation": random.choice(numbers)}, {"texCoord": random.choice(INTEGERS)}))
+        further: tuple[dict[str, Any], ...] = (
+            {}, {"rotation": random.choice(numbers)}, {"texCoord": random.choice(INTEGERS)},
+        )  # fmt: skip
+        moved |= random.choice(further)
         uses = (material["pbrMetallicRoughness"]["baseColorTexture"], material["normalTexture"])
         for use in random.sample(uses, random.choice((1, 2))):
             use["extensions"] = {"KHR_texture_transform": moved}

@@ -360,7 +360,7 @@ def test_the_picture_of_a_material_file_is_reduced_with_a_word(tmp_path: Path) -
     asset = import_object(tmp_path / "thing.obj", up="z")
     words = "thing.obj: the texture 'long.png' of 2,048 x 2 texels is averaged down to 1,024 x 1"
     assert words in asset.warnings
-    mean = srgb_to_linear(np.array([10, 250], np.float32) / 255).mean(keepdims=True)
+    mean = srgb_to_linear(np.array([10, 250], np.float32) / np.float32(255)).mean(keepdims=True)
     assert asset.base_color[0, 0, 0] == pytest.approx(linear_to_srgb(mean)[0], abs=1e-5)
     assert asset.base_color[0, 1] == pytest.approx([0, 90 / 255, 0], abs=1e-5)
 
@@ -464,13 +464,15 @@ EVENLY = some.floats(0.0, 1.0, width=32)
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(data=some.data())
 def test_whatever_a_file_has_is_read_right_or_named(data: some.DataObject) -> None:
-    one_of = lambda *values: data.draw(some.sampled_from(values))  # noqa: E731
+    def one_of(*values: Any) -> Any:
+        return data.draw(some.sampled_from(values))
+
     random = np.random.default_rng(data.draw(some.integers(0, 1000)))
     file, held, said = File(), {}, set[str]()
     surface: dict[str, Any] = {}
     wraps = one_of(REPEAT, MIRRORED, CLAMPED), one_of(REPEAT, MIRRORED, CLAMPED)
     filter, transform = one_of(None, NEAREST, LINEAR), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    pixels = random.integers(0, 256, (one_of(1, 2, 3, 5), one_of(1, 2, 3, 5), 3), np.uint8)
+    pixels = random.integers(0, 256, (one_of(1, 2, 3, 5), one_of(1, 2, 3, 5), 3), dtype=np.uint8)
     textured = one_of(True, True, False)
     if textured:
         sampler = {"wrapS": wraps[0], "wrapT": wraps[1], **({} if filter is None else {"magFilter": filter})}

@@ -103,7 +103,7 @@ def test_a_search_predicts_verifies_and_draws(
     found = answer(capsys, "attack", "--object", "mug", *asked, *flags)
     assert found["ending"] == "found" and found["transport"]["used"] and found["clean"]["correct"]
     assert found["objective"] == ("score" if detects else "pixel_margin")
-    assert set(found["verified"]["labels"]) == ({"bowl"} if detects else {"background"})
+    assert set(found["verified"]["labels"]) == ({"bowl"} if detects else {"no mug"})
     assert found["adversarial"]["payload"].keys() == ({"box", "found"} if detects else {"accuracy", "iou", "pixels"})
     with Store(run / "results.sqlite", read_only=True) as store:
         assert {type(row.payload) for row in store.rows("verification")} == {dict}
