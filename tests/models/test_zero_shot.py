@@ -178,7 +178,7 @@ def test_many_names_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.Monkey
     together = load_model(spec, labels=NAMES)(PICTURES)
     monkeypatch.setattr("advsearch.models.zoo.zero_shot.TEXTS", 3)
     assert float((load_model(spec, labels=NAMES)(PICTURES) - together).abs().max()) < 1e-4
-    with pytest.warns(ModelWarning, match="reads 'airplane' and 'automobile' as the same text"):
+    with pytest.warns(ModelWarning, match=r"reads 'airplane' \(#0\) and 'automobile' \(#1\) as the same"):
         assert load_model(spec, labels="cifar10").labels == read_labels("cifar10")
 
 
@@ -189,6 +189,8 @@ def test_a_network_from_python_brings_its_tokenizer(tmp_path: Path) -> None:
     assert float((model(PICTURES) - load_model(f"hf:{tmp_path}", labels=NAMES)(PICTURES)).abs().max()) < 1e-5
     assert network.text_model is not None, "the caller's network is left as it is"
     made = transformers.CLIPModel(transformers.CLIPConfig(vision_config=SIZES, text_config=SIZES))
+    with pytest.warns(ModelWarning, match=r"reads 'mug' \(#0\) and 'mug' \(#2\) as the same text"):
+        load_model(network, labels=["mug", "cup", "mug", "bowl"])
     with pytest.raises(ModelError, match="Load it with from_pretrained, from where its tokenizer"):
         load_model(made, labels=NAMES)
 

@@ -103,7 +103,7 @@ def _encoded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Mapping[str,
         InputError: one is longer than the network reads.
     """
     most = min(int(network.config.text_config.max_position_embeddings), int(tokenizer.model_max_length))
-    for text, tokens in zip(texts, tokenizer(list(texts))["input_ids"], strict=True):
+    for text, tokens in zip(texts, tokenizer(list(texts), verbose=False)["input_ids"], strict=True):
         if len(tokens) > most:
             raise InputError(f"prompt: expected texts of at most {most} tokens, got {len(tokens)}: {text[:80]!r}")
     padding = "max_length" if hasattr(network, "logit_bias") else True
@@ -161,12 +161,13 @@ def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, describ
 
 def _say_what_is_one(tokenizer: Any, texts: Sequence[str], names: Sequence[str], name: str) -> None:
     """Warn of names that are the same to the network: in another case, say, or of words that it does not know."""
-    seen: dict[tuple[int, ...], str] = {}
-    for one, tokens in zip(names, tokenizer(list(texts))["input_ids"], strict=True):
-        other = seen.setdefault(tuple(tokens), one)
-        if other is not one:
+    seen: dict[tuple[int, ...], int] = {}
+    for number, tokens in enumerate(tokenizer(list(texts), verbose=False)["input_ids"]):
+        first = seen.setdefault(tuple(tokens), number)
+        if first != number:
             warnings.warn(
-                f"model {name} reads {other!r} and {one!r} as the same text: it cannot tell one from the other",
+                f"model {name} reads {names[first]!r} (#{first}) and {names[number]!r} (#{number}) as the same text: "
+                "it cannot tell one from the other",
                 ModelWarning,
                 stacklevel=5,
             )
