@@ -221,6 +221,12 @@ def test_patches_are_refused(tmp_path: Path) -> None:
         load_model(spec, labels=NAMES)
 
 
+def test_repositories_of_open_clip_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "open_clip_config.json").write_text("{}")
+    with pytest.raises(ModelError, match="is a repository of open_clip, which transformers can't read; give the netw"):
+        load_model(f"hf:{tmp_path}", labels=NAMES)
+
+
 def test_scores_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = published(tmp_path)
     forward = transformers.CLIPModel.forward

@@ -6,6 +6,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,7 @@ def load(spec: str) -> Source:
         transformers.utils.logging.disable_progress_bar()
     where = {"revision": revision} if revision else {}
     with reading(spec, ADVICE):
+        _check_not_open_clips(transformers, name, spec, where)
         told, _ = transformers.PretrainedConfig.get_config_dict(name, **where)
         if told.get("model_type") == TIMM:
             return timm.load_repository(spec, name, revision)
@@ -151,6 +153,16 @@ def _kind(architecture: str, network: Any, spec: str) -> str:
             "nn.Module whose answer a task can judge, your own too, and give that from Python"
         )
     return kind
+
+
+def _check_not_open_clips(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> None:
+    """Raise a ModelError for a repository that has the files of open_clip and none of transformers."""
+    has = partial(transformers.utils.cached_file, name, _raise_exceptions_for_missing_entries=False, **where)
+    if not has("config.json") and has("open_clip_config.json"):
+        raise ModelError(
+            f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
+            "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
+        )
 
 
 def _check_whole(told: Any, spec: str) -> None:
