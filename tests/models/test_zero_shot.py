@@ -43,10 +43,10 @@ def tokenizer() -> Any:
 
 
 def loud(network: Any) -> Any:
-    """The network with random weights that are large enough for answers that differ."""
+    """The network with random weights that are large enough for answers that differ, always the same."""
     generator = torch.Generator().manual_seed(0)
-    for parameter in network.parameters():
-        if parameter.dim() > 1:
+    for name, parameter in network.named_parameters():
+        if parameter.dim() > 1 or "embedding" in name:
             parameter.data = torch.randn(parameter.shape, generator=generator) * 0.3
     return network
 
@@ -92,7 +92,7 @@ def test_logits_are_the_librarys(tmp_path: Path, family: str) -> None:
     assert not [key for key in model.module.state_dict() if "text" in key], "the half for texts is not kept"
 
 
-@pytest.mark.parametrize("family", ["AltCLIP", "ChineseCLIP", "Align", "Blip", "CLIPSeg", "MetaClip2"])
+@pytest.mark.parametrize("family", ["AltCLIP", "ChineseCLIP", "Align"])
 def test_other_pairs_are_read_likewise(tmp_path: Path, family: str) -> None:
     """Whatever has two such halves is compared with the library's own score when it is loaded."""
     texts = [f"a photo of a {name}" for name in NAMES]
@@ -232,12 +232,12 @@ def test_scores_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.
     forward = transformers.CLIPModel.forward
 
     @wraps(forward)
-    def squared(network: Any, **given: Any) -> Any:
+    def moved(network: Any, **given: Any) -> Any:
         answer = forward(network, **given)
-        answer.logits_per_image = answer.logits_per_image**2
+        answer.logits_per_image = answer.logits_per_image + 1.0
         return answer
 
-    monkeypatch.setattr(transformers.CLIPModel, "forward", squared)
+    monkeypatch.setattr(transformers.CLIPModel, "forward", moved)
     with pytest.raises(ModelError, match="is a CLIPModel, whose scores are no scaled cosine"):
         load_model(spec, labels=NAMES)
 

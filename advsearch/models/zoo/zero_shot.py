@@ -21,7 +21,7 @@ from advsearch.models.zoo.processors import Measured
 TEXTS = 64
 """Texts that are embedded at once."""
 
-TOLERANCE = 1e-3
+TOLERANCE = 1e-4
 """What a score may be off from the network's own, as a share of the largest or of the scale."""
 
 
