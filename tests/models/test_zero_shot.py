@@ -24,7 +24,14 @@ WORDS = "a photo of this is the book bad big , . mug cup bowl vase coffee".split
 SPECIAL = ["[PAD]", "[UNK]", "[CLS]", "[SEP]"]
 PICTURES = torch.rand((2, SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
 SIZES = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 8}
-READS = {"vocab_size": 40, "max_position_embeddings": 12, "pad_token_id": 0, "bos_token_id": 2, "eos_token_id": 3}
+READS = {
+    "vocab_size": 40,
+    "max_position_embeddings": 12,
+    "pad_token_id": 0,
+    "bos_token_id": 2,
+    "eos_token_id": 3,
+    "attention_dropout": 0.5,
+}
 SIGMOID = "judges each name by itself, with a sigmoid of its logit: the scores that are shown are a softmax over the"
 SIGLIP = pytest.mark.filterwarnings("ignore:.*judges each name by itself")
 
@@ -184,10 +191,10 @@ def test_many_names_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_network_from_python_brings_its_tokenizer(tmp_path: Path) -> None:
     published(tmp_path)
-    network = transformers.CLIPModel.from_pretrained(tmp_path)
+    network = transformers.CLIPModel.from_pretrained(tmp_path).train()
     model = load_model(network, labels=NAMES)
     assert float((model(PICTURES) - load_model(f"hf:{tmp_path}", labels=NAMES)(PICTURES)).abs().max()) < 1e-5
-    assert network.text_model is not None, "the caller's network is left as it is"
+    assert network.text_model is not None and network.training, "the caller's network is left as it is"
     made = transformers.CLIPModel(transformers.CLIPConfig(vision_config=SIZES, text_config=SIZES))
     with pytest.warns(ModelWarning, match=r"reads 'mug' \(#0\) and 'mug' \(#2\) as the same text"):
         load_model(network, labels=["mug", "cup", "mug", "bowl"])

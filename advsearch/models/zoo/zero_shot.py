@@ -64,11 +64,11 @@ def _named(
     """
     if len(names) < 2:
         raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
-    spoken = _spoken(names)
-    scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
-    alone = hasattr(network, "logit_bias")
+    spoken, alone = _spoken(names), hasattr(network, "logit_bias")
     try:
         with torch.no_grad():
+            network = sharing_copy(network).eval()
+            scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
             each = [_embedded(network, tokenizer, [one.replace("{}", word) for word in spoken]) for one in prompts]
             head = nn.Linear(each[0].shape[1], len(names))
             head.weight.copy_(scale.float() * functional.normalize(torch.stack(each).mean(dim=0), dim=-1))
