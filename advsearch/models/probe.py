@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -21,6 +22,9 @@ PROBABILITY_TOLERANCE = 1e-3
 
 #: Rows that are non-negative and sum to 100 within this share of it are taken for percentages.
 PERCENT_TOLERANCE = 5e-3
+
+#: How far from [0, 1] colours are that show whether scores stay in it whatever the picture is.
+FAR = 1000.0
 
 ODD_ADVICE = (
     "They are taken for logits: the probabilities that are shown are none, and margins are differences of such scores. "
@@ -186,13 +190,17 @@ def _probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bo
 def _odd_scores(model: Model, rows: Tensor) -> str:
     """What rows of scores (N, classes) are that are neither logits nor probabilities; empty of others.
 
-    A black picture tells a sigmoid from means of the picture, which are 0 there.
+    A black picture tells a sigmoid from means of the picture, which are 0 there; colours far outside of [0, 1] tell it
+    from logits that are small, as those of a network that is not trained.
     """
     least = float(rows.min())
     if least >= 0.0 and float(rows.max()) <= 1.0:
         with torch.no_grad():
-            black = _run(model, torch.zeros(1, *model.input_size, 3))
-        rows = torch.cat([rows, black])
+            height, width = model.input_size
+            far = torch.linspace(0.0, FAR, 3 * height * width).reshape(height, width, 3)
+            rows = torch.cat([rows, _run(model, torch.zeros_like(far)[None])])
+            with suppress(ModelError):  # it may refuse such colours
+                rows = torch.cat([rows, _run(model, torch.stack([far, -far]))])
     if 0.0 <= float(rows.min()) and float(rows.max()) <= 1.0 and bool(rows.any(dim=1).all()):
         return "scores in [0, 1] that do not sum to 1, as after a sigmoid for each class"
     if least >= 0.0 and bool(((torch.exp(-rows).sum(dim=1) - 1.0).abs() < PROBABILITY_TOLERANCE).all()):

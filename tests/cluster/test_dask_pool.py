@@ -87,7 +87,7 @@ def test_a_worker_that_takes_long_to_start_again_is_waited_for(tmp_path: Path) -
 @contextmanager
 def started(*words: str) -> Iterator[subprocess.Popen[bytes]]:
     """A process of Dask's own command line, which is ended at the end of the block."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     process = subprocess.Popen([str(SCRIPTS / "dask"), *words], env=environment, start_new_session=True, **quiet)  # type: ignore[call-overload]
     try:

@@ -397,6 +397,26 @@ def test_scores_that_are_neither_logits_nor_probabilities_are_warned_of(
         assert not load_model(Answering(function), input_size=8).probabilities
 
 
+def test_logits_that_are_small_are_no_such_scores() -> None:
+    """As those of a network that is not trained."""
+
+    class Untrained(nn.Module):
+        def forward(self, x: Tensor) -> Tensor:
+            return 0.4 + 0.1 * x.mean(dim=(2, 3))
+
+    assert not load_model(Untrained(), input_size=8).probabilities
+
+
+def test_a_sigmoid_is_told_where_colours_outside_of_a_picture_are_refused() -> None:
+    class Refusing(nn.Module):
+        def forward(self, x: Tensor) -> Tensor:
+            assert bool(((x >= 0.0) & (x <= 1.0)).all()), "no picture"
+            return x.mean(dim=(2, 3)).sigmoid()
+
+    with pytest.warns(ModelWarning, match="as after a sigmoid"):
+        load_model(Refusing(), input_size=8)
+
+
 def test_a_random_model_is_named_as_such() -> None:
     with pytest.warns(ModelWarning, match=r"answers the same image differently each time"):
         load_model(Answering(lambda z: z + torch.rand_like(z)), input_size=8)
