@@ -370,7 +370,7 @@ def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tup
 
 def _model(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
     """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
-    models, warnings = load_models(several(model), task, labels=config.labels, used_threads=config.used_threads)
+    models, warnings = load_models(several(model), task, config)
     return models[0] if config.ensemble is None else together(models, config.resolution), warnings
 
 

@@ -216,9 +216,7 @@ def _label_for_all(config: AttackConfig) -> list[str]:
         return []
     bundled = list_objects()
     own = {name: load_object(name).label if name in bundled else None for name in config.objects}
-    models, _ = load_models(
-        [config.model], make_task(config.task), labels=config.labels, used_threads=config.used_threads
-    )
+    models, _ = load_models([config.model], make_task(config.task), config)
     return one_label_for_several(models, config.label, own)
 
 

@@ -122,7 +122,7 @@ def _carry_out(
     progress.stage(LOADING)
     RunSettings(config.epsilon, config.norm, config.texture_resolution).check(config.controls)
     task = make_task(config.task)
-    (loaded, *_), warnings = load_models([model], task, labels=config.labels, used_threads=config.used_threads)
+    (loaded, *_), warnings = load_models([model], task, config)
     student = trainable(loaded, config.layers)
     splits = splits_of(config, loaded)
     order = seeds.stream(config.seed, "order")

@@ -153,7 +153,7 @@ def scenes_of(settings: JsonObject) -> Call:
     """Return what does what is wanted of scenes of the hardening that the settings describe: what a worker does."""
     config = HardenConfig(**settings)
     task = make_task(config.task)
-    (model, *_), _ = load_models([config.model], task, labels=config.labels, used_threads=config.used_threads)
+    (model, *_), _ = load_models([config.model], task, config)
     gc.freeze()  # what a scene leaves is collected after each; a sixth of the time goes into looking at all the rest
     return SceneWork(config, model, splits_of(config, model))
 

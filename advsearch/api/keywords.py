@@ -42,7 +42,8 @@ class PictureKeywords(TypedDict, total=False):
     set: Mapping[str, float | str | Sequence[float]] | None
     exposure: float | None
     resolution: int | str | tuple[int, int] | None
-    labels: str | Path | None
+    labels: Path | Names | None
+    prompt: Names | None
     label: int | Names | None
     texture_resolution: int | None
     denoise: Literal["oidn", "none"]
@@ -133,7 +134,8 @@ class HardenKeywords(RunKeywords, total=False):
     set: Mapping[str, float | str | Sequence[float]] | None
     exposure: float | None
     resolution: int | str | tuple[int, int] | None
-    labels: str | Path | None
+    labels: Path | Names | None
+    prompt: Names | None
     texture_resolution: int | None
     denoise: Literal["oidn", "none"]
     pixel_sampler: Literal["independent", "multijitter"]
@@ -196,7 +198,8 @@ class RecipeKeywords(RunKeywords, total=False):
     up: Literal["y", "z"] | None
     resolution: int | str | tuple[int, int] | None
     model: Path | Names | None
-    labels: str | Path | None
+    labels: Path | Names | None
+    prompt: Names | None
     task: Named | None
     label: str | Mapping[str, str]
     seed: int

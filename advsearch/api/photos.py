@@ -210,7 +210,7 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
     made = make_task(config.task)
     if made.varies:
         return _by_sweep(config) if isinstance(config, SweepConfig) else _by_attack(run, config)
-    models, _ = load_models(config.models, made, labels=config.labels, used_threads=config.used_threads)
+    models, _ = load_models(config.models, made, config)
     given, judges = scene_settings(config.set_, config.exposure), []
     for model in models:
         task = made.on(model)

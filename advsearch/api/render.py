@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
 
 from advsearch.config import RenderConfig
 from advsearch.engine import rendering
@@ -33,7 +33,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     if aovs and config.around is not None:
         raise InputError("aov: is of one view; leave `around` out")
     for spec in (config.object, config.environment, config.model, config.labels):
-        if spec is not None and out.exists() and Path(spec).exists() and out.samefile(spec):
+        if spec is not None and out.exists() and os.path.exists(spec) and out.samefile(spec):
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
     progress.stage("loading the scene and the model")
     shared = RunSettings(texture_resolution=config.texture_resolution)
@@ -42,7 +42,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given, camera=config.camera)
     task = make_task(config.task)
-    (model,), notes = load_models([config.model], task, labels=config.labels, used_threads=config.used_threads)
+    (model,), notes = load_models([config.model], task, config)
     rendering = render(
         scene,
         model,

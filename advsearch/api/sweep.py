@@ -337,7 +337,7 @@ def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tupl
             f"model: expected models with different names, got {', '.join(names)}; from Python, "
             "load_model(..., name=...) gives one"
         )
-    return load_models(models, task, labels=config.labels, used_threads=config.used_threads)
+    return load_models(models, task, config)
 
 
 # ---- where it is kept -----------------------------------------------------------------------------------------------

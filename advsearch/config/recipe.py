@@ -10,7 +10,7 @@ from pydantic import JsonValue, field_validator
 from advsearch.config.named import read_named
 from advsearch.config.scene import SceneConfig
 from advsearch.files import MESHES, either
-from advsearch.settings import Clash, Config, as_text, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, setting, setting_as_in, split_names
 
 ALL_OBJECTS = "*"
 """Under this a label stands that is right for every object without one of its own."""
@@ -65,6 +65,7 @@ class RecipeConfig(Config):
         otherwise="what the recipe names",
     )
     labels: str | None = setting_as_in(SceneConfig, "labels")
+    prompt: str | None = setting_as_in(SceneConfig, "prompt")
     task: str | dict[str, JsonValue] | None = setting_as_in(
         SceneConfig, "task", default=None, otherwise="what the recipe says, or classification"
     )
@@ -86,7 +87,12 @@ class RecipeConfig(Config):
     @field_validator("recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before")
     @classmethod
     def _as_text(cls, value: Any, info: Any) -> Any:
-        return as_text(value, several=info.field_name in ("object", "environment", "model"))
+        return SceneConfig._as_text(value, info)
+
+    @field_validator("prompt", mode="before")
+    @classmethod
+    def _prompts_as_text(cls, value: Any) -> Any:
+        return SceneConfig._prompts_as_text(value)
 
     @field_validator("task", mode="before")
     @classmethod

@@ -16,7 +16,7 @@ from advsearch.settings import Clash, Config, as_text, check_once, number_or_tex
 DEFAULT_ENVIRONMENT = "studio"
 """What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
 
-SEVERAL = ("object", "environment", "model", "label", "target", "held_out", "held_out_environment")
+SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_out", "held_out_environment")
 """The settings that may be several names, where a command takes several."""
 
 ControlsByName = dict[str, dict[str, object]]
@@ -111,9 +111,18 @@ class SceneConfig(Config):
         None,
         "model",
         "names of the model's classes",
-        "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91 or voc",
+        "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91, voc, or the names with commas between "
+        "them",
         metavar="FILE",
         otherwise="the model's own",
+    )
+    prompt: str | None = setting(
+        None,
+        "model",
+        "the text that a model such as CLIP compares pictures with, for each of labels; several are averaged",
+        "a text with {} where the name goes, several with | between them",
+        otherwise="a photo of a {}",
+        metavar="TEXT",
     )
     task: str | dict[str, JsonValue] = setting(
         "classification",
@@ -256,7 +265,20 @@ class SceneConfig(Config):
     )
     @classmethod
     def _as_text(cls, value: Any, info: Any) -> Any:
+        listed = info.field_name == "labels" and isinstance(value, (list, tuple))
+        if listed and any("," in str(one) for one in value):
+            raise ValueError("a name that would be two; a file can have it")
         return as_text(value, several=info.field_name in SEVERAL)
+
+    @field_validator("prompt", mode="before")
+    @classmethod
+    def _prompts_as_text(cls, value: Any) -> Any:
+        """Accept several in a list; each says where the name goes."""
+        several = isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value)
+        text = " | ".join(value) if several else value
+        if isinstance(text, str) and not all("{}" in one for one in text.split("|")):
+            raise ValueError("no place for a name")
+        return text
 
     @field_validator("task", mode="before")
     @classmethod

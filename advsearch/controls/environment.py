@@ -16,6 +16,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import ClassVar
 
 import torch
@@ -109,7 +110,7 @@ class EnvironmentControl(NumberControl):
         if OWN_MAP in allowed or self._own_name(scene) is not None or not (isinstance(spec, Fixed) or files):
             lit = scene.environment_for(f"`controls` {self.name}")
             if found and scene.photograph is None and not lit.photographed and scene.number("ground.size") > 0.0:
-                names = ", ".join(one.name for one in found.values())
+                names = ", ".join(Path(name).name for name in found)
                 notes.append(
                     f"{names}: the object stands on the scene's table there, too; ground.kind=photograph shows the "
                     "floor of each picture instead"

@@ -10,6 +10,7 @@ from typing import Any
 from torch import nn
 
 from advsearch import threads
+from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
@@ -45,21 +46,19 @@ def code_of(models: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name in code if name))
 
 
-def load_models(
-    models: Sequence[Any], task: Task, *, labels: str | None = None, used_threads: int | None = None
-) -> tuple[tuple[Model, ...], list[str]]:
+def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple[tuple[Model, ...], list[str]]:
     """Load models; their warnings become sentences of the run.
 
     Args:
         models: as `load_model` takes them.
         task: what their outputs are for.
-        labels: the file with the names of their classes; None for their own.
-        used_threads: processor threads that everything takes from here on; None for all.
+        config: has the names of their classes, the texts that these are put into, and the processor threads that
+            everything takes from here on.
     """
-    threads.configure(used_threads)
+    threads.configure(config.used_threads)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(load_model(one, labels=labels, read=task.reader) for one in models)
+        loaded = tuple(load_model(one, labels=config.labels, prompt=config.prompt, read=task.reader) for one in models)
     sentences = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
     for one in caught:
         if not issubclass(one.category, ModelWarning):

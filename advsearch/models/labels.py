@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,9 @@ from advsearch.files import parse_json, read_text
 
 LARGEST = 16 << 20
 """Most bytes of a label file."""
+
+PROMPT = "a photo of a {}"
+"""The text that a name is put into where nothing else is said."""
 
 LONGEST = 1000
 """Most characters of a label name; those of ImageNet have up to 130."""
@@ -173,21 +177,24 @@ def _name_table(labels: Sequence[str]) -> dict[str, list[int]]:
 # label files
 
 
-def read_labels(source: str | Path | Sequence[str]) -> tuple[str, ...]:
+def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ...]:
     """Return label names in index order.
 
     Args:
-        source: the names themselves, one of `SETS`, or a path to a JSON list of names, a JSON object from index to name
-            (every index from 0 on, once), or a text file with one name per line (UTF-8).
+        source: the names themselves, in a sequence or a text with commas between them; one of `SETS`; or a path to a
+            JSON list of names, a JSON object from index to name (every index from 0 on, once), or a text file with one
+            name per line (UTF-8). A text with commas that is the path of a file stands for that.
 
     Raises:
         FileFormatError: the file is missing, empty or something else; the message names it.
-        InputError: `source` is a sequence that holds something other than non-empty strings.
+        InputError: `source` holds something other than non-empty names.
     """
-    if isinstance(source, (str, Path)):
+    if isinstance(source, (str, os.PathLike)):
         if str(source) in SETS:
             return _label_sets()[str(source)]
-        return _read_file(Path(source))
+        if not _lists_names(source):
+            return _read_file(Path(source))
+        source = str(source).split(",")
     if not isinstance(source, Sequence):
         raise InputError(f"labels: expected a path or a list of names, got {type(source).__name__}")
     problem = _problem(source)
@@ -222,6 +229,35 @@ def names_in(said: Any) -> tuple[str, ...] | None:
 _TEXT = r"""(?:'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")"""
 _FLAT = re.compile(rf"\{{(?:\d{{1,6}}: {_TEXT}(?:, |(?=\}})))*\}}|\[(?:{_TEXT}(?:, |(?=\])))*\]")
 """A mapping or a list as Python writes it: nothing in it is deep or runs."""
+
+
+def _lists_names(source: str | os.PathLike[str]) -> bool:
+    """Whether a text is names with commas between them, not the path of a file, be it there or not."""
+    text = str(source)
+    return isinstance(source, str) and "," in text and not (os.path.isfile(text) or text.endswith((".json", ".txt")))
+
+
+def labels_origin(given: object) -> str:
+    """Return where labels came from, for messages."""
+    if given is None:
+        return "labels of the model"
+    is_file = isinstance(given, (str, os.PathLike)) and str(given) not in SETS and not _lists_names(given)
+    return f"label file {given}" if is_file else "labels"
+
+
+def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Return the texts that a name is put into, ``{}`` in its place, from a list or a text with | between them.
+
+    Raises:
+        InputError: one has no ``{}``.
+    """
+    if given is None:
+        return (PROMPT,)
+    listed = [part.strip() for part in given.split("|")] if isinstance(given, str) else list(given)
+    for one in listed or [""]:
+        if not isinstance(one, str) or "{}" not in one:
+            raise InputError(f"prompt: expected a text with {{}} where the name goes, such as {PROMPT!r}, got {one!r}")
+    return tuple(listed)
 
 
 def sets_of(classes: int) -> list[str]:
@@ -260,7 +296,8 @@ def _read_file(path: Path) -> tuple[str, ...]:
     try:
         text = read_text(path, "a label file", LARGEST)
     except OSError as error:
-        raise FileFormatError(f"label file {path}: cannot be read ({error.strerror or error})") from None
+        advice = "" if path.suffix else ", and several names have commas between them, such as 'mug,cup'"
+        raise FileFormatError(f"label file {path}: cannot be read ({error.strerror or error}){advice}") from None
     if not text.strip():
         raise FileFormatError(f"label file {path}: expected label names, got an empty file")
     if path.suffix.lower() == ".json" or text.lstrip()[0] in "[{":

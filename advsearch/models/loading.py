@@ -14,7 +14,7 @@ from torch import nn
 from advsearch.errors import InputError, UnknownNameError, resembling
 from advsearch.models import files, imported, reference
 from advsearch.models import preprocessing as pre
-from advsearch.models.labels import SETS, fitting_labels, names_in, read_labels
+from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
 from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
@@ -45,6 +45,7 @@ def load_model(
     spec: str | os.PathLike[str] | nn.Module | Model,
     *,
     labels: str | os.PathLike[str] | Sequence[str] | None = None,
+    prompt: str | Sequence[str] | None = None,
     name: str | None = None,
     input_size: int | Sequence[int] | str | None = None,
     mean: float | Sequence[float] | str | None = None,
@@ -65,6 +66,9 @@ def load_model(
             or a `Model`, with ``"@weights.safetensors"`` if wanted; ``"torchvision:NAME@weights.safetensors"``; an
             `nn.Module` (copied, its weights shared, unless they were made in `torch.inference_mode`); a `Model`.
         labels: the label names in index order, or a label file (see `read_labels`). Default "class 0", "class 1", ...
+            A network that compares pictures with texts has no classes but these.
+        prompt: of such a network: the text that each name is put into, with ``{}`` in its place; several (a list, or
+            with | between them) are averaged. Default `advsearch.models.labels.PROMPT`.
         name: what to call it in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.
         mean: one number, three, or ``"imagenet"``, ``"half"``, ``"clip"``, in units of `value_range`; default 0.
@@ -96,21 +100,32 @@ def load_model(
     }
     given = {key: value for key, value in options.items() if value is not None}
     if isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None:
-        return dataclasses.replace(_loaded(spec, given, labels, name, max_batch, read), asked=os.fspath(spec))
-    return _loaded(spec, given, labels, name, max_batch, read)
+        return dataclasses.replace(_loaded(spec, given, labels, prompt, name, max_batch, read), asked=os.fspath(spec))
+    return _loaded(spec, given, labels, prompt, name, max_batch, read)
 
 
 def _loaded(
     spec: object,
     given: Mapping[str, object],
     labels: Any,
+    prompt: str | Sequence[str] | None,
     name: str | None,
     max_batch: int | None,
     read: Read | None,
 ) -> Model:
-    names, origin = _given_labels(labels)  # first, because loading a model takes seconds
+    names, origin = None if labels is None else read_labels(labels), labels_origin(labels)
+    prompts = read_prompts(prompt)  # first, because loading a model takes seconds
     found = _find(spec)
     switches = turned_by_code()
+    if isinstance(found, Source) and found.of_names:
+        if names is None:
+            raise InputError(
+                f"model {found.name} compares a picture with texts and has no classes of its own: name them, two at "
+                "least, such as `labels=mug,cup,bowl` or `labels=imagenet`"
+            )
+        found = found.of_names(names, prompts)
+    elif prompt is not None:
+        raise InputError(f"prompt: model {found.name} has classes of its own and reads no text; leave `prompt` out")
     if isinstance(found, Source) and isinstance(found.module, nn.Module):
         called_under(found.module, switches)
     if isinstance(found, Model):
@@ -158,7 +173,7 @@ def _find(spec: object) -> Source | Model:
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
-        return source_of(spec, type(spec).__name__)
+        return transformers.of_network(spec) or timm.of_network(spec) or source_of(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
@@ -196,7 +211,7 @@ def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
     made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE)
     own = {"mean": found.mean, "std": found.std, **pre.parse_normalisation(given.get("mean"), given.get("std"))}
     made = dataclasses.replace(made, mean=own["mean"] or made.mean, std=own["std"] or made.std)
-    made = dataclasses.replace(made, layout=found.layout or made.layout)
+    made = dataclasses.replace(made, layout=found.layout or made.layout, channels=found.channels or made.channels)
     if "input_size" in given:
         made = dataclasses.replace(made, input_size=pre.parse_input_size(given["input_size"]))
     if "value_range" in given:
@@ -206,15 +221,6 @@ def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
     if "channels" in given:
         made = dataclasses.replace(made, channels=pre.parse_choice("channels", given["channels"], pre.CHANNELS))
     return made
-
-
-def _given_labels(given: Any) -> tuple[tuple[str, ...] | None, str]:
-    """Return the labels that the caller gave, if any, and where they came from, for messages."""
-    if given is None:
-        return None, "labels of the model"
-    if isinstance(given, (str, os.PathLike)):
-        return read_labels(Path(given)), "labels" if str(given) in SETS else f"label file {os.fspath(given)}"
-    return read_labels(given), "labels"
 
 
 def _relabelled(

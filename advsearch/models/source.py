@@ -30,10 +30,12 @@ class Source:
     Args:
         module: the network, in evaluation mode, its parameters without gradients.
         name: what to call it.
-        input_size, mean, std, layout, labels: as in `load_model`; None where the source does not say.
+        input_size, mean, std, layout, channels, labels: as in `load_model`; None where the source does not say.
         batch_limits: (fewest, most) images at once.
         dtype: floating type of the input.
         device: where its weights are.
+        of_names: of a network that compares pictures with texts and has no classes of its own: makes a classifier of
+            the names and the prompts that they stand in.
     """
 
     module: Callable[[torch.Tensor], Any]
@@ -42,10 +44,12 @@ class Source:
     mean: Triple | None = None
     std: Triple | None = None
     layout: str | None = None
+    channels: str | None = None
     labels: tuple[str, ...] | None = None
     batch_limits: tuple[int, int] = (1, 64)
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
+    of_names: Callable[[tuple[str, ...], tuple[str, ...]], Source] | None = None
 
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:

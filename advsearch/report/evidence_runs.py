@@ -41,6 +41,8 @@ def evidence_of(
         "Object": str(objects or ""),
         "Environment": _lit_by(result),
         "Model": str(values.get("model") or ""),
+        "Names of its classes": str(settings.get("labels") or ""),
+        "Prompt": str(settings.get("prompt") or ""),
         "Task": str(values.get("task") or ""),
         "Counts as right": ", ".join(right) if isinstance(right, list) else str(right or "the object's own label"),
         "Sought": str(values.get("goal") or ""),

@@ -191,7 +191,8 @@ MOST_NOTES = 3
 """Notes on files that are not folded."""
 
 _OF_A_FILE = re.compile(
-    rf"[^:]{{1,200}}\.({'|'.join(one[1:] for one in (*MESHES, '.hdr', '.exr', '.xml'))})[: ]|The clean scene has "
+    rf"[^:]{{1,200}}\.({'|'.join(one[1:] for one in (*MESHES, '.hdr', '.exr', '.xml'))})[: ]|The clean scene has ",
+    re.IGNORECASE,
 )
 """How what is said of the reading of a file begins, and of a value that a control leaves out."""
 

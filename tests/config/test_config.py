@@ -47,7 +47,8 @@ WRONG: dict[str, tuple[Any, str]] = {
         "expected reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, "
         "or package.module:callable",
     ),
-    "labels": (True, "expected a JSON or text file, imagenet, "),
+    "labels": (["tench, Tinca tinca", "goldfish"], "expected a JSON or text file, imagenet, "),
+    "prompt": ("a photo of a {} | a photo", "expected a text with {} where the name goes, several with | between them"),
     "task": ("  ", "expected the name of a task, or NAME={OPTION: VALUE}, got '  '"),
     "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
     "controls": (
@@ -97,7 +98,7 @@ GIVEN: dict[str, Any] = {
     "object": "mug.obj", "environment": "room.hdr", "up": "y", "camera": "front",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
-    "labels": "labels.json", "task": "detection", "label": "coffee mug,cup",
+    "labels": "labels.json", "prompt": "a photo of a {}", "task": "detection", "label": "coffee mug,cup",
     "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
     "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
     "average": 50, "printable": True, "aov": "mask,uv", "log": "wandb",
@@ -441,10 +442,12 @@ def test_yaml_as_a_person_writes_it(tmp_path: Path) -> None:
     path = tmp_path / "study.yaml"
     path.write_text(
         "object: mug\nup: y\ndenoise: none\ncontrols: [texture, pose]\nlabel: [coffee mug, cup]\n"
+        "labels: [coffee mug, cup, bowl]\nprompt: ['a photo of a {}, big', 'the {}']\n"
         "epsilon: 1e-3\nresolution: 224\nset: {camera.azimuth: 130, camera.elevation: 2e1}\n"
     )
     config = AttackConfig.from_yaml(path)
     assert (config.up, config.denoise, config.label) == ("y", "none", "coffee mug,cup")
+    assert (config.labels, config.prompt) == ("coffee mug,cup,bowl", "a photo of a {}, big | the {}")
     assert (config.epsilon, config.resolution) == (1e-3, (224, 224))
     assert config.controls == {"texture": {}, "pose": {}}
     assert config.set_ == {"camera.azimuth": 130.0, "camera.elevation": 20.0}

@@ -52,7 +52,7 @@ def test_beside_a_bundled_one_the_table_stays_and_is_said(maps: tuple[str, str])
     assert isinstance(renderer.space, Space) and renderer.space.scene is not None
     assert renderer.space.describe(torch.tensor([0.5]))["environment.which"]["value"] == maps[0]
     np.testing.assert_allclose(renderer(renderer.start, 0, 16), shown(scene, "pose"), atol=2e-5)
-    assert "red, blue: the object stands on the scene's table" in renderer.space.scene.notes[-1]
+    assert "red.exr, blue.hdr: the object stands on the scene's table" in renderer.space.scene.notes[-1]
 
 
 def test_a_file_that_changed_is_read_again(maps: tuple[str, str], tmp_path: Path) -> None:

@@ -511,6 +511,21 @@ def test_label_files(tmp_path: Path, name: str, text: str) -> None:
     assert tiny(labels=path).labels == read_labels(str(path)) == ("mug", "bowl", "vase")
 
 
+def test_labels_in_a_text_with_commas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert tiny(labels="mug, bowl,vase").labels == ("mug", "bowl", "vase")
+    with pytest.raises(InputError, match=r"^labels: 2 labels, but model Net has 3 classes"):
+        tiny(labels="mug,bowl", name="Net")
+    monkeypatch.chdir(tmp_path)
+    Path("mug,bowl").write_text("one\ntwo\nthree\n")
+    assert tiny(labels="mug,bowl").labels == ("one", "two", "three"), "a file that is there goes first"
+
+
+def test_a_prompt_is_not_for_classes_of_its_own() -> None:
+    for given in ("reference", nn.Sequential(nn.Flatten(), nn.Linear(3 * 8 * 8, 3))):
+        with pytest.raises(InputError, match=r"^prompt: model \w+ has classes of its own and reads no text; leave"):
+            load_model(given, prompt="a {}", input_size=8 if given != "reference" else None)
+
+
 @pytest.mark.parametrize(
     "name, content, message",
     [

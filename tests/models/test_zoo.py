@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 import subprocess
@@ -218,61 +217,6 @@ def test_an_absent_library_says_the_command(
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ModelError, match=f"model {spec}: needs {library}, which is not installed: {command}"):
-        load_model(spec)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# transformers
-
-
-PREPROCESSING = {"size": {"height": 16, "width": 16}, "image_mean": [0.5] * 3, "image_std": [0.25] * 3}
-
-
-def published(folder: Path, architecture: str, **more: Any) -> str:
-    """Publish a tiny network of transformers into a folder, as `save_pretrained` does."""
-    transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
-    sizes: dict[str, Any] = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 8}
-    if "Segformer" in architecture:
-        sizes = {"num_encoder_blocks": 1, "depths": [1], "sr_ratios": [1], "hidden_sizes": [8], "strides": [2]}
-        sizes |= {"num_attention_heads": [1], "patch_sizes": [3], "mlp_ratios": [1], "decoder_hidden_size": 8}
-    family = architecture.partition("For")[0]
-    labels = {0: "mug", 1: "bowl", 2: "vase"}
-    config = getattr(transformers, f"{family}Config")(id2label=labels, **sizes, **more)
-    torch.manual_seed(0)
-    getattr(transformers, architecture)(config).save_pretrained(folder)
-    (folder / "preprocessor_config.json").write_text(json.dumps(PREPROCESSING))
-    return f"hf:{folder}"
-
-
-def test_transformers_classifies(tmp_path: Path) -> None:
-    model = load_model(published(tmp_path, "ViTForImageClassification", image_size=16, patch_size=8))
-    assert (model.labels, model.input_size, model.differentiable) == (("mug", "bowl", "vase"), (16, 16), True)
-    assert (model.preprocessing.mean, model.preprocessing.std) == ((0.5,) * 3, (0.25,) * 3)
-
-
-def test_transformers_segments(tmp_path: Path) -> None:
-    spec = published(tmp_path, "SegformerForSemanticSegmentation")
-    assert load_model(spec, read=lambda answer, count: answer)(IMAGES).shape == (2, 3, 16, 16)
-
-
-def test_transformers_finds_objects(tmp_path: Path) -> None:
-    more = {"image_size": [16, 16], "patch_size": 8, "num_detection_tokens": 5}
-    model = load_model(
-        published(tmp_path, "YolosForObjectDetection", **more),
-        read=lambda answer, count: list(zip(*answer, strict=True)),
-    )
-    boxes, scores = model(IMAGES)[0]
-    assert boxes.shape == (5, 4)
-    assert bool((boxes[:, :2] <= boxes[:, 2:]).all())
-    assert scores.shape == (5, 3)
-    assert 0.0 <= float(scores.min()) <= float(scores.max()) <= 1.0
-
-
-def test_transformers_never_unpickles(tmp_path: Path) -> None:
-    spec = published(tmp_path, "ViTForImageClassification", image_size=16, patch_size=8)
-    (tmp_path / "model.safetensors").unlink()
-    torch.save(Net().state_dict(), tmp_path / "pytorch_model.bin")
-    with pytest.raises(ModelError, match=r"cannot be fetched or read"):
         load_model(spec)
 
 

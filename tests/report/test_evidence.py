@@ -170,7 +170,8 @@ def test_evidence_says_what_varied_how_far_and_what_judged() -> None:
     azimuth = {"unit": "degrees", "low": 0.0, "high": 360.0}
     over = {"camera.azimuth": azimuth, "environment.which": {"unit": "name", "names": ["noon", "studio"]}}
     many = samples.attack(over=["camera", "environment"], conditions=over, verified=samples.rated(18, trials=18))
-    found = evidence_of("b", many, claims_of(many), {}, {})
+    found = evidence_of("b", many, claims_of(many), {"labels": "mug,cup", "prompt": "a {}"}, {})
+    assert (found.about["Names of its classes"], found.about["Prompt"]) == ("mug,cup", "a {}")
     assert "camera.azimuth: 0 to 360 degrees, by chance" in found.searched
     assert "environment.which: noon or studio, by chance" in found.searched
     assert found.about["Environment"] == "varied, see below; the clean scene has studio"

@@ -19,6 +19,7 @@ from advsearch.runs.results.gap import StudyResult
 from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.stability import StabilityResult
 from advsearch.viewer.pages import write_page
+from advsearch.viewer.study_page import heading
 
 ACCURACIES = ((0.01, 7), (0.03, 4), (0.1, 1))
 
@@ -155,3 +156,14 @@ def test_the_dashboard_and_a_bundle_have_the_pages_of_the_attacks(tmp_path: Path
     assert (tmp_path / "site" / "parts" / "pose" / "report.html").read_text() == "the attack pose"
     assert "parts/pose/report.html" in (tmp_path / "site" / "index.html").read_text()
     assert not (tmp_path / "site" / "parts" / "camera").exists()
+
+
+def test_notes_on_files_stand_outside_of_the_yellow_box() -> None:
+    notes = ["My Car.OBJ: 12 faces without area were removed", "a.hdr, b.exr: the object stands on the scene's table"]
+    weighty = "The worst margin still moved with the sample count: noise may take part in it."
+    shown = str(heading("sweep", "Right in 7 of 8.", [notes[0], weighty, notes[1]]))
+    assert shown.index('class="remarks"') < shown.index("worst margin") < shown.index('class="notes"')
+    assert all(shown.index('class="notes"') < shown.index(one.partition(":")[0]) for one in notes)
+    assert "<details>" not in shown
+    folded = str(heading("sweep", "Right in 7 of 8.", [f"{k}.ply: nothing" for k in range(4)]))
+    assert "<summary>4 notes on how files were read</summary>" in folded and "remarks" not in folded

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
-from advsearch.errors import UnknownNameError
+from torch import nn
+
+from advsearch.errors import ModelError, UnknownNameError
 from advsearch.models.imported import near_names, split_weights
 from advsearch.models.source import Source, load_weights, source_of
 from advsearch.models.zoo.library import library, reading
@@ -27,6 +31,36 @@ def load(spec: str) -> Source:
         module = timm.create_model(name, pretrained=weights is None)
     if weights is not None:
         load_weights(module, weights, name)
+    return _source(timm, module, name)
+
+
+def load_repository(spec: str, name: str, revision: str) -> Source:
+    """Return the network of a repository, or of a folder, that timm has made; `spec` is for messages.
+
+    Raises:
+        ModelError: timm is missing, or it cannot be had.
+    """
+    timm = library("timm", spec, "timm")
+    local = Path(name).is_dir()
+    place = f"local-dir:{name}" if local else f"hf-hub:{name}{'@' if revision else ''}{revision}"
+    with reading(spec, "Give a folder with config.json and model.safetensors, as timm saves them"):
+        module = timm.create_model(place, pretrained=True)
+    return _source(timm, module, name.rstrip("/").rpartition("/")[2])
+
+
+def of_network(network: nn.Module) -> Source | None:
+    """Return the source of a network of timm that is there already; None of any other."""
+    timm: Any = sys.modules.get("timm")
+    if timm is None or not isinstance(getattr(network, "pretrained_cfg", None), dict):
+        return None
+    return _source(timm, network, type(network).__name__)
+
+
+def _source(timm: Any, module: Any, name: str) -> Source:
+    if module.num_classes == 0:
+        raise ModelError(
+            f"model {name}: has no classes (num_classes is 0): it answers with features. Give a network with a head"
+        )
     asked = timm.data.resolve_model_data_config(module)
     return source_of(
         module,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
+import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,56 +15,165 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.errors import ModelError
-from advsearch.files import parse_json, read_text
-from advsearch.models.labels import LARGEST
-from advsearch.models.preprocessing import Triple
+from advsearch.models.model import ModelWarning
 from advsearch.models.source import Source, source_of
+from advsearch.models.zoo import timm, zero_shot
 from advsearch.models.zoo.library import library, reading
+from advsearch.models.zoo.processors import Measured, measured, processor_of
 
 KINDS = {
     "ForImageClassification": "AutoModelForImageClassification",
     "ForSemanticSegmentation": "AutoModelForSemanticSegmentation",
     "ForObjectDetection": "AutoModelForObjectDetection",
 }
-"""What an architecture may end with, and what builds it."""
+"""What the name of an architecture has in it, as ``DeiTForImageClassificationWithTeacher``, and what builds it."""
+COMPARES = "compares pictures with texts"
+"""The kind of an architecture such as ``CLIPModel``."""
+TIMM = "timm_wrapper"
+"""The kind of a repository of timm."""
 ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has made as 'hf:FOLDER'"
 
 
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network that classifies, segments or finds objects.
 
-    Its size, normalisation and labels are those that it was published with. Code in a repository is never run, and
-    weights are read from safetensors alone.
+    One that compares pictures with texts gets its classes from its user (`zero_shot`).
+
+    Its labels are those that it was published with; size, order of channels and normalisation are measured on its
+    image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
+    alone. A repository of timm goes to timm.
 
     Raises:
-        ModelError: transformers is missing, the repository cannot be had, or its network is of another kind.
+        ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
+            kind, or its processor does what `advsearch.models.preprocessing` can't.
+
+    Warns:
+        ModelWarning: it has no image processor.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = library("transformers", spec, "hf")
     if Path(name).is_dir():
         name = str(Path(name).resolve())
+    elif name.startswith((".", "/", "~")) or name.count("/") > 1:
+        raise ModelError(f"model {spec}: no such folder; a repository is written hf:OWNER/NAME")
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
     where = {"revision": revision} if revision else {}
     with reading(spec, ADVICE):
+        _check_not_open_clips(transformers, name, spec, where)
+        told, _ = transformers.PretrainedConfig.get_config_dict(name, **where)
+        if told.get("model_type") == TIMM:
+            return timm.load_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
-        kind = next((kind for kind in KINDS if architecture.endswith(kind)), None)
-        if kind is None:
-            endings = ", ".join(KINDS)
-            raise ModelError(f"model {spec}: is a {architecture}; expected a network that ends with one of {endings}")
-        maker = getattr(transformers, KINDS[kind])
-        network = maker.from_pretrained(name, use_safetensors=True, trust_remote_code=False, **where)
-        described = _described(transformers, name, where)
-    labels = getattr(config, "id2label", None) or {}
+        kind = _kind(architecture, getattr(transformers, architecture, None), spec)
+        maker = getattr(transformers, KINDS.get(kind, "AutoModel"))
+        network, found = maker.from_pretrained(
+            name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
+        )
+        _check_whole(found, spec)
+        processor = processor_of(transformers, name, where)
+        described = Measured() if processor is None else measured(processor, spec)
+        tokenizer = None if kind in KINDS else _tokenizer(transformers, name, where)
+    if processor is None:
+        warnings.warn(_UNPREPARED.format(spec=spec), ModelWarning, stacklevel=3)
+    return _source(network, kind, name.rstrip("/").rpartition("/")[2], described, tokenizer)
+
+
+_UNPREPARED = (
+    "model {spec} comes without an image processor: pictures are given as they are, RGB in [0, 1]. Say `mean`, `std` "
+    "and `input_size` of load_model if it wants them otherwise"
+)
+
+
+def of_network(network: nn.Module) -> Source | None:
+    """Return the source of a network of transformers that is there already; None of any other.
+
+    Names come from its ``config``, and what is done to pictures from the repository or folder that it was loaded from.
+
+    Warns:
+        ModelWarning: that has no image processor, or can't be read any more.
+    """
+    transformers: Any = sys.modules.get("transformers")
+    if transformers is None or not isinstance(network, transformers.PreTrainedModel):
+        return None
+    spec = type(network).__name__
+    kind, origin = _kind(spec, network, spec), str(getattr(network, "name_or_path", "") or "")
+    described = tokenizer = None
+    if origin:
+        try:
+            with reading(spec, ""):
+                processor = processor_of(transformers, origin, {"local_files_only": True})
+                described = None if processor is None else measured(processor, spec)
+        except ModelError:  # it is not there any more: said below
+            described = None
+    if kind not in KINDS:
+        with reading(spec, "Load it with from_pretrained, from where its tokenizer is beside it"):
+            tokenizer = _tokenizer(transformers, origin, {"local_files_only": True})
+    if described is None:
+        warnings.warn(_UNPREPARED.format(spec=spec), ModelWarning, stacklevel=4)
+    return _source(network, kind, spec, described or Measured(), tokenizer)
+
+
+def _tokenizer(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
+    return transformers.AutoTokenizer.from_pretrained(name, trust_remote_code=False, **where)
+
+
+def _source(network: Any, kind: str, name: str, described: Measured, tokenizer: Any) -> Source:
+    if kind == COMPARES:
+        return zero_shot.unnamed(network, tokenizer, name, described)
+    labels = getattr(network.config, "id2label", None) or {}
     names = tuple(str(labels[key]) for key in sorted(labels, key=int))
-    wrapped: dict[str, Callable[[], nn.Module]] = {
+    if all(re.fullmatch(r"LABEL_\d+", one) for one in names):  # what transformers puts where there are no names
+        names = ()
+    made: dict[str, Callable[[], nn.Module]] = {
         "ForImageClassification": lambda: _Classifier(network),
         "ForSemanticSegmentation": lambda: _Segmenter(network),
-        "ForObjectDetection": lambda: _Detector(network, len(names)),
+        "ForObjectDetection": lambda: _Detector(network, len(labels)),
     }
-    module = wrapped[kind]()
-    return source_of(module, name.rstrip("/").rpartition("/")[2], labels=names or None, **described)
+    return source_of(made[kind](), name, labels=names or None, **described)
+
+
+def _kind(architecture: str, network: Any, spec: str) -> str:
+    """Return which of `KINDS` an architecture is of, or `COMPARES`; a ModelError says what it is otherwise.
+
+    Args:
+        architecture: by name.
+        network: of it, or its class.
+        spec: the model, for messages.
+    """
+    kind = next((kind for kind in KINDS if kind in architecture), None)
+    if kind is None and zero_shot.compares(network):
+        zero_shot.check_size_fixed(network, spec)
+        return COMPARES
+    if kind is None:
+        raise ModelError(
+            f"model {spec}: is a {architecture}; expected one of {', '.join(KINDS)}, or one that compares "
+            "pictures with texts, as CLIPModel. Wrap another in an "
+            "nn.Module whose answer a task can judge, your own too, and give that from Python"
+        )
+    return kind
+
+
+def _check_not_open_clips(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> None:
+    """Raise a ModelError for a repository that has the files of open_clip and none of transformers."""
+    has = partial(transformers.utils.cached_file, name, _raise_exceptions_for_missing_entries=False, **where)
+    if not has("config.json") and has("open_clip_config.json"):
+        raise ModelError(
+            f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
+            "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
+        )
+
+
+def _check_whole(told: Any, spec: str) -> None:
+    """Raise a ModelError where weights are not in the file: they would be random, and others at each load."""
+    lacking = sorted({*told.get("missing_keys", ()), *(key for key, *_ in told.get("mismatched_keys", ()))})
+    if lacking:
+        shown = ", ".join(map(str, lacking[:3])) + (", ..." if len(lacking) > 3 else "")
+        raise ModelError(
+            f"model {spec}: its files lack {len(lacking)} of the network's weights ({shown}), which would be random. "
+            "Give a repository that was trained for this, not one of its beginnings"
+        )
 
 
 class _Classifier(nn.Module):
@@ -103,33 +215,3 @@ class _Detector(nn.Module):
         if answer.logits.shape[-1] > self.classes:
             return boxes, answer.logits.softmax(dim=-1)[..., :-1]
         return boxes, answer.logits.sigmoid()
-
-
-def _described(transformers: Any, name: str, where: Mapping[str, str]) -> dict[str, tuple[int, int] | Triple]:
-    """Return the fields of `Source` that the preprocessing of a repository tells."""
-    path = transformers.utils.cached_file(
-        name, "preprocessor_config.json", _raise_exceptions_for_missing_entries=False, **where
-    )
-    told = {} if path is None else parse_json(read_text(Path(path), "a preprocessing in JSON", LARGEST))
-    fields: dict[str, tuple[int, int] | Triple] = {}
-    size = _sides(told.get("crop_size") if told.get("do_center_crop") else None) or _sides(told.get("size"))
-    if size is not None:
-        fields["input_size"] = size
-    if told.get("do_normalize", True):
-        for field, key in (("mean", "image_mean"), ("std", "image_std")):
-            numbers = told.get(key)
-            if isinstance(numbers, list) and len(numbers) == 3:
-                fields[field] = (float(numbers[0]), float(numbers[1]), float(numbers[2]))
-    return fields
-
-
-def _sides(size: Any) -> tuple[int, int] | None:
-    """Return height and width of what a preprocessing calls a size: a number, both sides, or the shorter one."""
-    if isinstance(size, dict):
-        shorter = size.get("shortest_edge")
-        height, width = size.get("height", shorter), size.get("width", shorter)
-    else:
-        height = width = size
-    if isinstance(height, int) and isinstance(width, int) and min(height, width) > 0:
-        return height, width
-    return None

@@ -604,7 +604,7 @@
     }
 
     showGallery() {
-      const state = this.state, { rows, all } = this.found(state.cell, SHOWN), boxes = rows.some((k) => this.marks(k).length);
+      const state = this.state, { rows, all } = this.found(state.cell, SHOWN), boxes = rows.some((k) => this.address(k) && this.marks(k).length);
       this.parts.bar.replaceChildren(
         choice("Show", [["all", "all"], ["wrong", "wrong answers"], ["right", "right answers"]], state.show, (show) => this.change({ show })),
         choice("First", [["worst", "worst margin"], ["best", "best margin"], ["first", "as they were made"]], state.order, (order) => this.change({ order })),

@@ -1,0 +1,174 @@
+"""Networks that compare pictures with texts, as CLIP and SigLIP do: classifiers of whatever names they are given."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from advsearch.errors import InputError, ModelError
+from advsearch.models.model import ModelWarning
+from advsearch.models.probe import first_line
+from advsearch.models.source import Source, sharing_copy, source_of
+from advsearch.models.zoo.processors import Measured
+
+TEXTS = 64
+"""Texts that are embedded at once."""
+
+TOLERANCE = 1e-4
+"""What a score may be off from the network's own, as a share of the largest or of the scale."""
+
+
+def compares(network: Any) -> bool:
+    """Whether a network of transformers, or the class of one, has a half for pictures and one for texts."""
+    return all(hasattr(network, f"get_{half}_features") for half in ("image", "text"))
+
+
+def check_size_fixed(network: Any, spec: str) -> None:
+    """Raise a ModelError where a network, or the class of one, takes patches in place of pictures."""
+    if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
+        raise ModelError(
+            f"model {spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a checkpoint of "
+            "a fixed resolution, such as hf:google/siglip2-base-patch16-224"
+        )
+
+
+def unnamed(network: Any, tokenizer: Any, name: str, described: Measured) -> Source:
+    """Return the source of a network that becomes a classifier when names are there (`Source.of_names`).
+
+    Args:
+        network: of transformers, which `compares`.
+        tokenizer: of its texts.
+        name: what to call it.
+        described: what is done to pictures.
+    """
+    side = getattr(getattr(network.config, "vision_config", None), "image_size", None)
+    if "input_size" not in described and isinstance(side, int):
+        described = Measured(**{**described, "input_size": (side, side)})
+    return Source(network, name, of_names=partial(_named, network, tokenizer, name, described))
+
+
+def _named(
+    network: Any, tokenizer: Any, name: str, described: Measured, names: tuple[str, ...], prompts: tuple[str, ...]
+) -> Source:
+    """Return the classifier of these names.
+
+    The weights of a name are its texts: one of each prompt, embedded, normalised, averaged, and normalised again
+    (Radford et al. 2021, arXiv 2103.00020, section 3.1.4).
+    """
+    if len(names) < 2:
+        raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
+    spoken, alone = _spoken(names), hasattr(network, "logit_bias")
+    try:
+        with torch.no_grad():
+            network = sharing_copy(network).eval()
+            scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
+            each = [_embedded(network, tokenizer, [one.replace("{}", word) for word in spoken]) for one in prompts]
+            head = nn.Linear(each[0].shape[1], len(names))
+            head.weight.copy_(scale.float() * functional.normalize(torch.stack(each).mean(dim=0), dim=-1))
+            head.bias.copy_(network.logit_bias.float() if alone else torch.zeros(()))
+            compared = _Compared(network, head.to(network.device))
+            _check(network, compared, tokenizer, prompts[0].replace("{}", spoken[0]), described, name)
+    except (InputError, ModelError):
+        raise
+    except Exception as error:  # any network may raise anything
+        raise ModelError(f"model {name}: cannot embed the names of `labels` ({first_line(error)})") from error
+    _say_what_is_one(tokenizer, [prompts[0].replace("{}", word) for word in spoken], names, name)
+    if alone:
+        warnings.warn(
+            f"model {name} judges each name by itself, with a sigmoid of its logit: the scores that are shown are a "
+            f"softmax over the {len(names)} names, and margins are differences of logits",
+            ModelWarning,
+            stacklevel=4,
+        )
+    return source_of(compared, name, labels=names, dtype=network.dtype, **described)
+
+
+def _spoken(names: Sequence[str]) -> list[str]:
+    """Return what stands for each name in a text: of synonyms with commas between them the first, if that is one's."""
+    first = [one.partition(",")[0].strip() or one for one in names]
+    return [short if first.count(short) == 1 else name for short, name in zip(first, names, strict=True)]
+
+
+def _encoded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Mapping[str, Tensor]:
+    """Return texts as the network was trained on them: SigLIP's are as long as can be, the others' as the longest.
+
+    Raises:
+        InputError: one is longer than the network reads.
+    """
+    most = min(int(network.config.text_config.max_position_embeddings), int(tokenizer.model_max_length))
+    for text, tokens in zip(texts, tokenizer(list(texts), verbose=False)["input_ids"], strict=True):
+        if len(tokens) > most:
+            raise InputError(f"prompt: expected texts of at most {most} tokens, got {len(tokens)}: {text[:80]!r}")
+    padding = "max_length" if hasattr(network, "logit_bias") else True
+    given = tokenizer(list(texts), padding=padding, max_length=most, truncation=True, return_tensors="pt")
+    taken = inspect.signature(network.forward).parameters
+    return {key: value.to(network.device) for key, value in given.items() if key in taken}
+
+
+def _embedded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Tensor:
+    """Return one row (len(texts), features) of length 1 for each text."""
+    parts = [texts[begin : begin + TEXTS] for begin in range(0, len(texts), TEXTS)]
+    rows = [_pooled(network.get_text_features(**_encoded(network, tokenizer, part))) for part in parts]
+    return functional.normalize(torch.cat(rows), dim=-1)
+
+
+def _pooled(answer: Any) -> Tensor:
+    features: Tensor = getattr(answer, "pooler_output", answer)
+    return features.float()
+
+
+class _Compared(nn.Module):
+    """Logits (N, names): the scaled cosine of a picture and each name. The half for texts is left out."""
+
+    def __init__(self, network: nn.Module, head: nn.Linear) -> None:
+        super().__init__()
+        self.network = sharing_copy(network)
+        for part in [part for part, _ in self.network.named_children() if part.startswith("text")]:
+            setattr(self.network, part, None)
+        self.head = head
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.score(images, self.head)
+
+    def score(self, images: Tensor, head: nn.Module) -> Tensor:
+        features: Any = self.network.get_image_features(pixel_values=images)  # type: ignore[operator]
+        scores: Tensor = head(functional.normalize(_pooled(features), dim=-1))
+        return scores
+
+
+def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, described: Measured, name: str) -> None:
+    """Raise a ModelError where the network itself gives a picture of noise and a text another score."""
+    shape = (1, 3, *described.get("input_size", (224, 224)))
+    noise = torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(network.device, network.dtype)
+    own = network(**_encoded(network, tokenizer, [text]), pixel_values=noise).logits_per_image.float()
+    scale = compared.head.weight.norm(dim=-1).max()
+    row = scale * _embedded(network, tokenizer, [text])
+    ours = compared.score(noise, lambda seen: seen @ row.T + compared.head.bias[0])  # type: ignore[arg-type]
+    size = max(TOLERANCE, 8.0 * torch.finfo(network.dtype).eps) * max(float(scale), float(own.abs().max()))
+    if own.shape != ours.shape or not float((own - ours).abs().max()) <= size:
+        raise ModelError(
+            f"model {name}: is a {type(network).__name__}, whose scores are no scaled cosine of a picture and a text; "
+            "expected one such as CLIPModel or SiglipModel"
+        )
+
+
+def _say_what_is_one(tokenizer: Any, texts: Sequence[str], names: Sequence[str], name: str) -> None:
+    """Warn of names that are the same to the network: in another case, say, or of words that it does not know."""
+    seen: dict[tuple[int, ...], int] = {}
+    for number, tokens in enumerate(tokenizer(list(texts), verbose=False)["input_ids"]):
+        first = seen.setdefault(tuple(tokens), number)
+        if first != number:
+            warnings.warn(
+                f"model {name} reads {names[first]!r} (#{first}) and {names[number]!r} (#{number}) as the same text: "
+                "it cannot tell one from the other",
+                ModelWarning,
+                stacklevel=5,
+            )
+            return
