@@ -376,13 +376,12 @@ def pins() -> dict[str, list[Requirement]]:
 
 @pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13"])
 def test_every_dependency_has_one_pin_within_its_range_for_every_python(version: str) -> None:
-    for one in requirements("install_requires") + requirements("dev", "options.extras_require"):
-        fitting = [
-            pin
-            for pin in pins().get(canonicalize_name(one.name), [])
-            if pin.marker is None
-            or pin.marker.evaluate({"python_version": version, "python_full_version": version + ".0"})
-        ]
+    def counts(one: Requirement) -> bool:
+        where = {"python_version": version, "python_full_version": version + ".0"}
+        return one.marker is None or one.marker.evaluate(where)
+
+    for one in filter(counts, requirements("install_requires") + requirements("dev", "options.extras_require")):
+        fitting = [pin for pin in pins().get(canonicalize_name(one.name), []) if counts(pin)]
         assert len(fitting) == 1, f"{one.name} on Python {version}: {fitting}"
         (specifier,) = fitting[0].specifier
         assert specifier.operator == "==" and one.specifier.contains(specifier.version)

@@ -245,7 +245,7 @@ def test_what_an_attack_takes_beside_its_settings_is_read_as_they_are(asked: Cal
     for wrong in ({"policy": ["pgd", "random"]}, {"objective": ["margin", "dlr"]}, {"task": ["yaw", "seen"]}):
         with pytest.raises(InputError, match=rf"^{next(iter(wrong))}: expected "):
             asked("mug", **wrong)
-    with pytest.raises(InputError, match="labels: expected a JSON or text file"):
+    with pytest.raises(InputError, match="labels: 2 labels, but model reference has 14 classes"):
         asked("mug", labels=["mug", "vase"])
     assert advsearch.load_scene("mug", settings={"pose.yaw": np.float32(9.0)}).description.values["pose.yaw"] == 9.0
 
