@@ -54,7 +54,7 @@ def processor(name: str, **settings: Any) -> Any:
 
 
 CROP = {"crop_size": {"height": SIDE, "width": SIDE}}
-PROCESSORS = {
+PROCESSORS: dict[str, tuple[str, dict[str, Any]]] = {
     "as usual": ("ViTImageProcessor", HALF),
     "without mean": ("ViTImageProcessor", {"image_std": [0.3] * 3}),
     "not rescaled": ("ViTImageProcessor", {"do_rescale": False, "image_mean": [127.5] * 3, "image_std": [60.0] * 3}),

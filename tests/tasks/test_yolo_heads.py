@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import advsearch
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.labels import names_in, read_labels
-from advsearch.tasks import Answer, Detection
+from advsearch.tasks import Detection
 from advsearch.tasks.boxes import left_over, strongest
 from advsearch.tasks.detection import Place
 from advsearch.tasks.detector_answers import order_in
@@ -139,7 +140,7 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     truth = Place((cup(classes),), TRUTH.box, TRUTH.size)
     (found,) = task.judge(output, truth)
     score = 0.8 * (objectness or 1.0)
-    assert found.right and found.answer == Answer(names[cup(classes)], cup(classes), pytest.approx(score, abs=1e-4))
+    assert found.right and astuple(found.answer) == (names[cup(classes)], cup(classes), pytest.approx(score, abs=1e-4))
     best: Any = found.payload
     assert best["found"][0]["box"] == pytest.approx(CUP, abs=0.1)
     assert task.seen_order == order and task.seen_unit == ("fractions" if "RT-DETR" in form else "pixels")
@@ -212,7 +213,7 @@ def test_what_fits_twice_is_asked_for() -> None:
 @pytest.mark.parametrize("order", ["boxes objectness scores", "boxes, objectness, scores, channels, first"])
 def test_an_order_says_what_a_head_is(order: str) -> None:
     task, output = on(Head(first, objectness=0.9), order=order)
-    assert task.judge(output, TRUTH)[0].answer == Answer("cup", 1, pytest.approx(0.72, abs=1e-4))
+    assert astuple(task.judge(output, TRUTH)[0].answer) == ("cup", 1, pytest.approx(0.72, abs=1e-4))
     assert not task.remarks
     with pytest.raises(InputError, match="order: expected boxes, scores and labels in their order"):
         Detection(order="boxes objectness")
@@ -351,7 +352,7 @@ def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
     assert loaded.labels == NAMES and loaded.input_size == (100, 100)
     output = loaded(PICTURE)
     task = Detection().on(loaded).seeing(output, TRUTH)
-    assert task.judge(output, TRUTH)[0].answer == Answer("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.doubts
+    assert astuple(task.judge(output, TRUTH)[0].answer) == ("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.doubts
 
 
 @pytest.mark.parametrize(
