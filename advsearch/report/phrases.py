@@ -34,7 +34,7 @@ _UNITS = {
     "lengths of the clean features": ("feature_distance",),
 }
 
-MOST_DECIMALS = 6
+MOST_DECIMALS = 4
 """Of a percentage."""
 
 _NONE, _ELSEWHERE = "no ", " elsewhere"

@@ -391,3 +391,10 @@ def test_whatever_a_file_has_is_read_or_named(
     assert part.surface.roughness == (0.5 if "Pr 0.5" in lines else None)
     scale, offset = (2.0, 2.0) if "-s 2 2" in options else (1.0, 1.0), (0.5 if "-o 0.5" in options else 0.0, 0.0)
     assert part.uvs == pytest.approx(part.vertices[:, :2] * np.array(scale) + np.array(offset))
+
+
+@pytest.mark.parametrize("option", ["-mm", "-bm", "-s", "-o", "-mm nan", "-s 1e9 1e9"])
+def test_an_option_of_a_map_that_says_too_little_does_nothing(option: str) -> None:
+    used = map_of(f"{option} paint.png")
+    assert used is not None
+    assert (used.scale, used.offset, used.range, used.bump) == ((1.0, 1.0), (0.0, 0.0), (0.0, 1.0), 1.0)

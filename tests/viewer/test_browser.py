@@ -519,7 +519,7 @@ def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) 
     given = "{name: 'd', unit: '', levels: null, edges: [1, 10, 100], data: Float32Array.of(2, 10, 99, 50, 20)}"
     made = page.evaluate(f"{code} return new Table().axis({given}); }})()")
     assert made["labels"] == ["1 to 10", "10 to 100"] and made["level"] == [0, 1, 1, 1, 1]
-    numbers = (0.0, 0.0002, 0.0459, 0.5, 0.97, 0.9996, 1.0)
+    numbers = (0.0, 1e-9, 0.0002, 0.0459, 0.5, 0.97, 0.9996, 0.999999999, 1.0)
     assert page.evaluate(f"{code} return {list(numbers)}.map(percentNumber); }})()") == list(
         map(percent_number, numbers)
     )

@@ -79,29 +79,28 @@ class MapUse:
     @property
     def scale(self) -> Pair:
         """How often the picture repeats over a unit of u and of v (``-s``)."""
-        return self._pair("s", 1.0)
+        return self._numbers("s", 1.0, 1.0)
 
     @property
     def offset(self) -> Pair:
         """What is added to scaled texture coordinates (``-o``)."""
-        return self._pair("o", 0.0)
+        return self._numbers("o", 0.0, 0.0)
 
     @property
     def range(self) -> Pair:
         """What is added to the picture's values, and their factor before (``-mm``)."""
-        base, gain = map(float, self.options.get("mm", "0 1").split())
-        return (base, gain) if math.isfinite(base) and math.isfinite(gain) else (0.0, 1.0)
+        return self._numbers("mm", 0.0, 1.0)
 
     @property
     def bump(self) -> float:
         """The factor of a normal map's x and y (``-bm``)."""
-        value = float(self.options.get("bm", "1"))
-        return value if math.isfinite(value) else 1.0
+        return self._numbers("bm", 1.0, 1.0)[0]
 
-    def _pair(self, option: str, otherwise: float) -> Pair:
+    def _numbers(self, option: str, first: float, second: float) -> Pair:
+        """What an option says; `first` and `second` where it says too little or nothing that can be computed with."""
         words = self.options.get(option, "").split()
-        u, v = (float(words[k]) if k < len(words) else otherwise for k in (0, 1))
-        return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else (otherwise, otherwise)
+        u, v = (float(words[k]) if k < len(words) else otherwise for k, otherwise in enumerate((first, second)))
+        return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else (first, second)
 
 
 def parsed(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:

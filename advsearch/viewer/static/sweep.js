@@ -44,7 +44,8 @@
   function percentNumber(share) {
     const value = 100 * share, away = Math.min(value, 100 - value);
     if (away >= 5 || away <= 0) return String(Math.round(value));
-    return String(Number(value.toFixed(Math.min(Math.max(1, -Math.floor(Math.log10(away))), 6))));
+    const decimals = Math.min(Math.max(1, -Math.floor(Math.log10(away))), 4), rounded = Number(value.toFixed(decimals)), least = 10 ** -decimals;
+    return rounded === 0 ? `under ${least.toFixed(decimals)}` : rounded === 100 ? `over ${(100 - least).toFixed(decimals)}` : String(rounded);
   }
   const percent = (share) => (share === null ? "none" : `${percentNumber(share)}\u00a0%`);
   // An answer with its number, by what judges answers: as `cells` there.
