@@ -36,6 +36,8 @@ _UNITS = {
 
 MOST_DECIMALS = 4
 """Of a percentage."""
+PROBABILITY_DECIMALS = 1
+"""Of a probability that a model gives."""
 
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
@@ -52,21 +54,21 @@ class Said(Protocol):
         """In [0, 1], of what the task says; None where there is none."""
 
 
-def percent(share: float | None) -> str:
+def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
     """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
-    return "unknown" if share is None else f"{percent_number(float(share))} %"
+    return "unknown" if share is None else f"{percent_number(float(share), most)} %"
 
 
-def percent_number(share: float) -> str:
+def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
     """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98`` for 0.99979.
 
-    Within five of 0 or 100 it has one decimal, and nearer to them as many as show how far it is away.
+    Within five of 0 or 100 it has one decimal, and nearer to them as many, `most` at most, as show how far it is away.
     """
     value = 100.0 * share
     away = min(value, 100.0 - value)
     if away >= 5.0 or away <= 0.0:
         return f"{value:.0f}"
-    decimals = min(max(1, -math.floor(math.log10(away))), MOST_DECIMALS)
+    decimals = min(max(1, -math.floor(math.log10(away))), most)
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     if text not in ("0", "100"):
         return text
@@ -133,7 +135,7 @@ def cells(task: str, answer: Said) -> list[str]:
         if label.startswith(_NONE):
             return [f"{label} found", f"best score of {label.removeprefix(_NONE)} {share:.2f}"]
         return [label, f"score {share:.2f}"]
-    return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share)]
+    return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share, PROBABILITY_DECIMALS)]
 
 
 def answer_text(task: str, answer: Said) -> str:
@@ -154,7 +156,7 @@ def seen_cells(task: str, answer: Said) -> list[str]:
         return [answer.label, ""]
     if task == DETECTION:
         return [answer.label, f"score {answer.probability:.2f}"]
-    share = percent(answer.probability)
+    share = percent(answer.probability, PROBABILITY_DECIMALS)
     return [answer.label, f"{share} of the picture" if task == SEGMENTATION else share]
 
 

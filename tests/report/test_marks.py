@@ -77,6 +77,7 @@ def test_a_large_picture_keeps_its_size_and_nothing_changes_nothing() -> None:
     ("task", "answer", "text"),
     [
         ("classification", Answer("vase", 3, 0.913), "vase, 91 %"),
+        ("classification", Answer("vase", 3, 0.9999999), "vase, over 99.9 %"),
         ("detection", Answer("cup", 46, 0.762), "cup (score 0.76)"),
         ("detection", Answer("no cup", None, 0.124), "no cup found (best score of cup 0.12)"),
         ("detection", Answer("cup elsewhere", None, 0.7), "cup elsewhere (score 0.70)"),

@@ -520,13 +520,14 @@ def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) 
     made = page.evaluate(f"{code} return new Table().axis({given}); }})()")
     assert made["labels"] == ["1 to 10", "10 to 100"] and made["level"] == [0, 1, 1, 1, 1]
     numbers = (0.0, 1e-9, 0.0002, 0.0459, 0.5, 0.97, 0.9996, 0.999999999, 1.0)
-    assert page.evaluate(f"{code} return {list(numbers)}.map(percentNumber); }})()") == list(
+    assert page.evaluate(f"{code} return {list(numbers)}.map((one) => percentNumber(one)); }})()") == list(
         map(percent_number, numbers)
     )
     for task, label, share in (
         ("detection", "no car", 0.15),
         ("detection", "car", 0.8),
         ("classification", "vase", 0.5),
+        ("classification", "lamp", 0.99999),
     ):
         said = page.evaluate(f"{code} return said({task!r}, {label!r}, {share}); }})()")
         assert said == answer_text(task, Answer(label, None, share)).replace(", ", " ").replace(" %", "\u00a0%")

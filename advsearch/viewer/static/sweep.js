@@ -41,18 +41,18 @@
   // ---- numbers -----------------------------------------------------------------------------------------------------
 
   // As `percent_number` in advsearch/report/phrases.py.
-  function percentNumber(share) {
+  function percentNumber(share, most = 4) {
     const value = 100 * share, away = Math.min(value, 100 - value);
     if (away >= 5 || away <= 0) return String(Math.round(value));
-    const decimals = Math.min(Math.max(1, -Math.floor(Math.log10(away))), 4), rounded = Number(value.toFixed(decimals)), least = 10 ** -decimals;
+    const decimals = Math.min(Math.max(1, -Math.floor(Math.log10(away))), most), rounded = Number(value.toFixed(decimals)), least = 10 ** -decimals;
     return rounded === 0 ? `under ${least.toFixed(decimals)}` : rounded === 100 ? `over ${(100 - least).toFixed(decimals)}` : String(rounded);
   }
-  const percent = (share) => (share === null ? "none" : `${percentNumber(share)}\u00a0%`);
+  const percent = (share, most) => (share === null ? "none" : `${percentNumber(share, most)}\u00a0%`);
   // An answer with its number, by what judges answers: as `cells` there.
   function said(task, label, share) {
     if (share === null) return label;
     if (task === "detection") return label.startsWith("no ") ? `${label} found (best score of ${label.slice(3)} ${share.toFixed(2)})` : `${label} (score ${share.toFixed(2)})`;
-    return task === "segmentation" ? `accuracy ${percent(share)}, most often ${label}` : `${label} ${percent(share)}`;
+    return task === "segmentation" ? `accuracy ${percent(share)}, most often ${label}` : `${label} ${percent(share, 1)}`;
   }
   const short = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(4))));
   // The last part of each path, with as much before it as tells it from the others; names stay as they are.
