@@ -16,7 +16,7 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 
 from advsearch.cli.attack import answer
-from advsearch.report.phrases import percent
+from advsearch.report.phrases import CLASSIFICATION, answer_text
 from advsearch.runs.directory import default_name
 from advsearch.runs.results.attack import AttackSummary, PicturedAnswer
 from advsearch.runs.summary import attack_of
@@ -68,7 +68,7 @@ def _fitted(picture: Image.Image) -> Image.Image:
 
 
 def _said(answer: PicturedAnswer | None) -> str:
-    return f"{answer.label}, {percent(answer.probability)}" if answer else "no answer"
+    return answer_text(CLASSIFICATION, answer) if answer else "no answer"
 
 
 def with_answer(readme: str, summary: AttackSummary) -> str:
