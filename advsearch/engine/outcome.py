@@ -16,7 +16,7 @@ from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.engine.domains import domain_of
 from advsearch.engine.failures import described_failures, write_failures
-from advsearch.engine.pictures import Shown, trial_to_show, write_artifacts, write_object, write_pictures
+from advsearch.engine.pictures import KeptPicture, trial_to_show, write_artifacts, write_object, write_pictures
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -167,7 +167,7 @@ def summarise(
     u = start if search is None else problem.domain.project(search.best_u)
     stages.progress.stage("making the pictures and the report")
     trial = None if findings.interrupted else trial_to_show(findings)  # whoever presses Ctrl-C is in a hurry
-    clean, adversarial = (Shown.of(problem, findings, at, trial) for at in (start, u))
+    clean, adversarial = (KeptPicture.of(problem, findings, at, trial) for at in (start, u))
     space = problem.searched_space
     artifacts = space.artifacts(u)
     run = recorder.run
@@ -199,7 +199,9 @@ def summarise(
 # ---- the summary ----------------------------------------------------------------------------------------------------
 
 
-def _summary(asked: Question, problem: Problem, findings: Findings, clean: Shown, adversarial: Shown) -> AttackSummary:
+def _summary(
+    asked: Question, problem: Problem, findings: Findings, clean: KeptPicture, adversarial: KeptPicture
+) -> AttackSummary:
     """All but where it is kept, how long it took and what there is to say."""
     task, search, baseline = problem.task, findings.search, findings.baseline
     controls = problem.searched_space.controls
@@ -313,7 +315,7 @@ def _alone(values: dict[str, T]) -> T | dict[str, T]:
     return next(iter(values.values())) if len(values) == 1 else values
 
 
-def _answer(shown: Shown) -> dict[str, Any]:
+def _answer(shown: KeptPicture) -> dict[str, Any]:
     """What the model says of a picture that is kept."""
     return {**vars(shown.judgement.answer), "payload": shown.judgement.payload, "trial": shown.trial}
 

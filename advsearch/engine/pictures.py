@@ -36,7 +36,7 @@ PICTURE_SPP = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class KeptPicture:
     """The picture of a configuration that is kept, and what is true of this picture alone.
 
     Attributes:
@@ -54,7 +54,7 @@ class Shown:
     trial: int | None
 
     @classmethod
-    def of(cls, problem: Problem, findings: Findings, u: Tensor, trial: int | None) -> Shown:
+    def of(cls, problem: Problem, findings: Findings, u: Tensor, trial: int | None) -> KeptPicture:
         """Render the searched controls at `u` as they are in a trial; as the scene comes, where that is None."""
         seed = seeds.stream(problem.seed, *(("pictures",) if trial is None else ("verification", trial)))
         whole, spp = problem.whole(u, None if trial is None else seed), PICTURE_SPP if trial is None else findings.spp
@@ -91,7 +91,7 @@ def _usual(labels: Sequence[str]) -> str:
     return Counter(labels).most_common(1)[0][0]
 
 
-def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, shown: Mapping[str, Shown]) -> None:
+def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, shown: Mapping[str, KeptPicture]) -> None:
     """Write the pictures of the clean and the adversarial scene, of their difference, of trials and of the search.
 
     Args:
@@ -121,7 +121,7 @@ def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, show
     if findings.frames:
         last = shown["adversarial"].picture
         if problem.conditions is not None and findings.search is not None:  # the frames see the scene as it comes
-            last = Shown.of(problem, findings, problem.domain.project(findings.search.best_u), None).picture
+            last = KeptPicture.of(problem, findings, problem.domain.project(findings.search.best_u), None).picture
         run.save_animation("search", [*findings.frames, last.numpy()])
 
 

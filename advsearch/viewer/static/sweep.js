@@ -57,14 +57,15 @@
   const short = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(4))));
   // The last part of each path, with as much before it as tells it from the others; names stay as they are.
   function shortened(names) {
-    const parts = names.map((name) => name.split(/[\\/]/).filter(Boolean));
-    return names.map((name, k) => {
-      for (let count = 1; count < parts[k].length; count++) {
-        const end = parts[k].slice(-count).join("/");
-        if (!names.some((other, j) => other !== name && (parts[j].slice(-count).join("/") === end))) return end;
-      }
-      return name;
-    });
+    const parts = names.map((name) => name.split(/[\\/]/).filter(Boolean)), found = [...names];
+    let open = names.map((_, k) => k).filter((k) => parts[k].length > 1);
+    for (let count = 1; open.length; count++) {
+      const ends = parts.map((one) => one.slice(-count).join("/")), times = new Map();
+      for (const end of ends) times.set(end, (times.get(end) || 0) + 1);
+      for (const k of open) if (times.get(ends[k]) === 1) found[k] = ends[k];
+      open = open.filter((k) => times.get(ends[k]) > 1 && count + 1 < parts[k].length);
+    }
+    return found;
   }
   const cut = (text, letters) => (text.length > letters ? `${text.slice(0, Math.max(letters - 1, 1))}…` : text);
   const named = (name, unit) => (unit && unit !== "name" && unit !== "1" ? `${name} [${unit}]` : name);
@@ -650,6 +651,12 @@
       return make("button", { type: "button", class: `card ${verdict.replace(" ", "-")}`, onclick: open }, ...picture, make("span", {}, make("strong", {}, verdict === "wrong" ? "✗ " : verdict === "right" ? "✓ " : ""), this.answered(k)));
     }
 
+    // The short names of a parameter's levels, which its axis has where it varies.
+    named(parameter) {
+      const axis = this.byName.get(parameter.name);
+      return axis && axis.full === parameter.levels ? axis.labels : shortened(parameter.levels);
+    }
+
     details(rows, first) {
       let place = first;
       const inside = make("div", {}), count = make("span", { class: "soft", role: "status" });
@@ -666,7 +673,7 @@
       const show = () => {
         const k = rows[place], { right, margin, step: number, source } = this.table.columns;
         const facts = [["run", this.table.sources[source[k]].name], ["configuration", String(number[k])], ["answer", this.answered(k)], ["verdict", ["wrong", "right", "not judged"][right[k]]], ["margin", short(Number(margin[k].toPrecision(4)))]];
-        for (const one of this.table.parameters) facts.push([named(one.name, one.unit), one.levels ? shortened(one.levels)[one.data[k]] : short(one.data[k]), one.levels && one.levels[one.data[k]]]);
+        for (const one of this.table.parameters) facts.push([named(one.name, one.unit), one.levels ? this.named(one)[one.data[k]] : short(one.data[k]), one.levels && one.levels[one.data[k]]]);
         dialog.setAttribute("aria-label", `Configuration ${number[k]}`);
         count.textContent = `${place + 1} of ${rows.length}`;
         inside.replaceChildren(
