@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from advsearch.errors import ModelError
 from advsearch.models.source import Source
-from advsearch.models.zoo import timm, zero_shot
+from advsearch.models.zoo import mask_queries, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
 from advsearch.models.zoo.loaded import Loaded
 from advsearch.models.zoo.processors import processor_of
@@ -216,6 +216,11 @@ KINDS = (
         _called("ForSemanticSegmentation"),
         "AutoModelForSemanticSegmentation",
         _with_names(_Segmenter),
+    ),
+    Kind(
+        mask_queries.is_ours,
+        "AutoModelForUniversalSegmentation",
+        lambda loaded: mask_queries.source(loaded, names_of(loaded.network.config) or None),
     ),
     Kind(
         _called("ForObjectDetection"),
