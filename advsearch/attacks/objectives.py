@@ -32,8 +32,9 @@ from advsearch.attacks.logit_objectives import (
 )
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
-from advsearch.tasks import Classification, Segmentation, Task
+from advsearch.tasks import Classification, Depth, Segmentation, Task
 from advsearch.tasks.classes import ClassTask
+from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS, Detection
 
 __all__ = [
@@ -161,6 +162,10 @@ _OWN = {
         *(
             ObjectiveKind(name, f"sought: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
             for name, summary in GOALS.items()
+        ),
+        *(
+            ObjectiveKind(name, f"sought: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
+            for name, summary in DEPTH_GOALS.items()
         ),
         ObjectiveKind(
             "pixel_margin",

@@ -276,7 +276,7 @@ def _facts(
 
 def sight_of(surfaces: Surfaces) -> Sight:
     """Return what a task judges by, of what the camera sees."""
-    return Sight(surfaces.seen(OBJECT), surfaces.depth)
+    return Sight(surfaces.seen(OBJECT), surfaces.depth, surfaces.z_depth)
 
 
 def writable(path: str | Path, views: int) -> Path:

@@ -7,28 +7,34 @@ from typing import Any, Protocol
 
 from advsearch.described import NOT_A_NUMBER
 
-CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
+CLASSIFICATION, DETECTION, SEGMENTATION, DEPTH = "classification", "detection", "segmentation", "depth"
 """Tasks whose answers have words of their own; others are quoted."""
 
 _MARGINS = {
     CLASSIFICATION: "how far the wrong answer leads the right one, in logits",
     DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
     SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
+    DEPTH: "the logarithm of the factor by which the object's distance is off, less that of the tolerance",
 }
 _MARKS = {
     DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
     SEGMENTATION: "Blue is the true outline, orange the pixels to which the model gives a right class.",
+    DEPTH: "Blue is the true outline, orange the object's pixels whose distance is right.",
 }
 _WANTED = {
     "mislabel": "makes the model take {} for something else",
     "displace": "makes the model see {} elsewhere",
     "create": "makes the model see beside {} what is not there",
+    "nearer": "makes the model judge {} nearer than it is",
+    "farther": "makes the model judge {} farther than it is",
+    "gone": "makes the model judge {} to be as far as what is behind it",
 }
 SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
 """Objectives that are over 0 exactly where an answer is what is sought."""
 
 _UNITS = {
     "logits": ("margin", "log_odds", "pixel_margin"),
+    "logarithm of a factor": ("nearer", "farther"),
     "log-odds": ("vanish", "mislabel", "displace", "create"),
     "nats": ("cross_entropy",),
     "lengths of the clean features": ("feature_distance",),
@@ -176,6 +182,8 @@ def calls(task: str, thing: str, label: str) -> str:
         return f"calls {thing} {with_article(label)}"
     if task == DETECTION:
         return _detects("finds", "sees", "takes", thing, label)
+    if task == DEPTH:
+        return f"judges {thing} {label}"
     return f"takes {thing} for {_stuff(label)}" if task == SEGMENTATION else f'answers "{label}" for {thing}'
 
 
@@ -187,6 +195,8 @@ def calling(task: str, label: str) -> str:
         return f"calling it {with_article(label)}"
     if task == DETECTION:
         return _detects("finding", "seeing", "taking", "it", label)
+    if task == DEPTH:
+        return f"judging it {label}"
     return f"taking it for {_stuff(label)}" if task == SEGMENTATION else f'answering "{label}"'
 
 

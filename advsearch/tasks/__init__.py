@@ -9,12 +9,13 @@ from advsearch.options import check_options
 from advsearch.registry import Registry
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
 from advsearch.tasks.classification import Classification
+from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
 from advsearch.tasks.segmentation import Segmentation
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation)},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation, Depth)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -49,6 +50,7 @@ __all__ = [
     "Answer",
     "AnyTask",
     "Classification",
+    "Depth",
     "Detection",
     "Facts",
     "Judgement",

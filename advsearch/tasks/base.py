@@ -108,10 +108,12 @@ class Sight:
     Attributes:
         mask: (H, W) bool, where it is the object.
         depth: (H, W) float, how far it is, see `Facts.depth`.
+        z_depth: (H, W) float, see `Facts.z_depth`.
     """
 
     mask: Tensor
     depth: Tensor
+    z_depth: Tensor
 
 
 @dataclass(frozen=True)
@@ -167,6 +169,15 @@ class Facts:
             InputError: as for `sight`.
         """
         return self.sight.depth
+
+    @property
+    def z_depth(self) -> Tensor:
+        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives.
+
+        Raises:
+            InputError: as for `sight`.
+        """
+        return self.sight.z_depth
 
     @cached_property
     def box(self) -> tuple[int, int, int, int] | None:

@@ -61,7 +61,7 @@ class Middle(nn.Module):
 
 
 def seen(rows: list[list[int]]) -> Facts:
-    return Facts("mug", look=lambda: Sight(torch.tensor(rows).bool(), torch.tensor(rows).float()))
+    return Facts("mug", look=lambda: Sight(torch.tensor(rows).bool(), *2 * [torch.tensor(rows).float()]))
 
 
 def test_a_box_holds_what_is_seen() -> None:
@@ -73,13 +73,13 @@ def test_a_box_holds_what_is_seen() -> None:
 
 
 def test_without_a_configuration_there_is_nothing_to_see() -> None:
-    for name in ("box", "mask", "depth"):
+    for name in ("box", "mask", "depth", "z_depth"):
         with pytest.raises(InputError, match="needs to see mug, which depends on the configuration; set `varies = Tr"):
             getattr(Facts("mug"), name)
 
 
 def test_the_camera_looks_once_for_all_that_is_seen() -> None:
-    looks = iter([Sight(torch.ones(2, 2).bool(), torch.full((2, 2), 3.0))])
+    looks = iter([Sight(torch.ones(2, 2).bool(), torch.full((2, 2), 3.0), torch.full((2, 2), 2.5))])
     facts = Facts("mug", look=lambda: next(looks))
     assert facts.box == (0, 0, 2, 2) and facts.depth.tolist() == [[3.0, 3.0]] * 2 and bool(facts.mask.all())
 

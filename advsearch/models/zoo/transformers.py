@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from advsearch.errors import ModelError
 from advsearch.models.source import Source
-from advsearch.models.zoo import mask_queries, timm, zero_shot
+from advsearch.models.zoo import depth_maps, mask_queries, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
 from advsearch.models.zoo.loaded import Loaded
 from advsearch.models.zoo.processors import processor_of
@@ -127,7 +127,7 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForSemanticSegmentation or ForObjectDetection in it, or one that compares pictures with texts, as CLIPModel. "
+        "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, or one that compares pictures with texts, as CLIPModel. "
         "Wrap another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
     )
 
@@ -226,6 +226,11 @@ KINDS = (
         _called("ForObjectDetection"),
         "AutoModelForObjectDetection",
         _with_names(_Detector),
+    ),
+    Kind(
+        _called("ForDepthEstimation"),
+        "AutoModelForDepthEstimation",
+        depth_maps.source,
     ),
     Kind(lambda architecture, network: zero_shot.compares(network), "AutoModel", zero_shot.source),
 )
