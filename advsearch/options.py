@@ -21,6 +21,10 @@ BY_KEY = "mitsuba"
 """The control whose parameters have Mitsuba's names."""
 
 
+JOINED = "+"
+"""Between the names of tasks that are asked of several models at once."""
+
+
 def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     """Return controls with ``{"mitsuba:KEY": RANGE}`` as ``{"mitsuba": {KEY: RANGE}}``, all keys together.
 

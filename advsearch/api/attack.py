@@ -371,7 +371,7 @@ def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tup
 def _model(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
     """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
     models, warnings = load_models(several(model), task, config)
-    return models[0] if config.ensemble is None else together(models, config.resolution), warnings
+    return models[0] if len(models) == 1 else together(models, config.resolution), warnings
 
 
 def _policy_options(config: AttackConfig) -> JsonObject:
@@ -403,7 +403,8 @@ def _task(job: _Job, *, shows: bool = True) -> tuple[Task, Callable[[Described, 
     alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
     tasks = list[Task]()
     for one, network in alone:
-        check_truth(one, network, job.scene, facts(dict), pictures)
+        known = task.told(one, facts(dict)) if isinstance(task, Together) else facts(dict)
+        check_truth(one, network, job.scene, known, pictures)
         tasks.append(shown(one, network, [job.scene], config.label, pictures) if shows else one)
         job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
     task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]

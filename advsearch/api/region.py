@@ -111,7 +111,7 @@ def region_from_config(
             object=config.object,
             environment=problem.environment,
             model=problem.model.name,
-            task=problem.task.name,
+            task=problem.task.title,
             controls=[bound.name for bound in problem.space.controls],
             ending=ending,
             **vars(answer),

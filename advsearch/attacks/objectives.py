@@ -36,6 +36,7 @@ from advsearch.tasks import Classification, Depth, Segmentation, Task
 from advsearch.tasks.classes import ClassTask
 from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS, Detection
+from advsearch.tasks.together import Together
 
 __all__ = [
     "OBJECTIVES",
@@ -162,6 +163,13 @@ _OWN = {
         *(
             ObjectiveKind(name, f"sought: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
             for name, summary in GOALS.items()
+        ),
+        ObjectiveKind(
+            Together.objective,
+            "of several tasks at once: each task's own objective, put together by `ensemble`",
+            "those of the tasks",
+            task=Together.name,
+            of_task=_score_of,
         ),
         *(
             ObjectiveKind(name, f"sought: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)

@@ -12,7 +12,7 @@ from advsearch.config.named import name_in, read_named
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.files import JsonObject
-from advsearch.settings import Clash, setting, setting_as_in
+from advsearch.settings import Clash, setting, setting_as_in, split_names
 
 if TYPE_CHECKING:
     pass
@@ -57,7 +57,7 @@ class AttackConfig(DerivativeConfig):
         ),
         Clash(
             "ensemble",
-            lambda one: not one.is_matrix,
+            lambda one: len(split_names(one.model)) < 2,
             "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
         ),
         Clash(

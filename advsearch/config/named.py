@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
+from advsearch.options import JOINED
 from advsearch.settings import parse_assignment
 
 
@@ -24,6 +26,23 @@ def read_named(value: Any, setting: str, otherwise: str) -> Any:
     options = {option: given for option, given in value.items() if option != "name"}
     name = value.get("name", otherwise)
     return {"name": name, **options} if options else name
+
+
+def read_joined(value: Any, setting: str, otherwise: str) -> Any:
+    """Return what `read_named` returns, of one or of several joined with + or in a list: the names with + between them,
+    and under each name its options: ``{"name": "detection+depth", "detection": {"iou": 0.7}}``."""
+    parts = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
+    if not isinstance(parts, (list, tuple)) or len(parts) < 2:
+        return read_named(value, setting, otherwise)
+    read = [read_named(one.strip() if isinstance(one, str) else one, setting, otherwise) for one in parts]
+    names = [one.get("name") if isinstance(one, Mapping) else one for one in read]
+    if not all(isinstance(name, str) and name for name in names):
+        return value
+    options = {one["name"]: {k: v for k, v in one.items() if k != "name"} for one in read if isinstance(one, Mapping)}
+    last = options.get(names[-1], {})
+    if last.keys() <= set(names):  # as a command is written back: detection+depth={depth: {seek: gone}}
+        options = {**options, **last} if names[-1] in last else {**options, names[-1]: {}, **last}
+    return read_named({**{k: v for k, v in options.items() if v}, "name": JOINED.join(names)}, setting, otherwise)
 
 
 def name_in(named: str | Mapping[str, object]) -> str:

@@ -30,7 +30,9 @@ CLEAN_SPP = 64
 
 def task_for(task: Task, model: Model) -> Task:
     """Return the task, or that of several models where the model is an ensemble of them."""
-    return Together(task=task, models=model.module.models) if isinstance(model.module, Ensemble) else task
+    if isinstance(task, Together) or not isinstance(model.module, Ensemble):
+        return task
+    return Together(parts=(task,) * len(model.module.models))
 
 
 def objective_for(
@@ -49,7 +51,8 @@ def objective_for(
         model: that is attacked.
         renderer: of the whole space.
         seed: of the clean picture.
-        ensemble: how the objectives of several models are put together.
+        ensemble: how the objectives of several models are put together; None for the mean, or the least of those of
+            several tasks, whose units differ.
 
     Raises:
         InputError: an objective of features, of several models.
@@ -59,7 +62,9 @@ def objective_for(
     if isinstance(task, Together):
         if of_features:
             raise InputError(f"objective: {wanted} compares the features of one model; take another for `ensemble`")
-        return of_ensemble([get_objective(wanted, one) for one in task.tasks], ensemble or "mean"), ""
+        own = wanted == Together.objective
+        each = [get_objective(one.objective if own else wanted, one) for one in task.tasks]
+        return of_ensemble(each, ensemble or ("worst" if own else "mean")), ""
     if not of_features:
         return get_objective(wanted, task), ""
     features = features_of(model)

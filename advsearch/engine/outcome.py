@@ -212,7 +212,7 @@ def _summary(
         run=None,
         object=asked.object,
         model=problem.model.name,
-        task=task.name,
+        task=task.title,
         environment=problem.environment,
         controls=list(budgets),
         policy=asked.policy,

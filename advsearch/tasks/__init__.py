@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
-from advsearch.errors import UnknownNameError
-from advsearch.options import check_options
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import JOINED, check_options
 from advsearch.registry import Registry
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
 from advsearch.tasks.segmentation import Segmentation
+from advsearch.tasks.together import Together
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
@@ -30,6 +32,8 @@ def make_task(task: AnyTask) -> Task:
     """Return the task of that name, of that `name` with these options, which are its dataclass's fields, or the task
     itself.
 
+    Of several tasks at once, "detection+depth", the options of each stand under its name.
+
     Raises:
         UnknownNameError: no such task, or it has no such option.
         InputError: an option's value is of another type, or outside its range.
@@ -38,11 +42,23 @@ def make_task(task: AnyTask) -> Task:
         return task
     given = {"name": task} if isinstance(task, str) else task
     name, options = str(given.get("name", Classification.name)), {key: given[key] for key in given if key != "name"}
+    if JOINED in name:
+        return _together([one.strip() for one in name.split(JOINED)], options)
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)
     build: Callable[..., Task] = TASKS[name]
     return build(**options)
+
+
+def _together(names: Sequence[str], options: Mapping[str, Any]) -> Together:
+    """Return several tasks as one, from their names, and by name the options of those that have some."""
+    for name, own in options.items():
+        if name not in names:
+            raise UnknownNameError(f"option of task {JOINED.join(names)!r}:", name, names)
+        if not isinstance(own, Mapping):
+            raise InputError(f"task {name}: expected its options as a mapping, got {own!r:.80}")
+    return Together(parts=tuple(make_task({**options.get(name, {}), "name": name}) for name in names))
 
 
 __all__ = [

@@ -224,12 +224,14 @@ class Task(ABC):
         objective: name of the objective where none is asked for; "score" is the task's own score.
         reads_logits: whether its models answer with logits (N, classes). Then their answers are checked as such, and
             the objectives of classification take them.
+        labelled: whether it takes a label; with one that takes none, others get it (`together`).
         varies: whether the truth depends on the configuration; it is asked for at each one then.
     """
 
     name: ClassVar[str]
     objective: ClassVar[str] = "score"
     reads_logits: ClassVar[bool] = False
+    labelled: ClassVar[bool] = True
     varies: ClassVar[bool] = False
 
     minimise: bool = field(default=False, metadata=FROM_RUN)
@@ -349,6 +351,11 @@ class Task(ABC):
     def average(self, outputs: Sequence[Output]) -> Output:
         """Return one output for several pictures of a configuration; each is of one picture, as is the result."""
         return torch.stack(list(outputs)).mean(dim=0)
+
+    @property
+    def title(self) -> str:
+        """What the task is called in results."""
+        return self.name
 
     @property
     def goal(self) -> str:

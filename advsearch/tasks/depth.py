@@ -125,6 +125,7 @@ class Depth(Task):
     """
 
     name = "depth"
+    labelled = False
     varies = True
 
     tolerance: float = 0.25
