@@ -35,8 +35,9 @@ def read_joined(value: Any, setting: str, otherwise: str) -> Any:
     if not isinstance(parts, (list, tuple)) or len(parts) < 2:
         return read_named(value, setting, otherwise)
     read = [read_named(one.strip() if isinstance(one, str) else one, setting, otherwise) for one in parts]
-    names = [one.get("name") if isinstance(one, Mapping) else one for one in read]
-    if not all(isinstance(name, str) and name for name in names):
+    named = [one.get("name") if isinstance(one, Mapping) else one for one in read]
+    names = [name for name in named if isinstance(name, str) and name]
+    if len(names) < len(read):
         return value
     options = {one["name"]: {k: v for k, v in one.items() if k != "name"} for one in read if isinstance(one, Mapping)}
     last = options.get(names[-1], {})

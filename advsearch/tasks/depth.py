@@ -33,7 +33,12 @@ KINDS = {
 }
 """What a model's numbers may be."""
 
-AS_FAR, NEARER, FARTHER, GONE = "as far as it is", "nearer than it is", "farther than it is", "as far as what is behind it"
+AS_FAR, NEARER, FARTHER, GONE = (
+    "as far as it is",
+    "nearer than it is",
+    "farther than it is",
+    "as far as what is behind it",
+)
 OUT_OF_SHAPE = "out of shape"
 
 GOALS = {
@@ -142,9 +147,7 @@ class Depth(Task):
                 raise InputError(f"task depth: {name}: expected a number over 0, under {high:g}, got {value!r}")
         for name, known in (("kind", KINDS), ("seek", GOALS)):
             if getattr(self, name) not in ("", *known):
-                raise InputError(
-                    f"task depth: {name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}"
-                )
+                raise InputError(f"task depth: {name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
 
     # ---- what is read -----------------------------------------------------------------------------------------------
 
@@ -349,7 +352,7 @@ class Depth(Task):
         if not math.isfinite(mean):
             return Answer(NOT_A_NUMBER), None
         distance = float(truth.z[truth.mask].double().log().mean().exp())
-        payload = {
+        payload: dict[str, float | str] = {
             "distance": round(distance, 4),
             "judged": round(distance * math.exp(mean), 4),
             "factor": round(math.exp(float(factors.abs().mean())), 4),

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.models import Model
 from advsearch.errors import InputError
+from advsearch.models import Model
 from advsearch.models.ensemble import Ensemble, Outputs, by_picture, of_each
 from advsearch.options import FROM_RUN, JOINED
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task, Truth

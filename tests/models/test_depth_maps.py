@@ -63,12 +63,11 @@ def made(family: str) -> Any:
 def published(folder: Path, family: str) -> str:
     """Publish it with an image processor that gives it pictures of `SIDE`."""
     made(family).save_pretrained(folder)
-    size = {"size": {"height": SIDE, "width": SIDE}}
-    prepared = {
-        "GLPN": lambda: transformers.GLPNImageProcessor(),
-        "ZoeDepth": lambda: transformers.ZoeDepthImageProcessor(**size, ensure_multiple_of=8),
-    }.get(family, lambda: transformers.DPTImageProcessor(**size))
-    prepared().save_pretrained(folder)
+    size: dict[str, Any] = {"size": {"height": SIDE, "width": SIDE}}
+    name, settings = {"GLPN": ("GLPN", {}), "ZoeDepth": ("ZoeDepth", {**size, "ensure_multiple_of": 8})}.get(
+        family, ("DPT", size)
+    )
+    getattr(transformers, f"{name}ImageProcessor")(**settings).save_pretrained(folder)
     return f"hf:{folder}"
 
 
@@ -79,7 +78,7 @@ def published(folder: Path, family: str) -> str:
 def test_maps_are_the_librarys(tmp_path: Path, family: str, kind: str) -> None:
     """Of a saved picture."""
     spec = published(tmp_path, family)
-    model = load_model(spec, task="depth", **({"input_size": SIDE} if family == "GLPN" else {}))
+    model = load_model(spec, task="depth", input_size=SIDE if family == "GLPN" else None)
     Image.fromarray(np.asarray(PICTURE.mul(255).round(), np.uint8)).save(tmp_path / "seen.png")
     ours = model(PICTURE)[0]
     prepared = transformers.AutoImageProcessor.from_pretrained(tmp_path)
@@ -114,7 +113,9 @@ def test_the_gradient_of_a_network_agrees_with_differences(tmp_path: Path) -> No
     model: Any = load_model(published(tmp_path, "DepthAnything"), task="depth")
     mask = torch.zeros(SIDE, SIDE).bool()
     mask[8:24, 8:24] = True
-    truth = Distances(mask, torch.linspace(2.0, 4.0, SIDE, dtype=torch.float64)[:, None].expand(SIDE, SIDE) - 0.5 * mask)
+    truth = Distances(
+        mask, torch.linspace(2.0, 4.0, SIDE, dtype=torch.float64)[:, None].expand(SIDE, SIDE) - 0.5 * mask
+    )
     network, task = model.module.double(), Depth()
     generator = torch.Generator().manual_seed(1)
     way = torch.randn((1, 3, SIDE, SIDE), generator=generator, dtype=torch.float64)

@@ -28,8 +28,8 @@ ROUNDED = pytest.mark.filterwarnings("ignore:.*answers an image differently in a
 SWIN = {"image_size": SIDE, "patch_size": 4, "embed_dim": 4, "depths": [1] * 4, "num_heads": [1] * 4, "window_size": 2}
 SIZES: dict[str, dict[str, Any]] = {
     "Mask2Former": {
-        "feature_size": 32, "mask_feature_size": 32, "hidden_dim": 32, "encoder_feedforward_dim": 8, "encoder_layers": 1,
-        "decoder_layers": 2, "num_attention_heads": 2, "dim_feedforward": 8, "num_queries": 5,
+        "feature_size": 32, "mask_feature_size": 32, "hidden_dim": 32, "encoder_feedforward_dim": 8,
+        "encoder_layers": 1, "decoder_layers": 2, "num_attention_heads": 2, "dim_feedforward": 8, "num_queries": 5,
     },
     "MaskFormer": {"fpn_feature_size": 32, "mask_feature_size": 8},
     "OneFormer": {
@@ -57,7 +57,9 @@ def published(folder: Path, family: str) -> str:
     """Publish a tiny network with random weights and its processor into a folder, as `save_pretrained` does."""
     sizes, size = dict(SIZES[family]), {"height": SIDE, "width": SIDE}
     if family == "MaskFormer":
-        sizes["backbone_config"] = transformers.MaskFormerSwinConfig(**SWIN, out_features=[f"stage{k}" for k in (1, 2, 3, 4)])
+        sizes["backbone_config"] = transformers.MaskFormerSwinConfig(
+            **SWIN, out_features=[f"stage{k}" for k in (1, 2, 3, 4)]
+        )
         sizes["decoder_config"] = transformers.DetrConfig(
             d_model=8, encoder_layers=1, decoder_layers=1, encoder_ffn_dim=8, decoder_ffn_dim=8, num_queries=5,
             encoder_attention_heads=2, decoder_attention_heads=2,
@@ -78,8 +80,8 @@ def published(folder: Path, family: str) -> str:
     generator = torch.Generator().manual_seed(0)
     for name, parameter in network.named_parameters():  # answers that differ
         if parameter.dim() > 1:
-            size = 3.0 if "quer" in name else 0.3
-            parameter.data = size * torch.randn(parameter.shape, generator=generator)
+            scale = 3.0 if "quer" in name else 0.3
+            parameter.data = scale * torch.randn(parameter.shape, generator=generator)
     network.save_pretrained(folder)
     getattr(transformers, f"{family}ImageProcessor")(**told).save_pretrained(folder)
     return f"hf:{folder}"

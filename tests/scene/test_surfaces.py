@@ -60,7 +60,11 @@ def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tu
     eye = scene.base("camera.to_world")[:3, 3]
     corners = faces[found.face[there]]
     for low, high, value in (
-        (vertices[corners].sub(eye).norm(dim=2).amin(1) - 2e-3, vertices[corners].sub(eye).norm(dim=2).amax(1), "depth"),
+        (
+            vertices[corners].sub(eye).norm(dim=2).amin(1) - 2e-3,
+            vertices[corners].sub(eye).norm(dim=2).amax(1),
+            "depth",
+        ),
         (uvs[corners].amin(1), uvs[corners].amax(1), "uv"),
     ):
         at = getattr(found, value)[there]

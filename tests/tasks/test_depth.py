@@ -52,7 +52,8 @@ TASK = Depth(size=0.5)
 
 @pytest.mark.parametrize("kind", [DISPARITY, RELATIVE, METRIC])
 @pytest.mark.parametrize(
-    ("factor", "right", "answer"), [(1.0, True, AS_FAR), (1.2, True, AS_FAR), (1.3, False, FARTHER), (0.7, False, NEARER)]
+    ("factor", "right", "answer"),
+    [(1.0, True, AS_FAR), (1.2, True, AS_FAR), (1.3, False, FARTHER), (0.7, False, NEARER)],
 )
 def test_a_factor_of_the_tolerance_is_what_decides(kind: str, factor: float, right: bool, answer: str) -> None:
     """By whatever scale and shift the model speaks: what is beside the object says them."""
@@ -101,7 +102,8 @@ def test_nearer_and_farther_have_a_sign_and_a_mixture_has_neither() -> None:
 
 def test_near_does_not_become_far_by_a_negative_scale() -> None:
     (found,) = TASK.judge([{DISPARITY: -INVERSE}], TRUTH)
-    assert not found.right and found.payload["relief"] < 0.5  # type: ignore[call-overload, index]
+    payload: Any = found.payload
+    assert not found.right and payload["relief"] < 0.5
 
 
 def test_where_nothing_is_seen_nothing_is_wrong_and_where_numbers_are_none_nothing_is_right() -> None:
@@ -145,9 +147,10 @@ def test_a_model_is_read_in_every_form() -> None:
 
 
 def test_what_has_to_be_said_is_said() -> None:
-    assert "does not say what its numbers are; say `kind`, one of relative disparity" in TASK.seeing(
-        [{"": INVERSE}], TRUTH
-    ).unsaid
+    assert (
+        "does not say what its numbers are; say `kind`, one of relative disparity"
+        in TASK.seeing([{"": INVERSE}], TRUTH).unsaid
+    )
     assert "say the longest side of the real object in metres" in Depth().seeing(said(INVERSE, METRIC), TRUTH).unsaid
     (remark,) = Depth(kind=RELATIVE).seeing([{"": INVERSE}], TRUTH).remarks
     assert remark.startswith("The model's numbers are read as relative depth: the distance, up to a scale and a shift")
@@ -274,7 +277,9 @@ def test_a_model_is_refused_for_what_it_is_not() -> None:
     with pytest.raises(ModelError, match="expected a number for each pixel"):
         advsearch.load_model(nn.Flatten(), input_size=8, task="depth")
     network = nn.Conv2d(3, 1, 1)
-    assert np.isfinite(float(advsearch.load_model(network, input_size=8, task="depth")(torch.zeros(8, 8, 3))[0][""].sum()))
+    assert np.isfinite(
+        float(advsearch.load_model(network, input_size=8, task="depth")(torch.zeros(8, 8, 3))[0][""].sum())
+    )
     with pytest.raises(InputError, match="labels: task depth has no classes"):
         Depth().on(advsearch.load_model(network, input_size=8, task="depth", labels=["mug", "cup"]))
     with pytest.raises(InputError, match='it was loaded for its logits; load it with task="depth"'):

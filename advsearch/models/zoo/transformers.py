@@ -127,7 +127,8 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, or one that compares pictures with texts, as CLIPModel. "
+        "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, or one "
+        "that compares pictures with texts, as CLIPModel. "
         "Wrap another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
     )
 
