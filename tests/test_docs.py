@@ -411,9 +411,10 @@ def check_names(config: Config) -> None:
     if isinstance(config, AttackConfig):
         as_controls(config.over)
         make_policy(config.policy_name, **config.policy_options)
+        task = make_task(config.task)
         check_objective(
-            config.objective or make_task(config.task).objective,
-            config.task_name,
+            config.objective or task.objective,
+            task.name,
             targeted=config.target is not None,
             minimise=config.minimise,
         )

@@ -203,13 +203,13 @@ class Depth(Task):
     def _missing(self, kind: str, truth: Distances | None) -> str:
         if not kind:
             return (
-                f"its network does not say what its numbers are; say `kind`, one of {', '.join(KINDS)}, as in "
-                f"--task 'depth={{kind: {DISPARITY}}}'"
+                f"kind: expected what its numbers are, one of {', '.join(KINDS)}, and its network does not say it; "
+                f"give `task='depth={{kind: {DISPARITY}}}'`, say"
             )
         if kind == METRIC and not self.size:
             return (
-                "it answers in metres, and scenes are in object sizes; say the longest side of the real object in "
-                "metres, as in --task 'depth={size: 0.1}'"
+                "size: it answers in metres, and scenes are in object sizes; give the longest side of the real object "
+                "in metres, `task='depth={size: 0.1}'`, say"
             )
         if kind != METRIC and truth is not None and truth.seen and not truth.anchored:
             return (

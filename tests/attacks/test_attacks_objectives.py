@@ -29,6 +29,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective, objec
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import load_model
 from advsearch.tasks import Classification
+from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS
 
 IMAGES = torch.zeros(2, 4, 4, 3)
@@ -201,7 +202,7 @@ every_form_of_logits = pytest.mark.parametrize(("name", "chosen"), [one for one 
 def test_the_battery_knows_every_objective() -> None:
     known = {"margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score"}
     assert {name for name, _ in all_forms()} == known, "a new objective needs a test of its values above"
-    assert set(OBJECTIVE_KINDS) - known == {*GOALS, "pixel_margin"}
+    assert set(OBJECTIVE_KINDS) - known == {*GOALS, *DEPTH_GOALS, "pixel_margin", "each"}
     assert set(OBJECTIVES) == {name for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None}
     for name, kind in OBJECTIVE_KINDS.items():
         assert kind.name == name and kind.unit and kind.summary == objective_summaries()[name]

@@ -108,7 +108,7 @@ def test_what_a_model_does_in_words(task: str, label: str, does: str, doing: str
 
 
 def test_margins_and_objectives_in_words() -> None:
-    assert len({margin_text(task) for task in ("classification", "detection", "segmentation", "yaw")}) == 4
+    assert len({margin_text(task) for task in ("classification", "detection", "segmentation", "depth", "yaw")}) == 5
     assert len({marks_text(task) for task in ("detection", "segmentation", "yaw")}) == 3
     assert wanted("vanish", "this mug") == "makes the model miss this mug"
     assert wanted("displace", "this mug") == "makes the model see this mug elsewhere"

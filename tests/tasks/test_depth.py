@@ -148,10 +148,10 @@ def test_a_model_is_read_in_every_form() -> None:
 
 def test_what_has_to_be_said_is_said() -> None:
     assert (
-        "does not say what its numbers are; say `kind`, one of relative disparity"
+        "kind: expected what its numbers are, one of relative disparity, relative depth, metric depth, and"
         in TASK.seeing([{"": INVERSE}], TRUTH).unsaid
     )
-    assert "say the longest side of the real object in metres" in Depth().seeing(said(INVERSE, METRIC), TRUTH).unsaid
+    assert "give the longest side of the real object in metres" in Depth().seeing(said(INVERSE, METRIC), TRUTH).unsaid
     (remark,) = Depth(kind=RELATIVE).seeing([{"": INVERSE}], TRUTH).remarks
     assert remark.startswith("The model's numbers are read as relative depth: the distance, up to a scale and a shift")
     with pytest.raises(InputError, match="label: task depth has no classes"):

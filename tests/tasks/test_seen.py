@@ -160,12 +160,12 @@ class Flat(nn.Module):
 
 def depth_task() -> Any:
     (page,) = (
-        text for text in (DOCS / "extending.md").read_text("utf-8").split("`my_package/")[1:] if text[:6] == "depth."
+        text for text in (DOCS / "extending.md").read_text("utf-8").split("`my_package/")[1:] if text[:9] == "distance."
     )
-    module = types.ModuleType("my_package.depth")
-    sys.modules["my_package.depth"] = module  # where a dataclass looks for its types
+    module = types.ModuleType("my_package.distance")
+    sys.modules["my_package.distance"] = module  # where a dataclass looks for its types
     exec(re.findall(r"```python\n(.*?)```", page, re.S)[0], vars(module))
-    return module.Depth
+    return module.Distance
 
 
 def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> None:
@@ -192,4 +192,4 @@ def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> N
         "measure": "no",
     }
     found = advsearch.attack("banana", model, run=str(tmp_path / "attack"), baseline=False, **attack, **fast)
-    assert found.summary.task == "depth" and found.summary.label_set[0].endswith(" away")
+    assert found.summary.task == "distance" and found.summary.label_set[0].endswith(" away")
