@@ -13,13 +13,16 @@ import math
 import os
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, final, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
 
 from advsearch.described import Value
 from advsearch.errors import FileFormatError
@@ -102,6 +105,19 @@ MIGRATIONS = (
     UPDATE evaluations SET score = objective, objective = NULL
         WHERE kind <> 'baseline' AND substr(kind, 1, 6) <> 'search';
     """,
+    """
+    -- What an evaluation told its search beside its row: only until the run is done.
+    CREATE TABLE told (
+        row         INTEGER PRIMARY KEY REFERENCES evaluations (id),
+        number      INTEGER NOT NULL, -- of its seed
+        u           BLOB    NOT NULL, -- digest of the configuration
+        non_finite  INTEGER NOT NULL, -- numbers of the gradient that were not
+        cost        INTEGER NOT NULL, -- in evaluations
+        gradient    BLOB,             -- float32, where one was wanted
+        picture     BLOB,             -- levels of 8 bits, where it is kept for the animation
+        height      INTEGER           -- of that, in pixels
+    );
+    """,
 )
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
@@ -155,11 +171,37 @@ class Row:
     id: int | None = None
 
 
+@dataclass(frozen=True)
+class Told:
+    """What an evaluation told its search beside its row. A policy's state follows from what it has been told, so a
+    search goes on by being told all of that again.
+
+    Attributes:
+        number: of its seed.
+        u: digest of the configuration.
+        non_finite: numbers of the gradient that were not.
+        cost: in evaluations.
+        gradient: (d,) float32; None where none was wanted.
+        picture: (H, W, 3) uint8; None where it is not kept.
+    """
+
+    number: int
+    u: bytes
+    non_finite: int
+    cost: int
+    gradient: NDArray[np.float32] | None = None
+    picture: NDArray[np.uint8] | None = None
+
+
+_TOLD = "number, u, non_finite, cost, gradient, picture, height"
 _AS_JSON = ("payload", "values")
 _COLUMNS = tuple(f"{one.name}_json" if one.name in _AS_JSON else one.name for one in fields(Row))
 _INSERT = (
     f"INSERT INTO evaluations ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) ON CONFLICT DO NOTHING"
 )
+
+
+_INSERT_TOLD = "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations WHERE kind = ? AND step = ?"
 
 
 @final
@@ -183,10 +225,10 @@ class Store:
             _check_version(self._db, path)
             _check_schema(self._db, path)
 
-    def append(self, rows: Iterable[Row]) -> None:
+    def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
         """Add rows in one transaction; they survive a kill of the process when this returns.
 
-        A row whose kind and step are there already changes nothing.
+        A row whose kind and step are there already changes nothing. What it `told` is that of the last one.
 
         Raises:
             StorageError: the disk is full or can't be written; none of these rows is kept.
@@ -197,6 +239,8 @@ class Store:
             self._db.execute(f"PRAGMA synchronous = {'FULL' if force else 'NORMAL'}")
             with self._db:
                 self._db.executemany(_INSERT, (_encode(row, stamp) for row in rows))
+                if told is not None:
+                    self._db.execute(_INSERT_TOLD, (*_encoded(told), rows[-1].kind, rows[-1].step))
         if force:
             ended = time.monotonic()
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
@@ -222,6 +266,46 @@ class Store:
                 (kind, step),
             ).fetchone()
         return None if found is None else _decode(found, self.path)
+
+    def told(self, kind: str, step: int) -> tuple[Row, Told] | None:
+        """Return a row of a search with what it told; None where there is none, or the run is done."""
+        row = self.row(kind, step)
+        with _readable(self.path):
+            found = row and self._db.execute(f"SELECT {_TOLD} FROM told WHERE row = ?", (row.id,)).fetchone()
+        return (row, _told(found, self.path)) if row and found else None
+
+    def pictures(self, kind: str, after: int, until: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield the number and the picture of what the rows of a kind with these ids have told, while the run goes on.
+
+        Args:
+            kind: of search.
+            after: the id behind which to begin.
+            until: the last id.
+        """
+        with _readable(self.path):
+            cursor = self._db.execute(
+                "SELECT number, u, non_finite, cost, NULL, picture, height FROM told JOIN evaluations ON row = id "
+                "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id",
+                (kind, after, until),
+            )
+        while (values := self._next(cursor)) is not None:
+            one = _told(values, self.path)
+            assert one.picture is not None
+            yield one.number, one.picture
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether there is something that searches were told: the run is not done."""
+        with _readable(self.path):
+            return bool(self._db.execute("SELECT EXISTS (SELECT * FROM told)").fetchone()[0])
+
+    def forget(self) -> None:
+        """Remove what searches were told: the run is done."""
+        with storage_errors(self.path):
+            with self._db:
+                anything = self._db.execute("DELETE FROM told").rowcount
+            if anything:
+                self._db.execute("VACUUM")
 
     def last_step(self, kind: str) -> int:
         """Return the largest step of a kind; -1 where there is none."""
@@ -465,6 +549,29 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     for name in ("success", "correct"):
         given[name] = None if given[name] is None else bool(given[name])
     return Row(**given)
+
+
+def _encoded(told: Told) -> tuple[Any, ...]:
+    arrays = [None if one is None else one.tobytes() for one in (told.gradient, told.picture)]
+    height = None if told.picture is None else len(told.picture)
+    return told.number, told.u, told.non_finite, told.cost, *arrays, height
+
+
+def _told(values: tuple[Any, ...], path: Path) -> Told:
+    number, u, non_finite, cost, gradient, picture, height = values
+    try:
+        if [type(one) for one in (number, u, non_finite, cost)] != [int, bytes, int, int]:
+            raise TypeError("a number that is none")
+        return Told(
+            number,
+            u,
+            non_finite,
+            cost,
+            gradient=None if gradient is None else np.frombuffer(gradient, np.float32),
+            picture=None if picture is None else np.frombuffer(picture, np.uint8).reshape(height, -1, 3),
+        )
+    except (TypeError, ValueError) as error:
+        raise FileFormatError(f"{path}: expected what a search was told, got something else ({error})") from None
 
 
 def _values(text: str) -> dict[str, Value] | None:
