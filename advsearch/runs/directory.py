@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
-from advsearch.runs import images, lock, made_with, store, summary, tracking
+from advsearch.runs import database, images, lock, made_with, store, summary, tracking
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 from advsearch.yaml_text import LARGEST
 
@@ -438,7 +438,7 @@ def only_here(path: Path) -> list[str]:
 
 def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
-    if store.is_ours(path / store.NAME):
+    if database.is_ours(path / store.NAME):
         return True
     from advsearch.settings import HEADER
 
@@ -498,12 +498,12 @@ def _clear(path: Path) -> None:
 
 def _never_began(path: Path) -> bool:
     """Whether a run was killed before its settings were written: there is nothing in it to lose."""
-    if (path / CONFIG).exists() or not store.is_ours(path / store.NAME):
+    if (path / CONFIG).exists() or not database.is_ours(path / store.NAME):
         return False
     with suppress(AdvsearchError):
         if (path / summary.NAME).exists():
             return False
-        if store.is_bare(path / store.NAME):
+        if database.is_bare(path / store.NAME):
             return True
         with store.Store(path / store.NAME, read_only=True) as results:
             return results.count() == 0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
-from advsearch.runs import lock, store, summary
+from advsearch.runs import database, lock, store, summary
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.runs.results.base import Result
 from advsearch.settings import read_yaml
@@ -56,7 +56,7 @@ def finished(path: Path) -> bool:
     """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
     if not (path / summary.NAME).is_file() or summary.read_result(path).goes_on:
         return False
-    return not store.is_ours(path / store.NAME) or not goes_on(path)
+    return not database.is_ours(path / store.NAME) or not goes_on(path)
 
 
 def goes_on(path: Path) -> bool:

@@ -26,7 +26,7 @@ from advsearch.engine.memory import Memory
 from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
-from advsearch.runs import store
+from advsearch.runs import database
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import goes_on
 from advsearch.runs.store import Row, Store, Told
@@ -284,11 +284,11 @@ def test_a_kill_before_the_results_had_tables_leaves_a_folder_that_a_run_can_tak
     folder = tmp_path / "run"
     folder.mkdir()
     with closing(sqlite3.connect(folder / "results.sqlite")) as made:
-        made.execute(f"PRAGMA application_id = {store.APPLICATION_ID}")
+        made.execute(f"PRAGMA application_id = {database.APPLICATION_ID}")
     with RunDirectory.create(folder) as run:
         run.write_config(configuration())
     with closing(sqlite3.connect(tmp_path / "results.sqlite")) as made:
-        made.execute(f"PRAGMA application_id = {store.APPLICATION_ID}")
+        made.execute(f"PRAGMA application_id = {database.APPLICATION_ID}")
         made.execute("CREATE TABLE others (text)")
     folder.joinpath("run.yaml").unlink()
     (tmp_path / "results.sqlite").replace(folder / "results.sqlite")
