@@ -19,7 +19,8 @@ _MARGINS = {
 _MARKS = {
     DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
     SEGMENTATION: "Blue is the true outline, orange the pixels to which the model gives a right class.",
-    DEPTH: "Blue is the true outline, orange the object's pixels whose distance is right.",
+    DEPTH: "Blue is the true outline, orange the object's pixels whose distance is right. Beside it is the inverse of "
+    "the true distance, and of the model's: light is near.",
 }
 _WANTED = {
     "mislabel": "makes the model take {} for something else",

@@ -93,12 +93,14 @@ class Mark:
         true: whether it is what is true of the scene; otherwise it is what the model says.
         box: x0, y0, x1, y1 in pixels of the picture, from the top left.
         mask: (h, w) bool over the whole picture, of any size.
+        map: (h, w) numbers over the whole picture, which are shown beside it, larger ones lighter.
     """
 
     text: str
     true: bool
     box: tuple[float, float, float, float] | None = None
     mask: Tensor | None = None
+    map: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -287,7 +287,16 @@ class Depth(Task):
         return torch.stack([value(self._factors(one, truth)) for one in output])
 
     def _factors(self, one: Map, truth: Distances) -> Tensor:
-        """log(judged / true) of each of the object's pixels, (P,); none is larger than `LARGEST`.
+        """log(judged / true) of each of the object's pixels, (P,); none is larger than `LARGEST`."""
+        judged, inverse = self._judged(one, truth)
+        mask, z = truth.mask.to(judged.device), truth.z.to(judged.device)
+        ratio = judged[mask] * z[mask] if inverse else judged[mask] / z[mask]
+        logarithms = ratio.clamp(1.0 / LARGEST, LARGEST).log()
+        whole = judged.sum() * 0.0  # a number that is none anywhere in the map
+        return (-logarithms if inverse else logarithms) + whole
+
+    def _judged(self, one: Map, truth: Distances) -> tuple[Tensor, bool]:
+        """What the model says of every pixel, (H, W) z-depth in object sizes, or its inverse; and whether that is it.
 
         A map is brought to the size of the picture as transformers does it in `post_process_depth_estimation`.
         """
@@ -296,17 +305,10 @@ class Depth(Task):
         size = (truth.mask.shape[0], truth.mask.shape[1])
         if values.shape != size:
             values = F.interpolate(values[None, None], size=size, mode="bicubic", align_corners=False)[0, 0]
-        mask, z, at = (part.to(values.device) for part in (truth.mask, truth.z, truth.fitted))
+        z, at = truth.z.to(values.device), truth.fitted.to(values.device)
         if kind == METRIC:
-            ratio = values[mask] / self.size / z[mask]
-        elif kind == DISPARITY:
-            ratio = _fitted(values, z.reciprocal(), at)[mask] * z[mask]
-        else:
-            ratio = _fitted(values, z, at)[mask] / z[mask]
-        logarithms = ratio.clamp(1.0 / LARGEST, LARGEST).log()
-        factors = -logarithms if kind == DISPARITY else logarithms
-        whole = values.sum() * 0.0  # a number that is none anywhere in the map
-        return factors + whole
+            return values / self.size, False
+        return (_fitted(values, z.reciprocal(), at), True) if kind == DISPARITY else (_fitted(values, z, at), False)
 
     def _relief(self, factors: Tensor, truth: Distances) -> Tensor:
         """The share of the object's relief that is left, (): 1 where all is as it is, 0 where it is as far as what is
@@ -366,13 +368,17 @@ class Depth(Task):
         return Answer(AS_FAR if right else wrong), payload
 
     def marks(self, output: Sequence[Map], truth: Distances) -> list[list[Mark]]:
-        """See `Task.marks`: the object, and its pixels of which the distance is right within the tolerance."""
-        found, true = [], Mark("object", True, mask=truth.mask)
+        """See `Task.marks`: the object, its pixels of which the distance is right, and the disparity of everything."""
+        found = []
         for one in output:
-            right = torch.zeros_like(truth.mask)
+            marks = [Mark("disparity", True, mask=truth.mask, map=truth.z.reciprocal())]
             if truth.seen and not self._missing(self.kind or next(iter(one)), None):
+                right = torch.zeros_like(truth.mask)
                 right[truth.mask] = (self._factors(one, truth).detach().abs() <= self._bar).to(right.device)
-            found.append([true, Mark("right distance", False, mask=right)])
+                judged, inverse = self._judged(one, truth)
+                near = judged if inverse else judged.clamp_min(1.0 / LARGEST).reciprocal()
+                marks.append(Mark("disparity", False, mask=right, map=near.detach().cpu()))
+            found.append(marks)
         return found
 
 

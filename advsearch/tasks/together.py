@@ -144,11 +144,11 @@ class Together(Task):
         return Judgement.of(min(one.score for one in each), margin, *said)
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
-        """See `Task.marks`: what is true once, and what each model says under its name."""
+        """See `Task.marks`: what is true of the first, maps of all, and what each model says under its name."""
         found: list[list[Mark]] = [[] for _ in output]
         for number, (one, *own) in enumerate(self._each(output, truth)):
             for listed, marks in zip(found, one.marks(*own), strict=True):
-                listed += [mark for mark in marks if mark.true and not number]
+                listed += [mark for mark in marks if mark.true and (not number or mark.map is not None)]
                 name = self.models[number].name
                 listed += [replace(mark, text=f"{name}: {mark.text}") for mark in marks if not mark.true]
         return found

@@ -192,8 +192,11 @@ def test_it_is_compared_with_the_distance_along_the_axis() -> None:
     sight = Sight(MASK, 2.0 * TRUTH.z, TRUTH.z)
     truth = TASK.truth(Facts("mug", look=lambda: sight))
     assert truth.z is TRUTH.z and TASK.truth_names(truth) == (AS_FAR,)
-    true, right = TASK.marks(said(moved(2.0)), truth)[0]
-    assert true.true and true.mask is MASK and right.mask is not None and not right.mask.any()
+    for kind in (DISPARITY, RELATIVE, METRIC):
+        true, right = TASK.marks(said(moved(2.0), kind), truth)[0]
+        assert true.true and true.mask is MASK and right.mask is not None and not right.mask.any()
+        assert true.map is not None and torch.allclose(true.map, INVERSE)
+        assert right.map is not None and torch.allclose(right.map, moved(2.0), atol=1e-4)
 
 
 # ---- on a model -----------------------------------------------------------------------------------------------------
@@ -229,11 +232,14 @@ def test_a_search_verifies_and_draws(asked: list[str], capsys: pytest.CaptureFix
         payloads: list[Any] = [row.payload for row in store.rows("verification")]
     assert {one["fitted"] for one in payloads} == {"beside the object"}
     clean, drawn = (read_png(run / "images" / f"{name}-answer.png") for name in ("clean", "adversarial"))
-    orange = [float((one[..., 0] - one[..., 2]).clip(0.2).mean()) for one in (clean, drawn)]
+    assert clean.shape == (512, 3 * 512, 3), "the picture, the true disparity and the model's"
+    orange = [float((one[:, :512, 0] - one[:, :512, 2]).clip(0.2).mean()) for one in (clean, drawn)]
     assert orange[0] > orange[1] + 0.02, "fewer pixels of the object are right"
+    off = [float(abs(one[:, 512:1024] - one[:, 1024:]).mean()) for one in (clean, drawn)]
+    assert off[0] < 0.16 and off[1] > off[0] + 0.1, off
     page = (run / "report.html").read_text("utf-8")
     assert f"The model judges this mug {GONE} in 6 of 6 fresh renders" in page
-    assert "orange the object&#x27;s pixels whose distance is right" in page
+    assert "orange the object&#x27;s pixels whose distance is right." in page
 
 
 def test_a_sweep_counts(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
