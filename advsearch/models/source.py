@@ -63,6 +63,7 @@ class Source:
         module: the network, in evaluation mode, its parameters without gradients.
         name: what to call it.
         input_size, mean, std, layout, channels, labels: as in `load_model`; None where the source does not say.
+        processor: as in `Preprocessing`; None where `mean`, `std` and `channels` say it all.
         batch_limits: (fewest, most) images at once.
         dtype: floating type of the input.
         device: where its weights are.
@@ -78,6 +79,7 @@ class Source:
     layout: str | None = None
     channels: str | None = None
     labels: tuple[str, ...] | None = None
+    processor: Callable[[torch.Tensor], torch.Tensor] | None = None
     batch_limits: tuple[int, int] = (1, 64)
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
