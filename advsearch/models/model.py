@@ -237,10 +237,11 @@ def _task_of(answer: Any) -> str | None:
 
 
 def _has_boxes(output: Any) -> bool:
-    """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings with "boxes"."""
+    """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings or objects with "boxes"."""
     first = output[0] if isinstance(output, (tuple, list)) and output else output
-    if isinstance(first, Mapping):
-        return "boxes" in first or "pred_boxes" in first
+    names = first if isinstance(first, Mapping) else dir(first)
+    if not isinstance(first, Tensor) and ("boxes" in names or "pred_boxes" in names):
+        return True
     several = isinstance(output, (tuple, list)) and len(output) > 1
     return several and isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4
 
