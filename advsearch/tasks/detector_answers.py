@@ -4,7 +4,8 @@ Detections of one picture are a mapping with `boxes` (D, 4) as they came and `sc
 with `labels` (D,), the class of each box. Where types, names and shapes leave open which of two numbers of a box is its
 score and which its class, these stand as `either` (D, 2) in place of both. One tensor that only the number of classes
 explains stands as `raw` (A, B) in place of all, with the channels of maps that came with it as `beside` (K,), see
-`yolo_heads`. Logits that only it explains stand as `logits` (D, K) in place of scores, see `QUERIES`. Rows that only fill up are gone; how many of them were NaN throughout is said as `blank` (1,), if any.
+`yolo_heads`. Logits that only that number explains stand as `logits` (D, K) in place of scores, see `QUERIES`. Rows
+that only fill up are gone; how many of them were NaN throughout is said as `blank` (1,), if any.
 """
 
 from __future__ import annotations
@@ -117,14 +118,15 @@ def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
 
 def _queries(answer: Any, order: str) -> tuple[Tensor, Tensor] | None:
     """The boxes and logits of an answer as DETR's networks give it, or that is said to be one; None of any other."""
-    if order in QUERIES:
-        parts = _parts(answer, ())
-        return (parts["boxes"], parts["scores"]) if "scores" in parts and "labels" not in parts else None
+    if order in QUERIES and isinstance(answer, (list, tuple)):  # boxes are shares, which logits are not
+        tensors = [one for one in answer if isinstance(one, Tensor)]
+        boxes = [one for one in tensors if one.shape[-1] == 4 and bool(((one >= 0.0) & (one <= 1.0)).all())][:1]
+        logits = [one for one in tensors if not any(one is box for box in boxes)][:1]
+        return (boxes[0], logits[0]) if boxes and logits else None
     part = answer.get if isinstance(answer, Mapping) else partial(getattr, answer)
-    found = [part(name, None) for name in ("pred_boxes", *QUERY_LOGITS)]
-    boxes, *logits = [one if isinstance(one, Tensor) else None for one in found]
-    given = [one for one in logits if one is not None]
-    return (boxes, given[0]) if boxes is not None and given and not order else None
+    found = [[one] if isinstance(one := part(name, None), Tensor) else [] for name in ("pred_boxes", *QUERY_LOGITS)]
+    boxes, logits = found[0], [*found[1], *found[2]][:1]
+    return (boxes[0], logits[0]) if boxes and logits and order in ("", *QUERIES) else None
 
 
 def _first(answer: Any) -> tuple[Any, set[int]]:
@@ -269,7 +271,9 @@ def _one(one: Mapping[str, Tensor]) -> Detections:
     outside = best[~filling]
     if bool(((outside < -TOLERANCE) | (outside > 1.0 + TOLERANCE) & outside.isfinite()).any()):
         said = f", or say {' or '.join(as_option(f'order: {order}') for order in QUERIES)}" if labels is None else ""
-        raise ValueError(f"expected scores that are probabilities in [0, 1]; apply a sigmoid or a softmax to them{said}")
+        raise ValueError(
+            f"expected scores that are probabilities in [0, 1]; apply a sigmoid or a softmax to them{said}"
+        )
     found = {"boxes": boxes, "scores": scores} if labels is None else {
         "boxes": boxes, "scores": scores, "labels": labels.long()
     }  # fmt: skip
@@ -349,8 +353,8 @@ def _order_of_queries(logits: int, classes: int, said: str) -> str:
         return order
     fitting = [f"`labels={name}`" for name in dict.fromkeys([*sets_of(logits), *sets_of(logits - 1)])]
     raise ValueError(
-        f"expected {classes} logits of a box for {classes} classes, or {classes + 1} with one for nothing, got {logits}; "
-        f"{' or '.join(fitting) + ' would fit' if fitting else 'give the `labels` of the classes of the model'}"
+        f"expected {classes} logits of a box for {classes} classes, or {classes + 1} with one for nothing, got "
+        f"{logits}; {' or '.join(fitting) + ' would fit' if fitting else 'give the `labels` of its classes'}"
     )
 
 
