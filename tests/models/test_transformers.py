@@ -18,6 +18,8 @@ from torch import Tensor, nn
 from advsearch.errors import InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.zoo import timm as timm_networks
+from advsearch.tasks import Detection
+from advsearch.tasks.detection import Place
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -214,6 +216,34 @@ def test_it_finds_objects(tmp_path: Path) -> None:
     assert bool((boxes[:, :2] <= boxes[:, 2:]).all())
     assert scores.shape == (5, 3)
     assert 0.0 <= float(scores.min()) <= float(scores.max()) <= 1.0
+
+
+class Asked(nn.Module):
+    """A network of transformers in a module of one's own, which answers with the library's own output."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> Any:
+        return self.network(pixel_values=x)
+
+
+def test_the_output_of_a_detector_is_read_as_the_library_reads_it(tmp_path: Path) -> None:
+    more = {"image_size": [SIDE, SIDE], "num_detection_tokens": 5}
+    prepared = processor("YolosImageProcessor")
+    published(tmp_path, "YolosForObjectDetection", prepared, **more)
+    network = transformers.YolosForObjectDetection.from_pretrained(tmp_path)
+    model = load_model(Asked(network), input_size=SIDE, labels=NAMES, read=Detection(iou=0.5).reader)
+    task = Detection(suppression=1.0, confidence=1e-6).on(model)
+    with torch.no_grad():
+        answer = network(pixel_values=PICTURES[:1].permute(0, 3, 1, 2))
+        theirs = prepared.post_process_object_detection(answer, threshold=0.0, target_sizes=[(SIDE, SIDE)])[0]
+    ours = task.judge(model(PICTURES[:1]), Place((0,), (0, 0, SIDE, SIDE), (SIDE, SIDE)))[0].payload
+    best = int(theirs["scores"].argmax())
+    (found,) = [one for one in ours["found"] if one["score"] == round(float(theirs["scores"][best]), 3)]  # type: ignore[index,call-overload,union-attr]
+    assert found["label"] == NAMES[int(theirs["labels"][best])]
+    assert found["box"] == [pytest.approx(x, abs=0.06) for x in theirs["boxes"][best].tolist()]
 
 
 def test_names_that_are_no_heads_at_the_end(tmp_path: Path) -> None:
