@@ -279,6 +279,25 @@ def test_a_folder_that_is_not_there_is_no_repository(spec: str) -> None:
         load_model(spec)
 
 
+def test_a_folder_with_nearly_that_name_is_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise OSError("We couldn't connect to the hub")
+
+    (tmp_path / "some" / "folder").mkdir(parents=True)
+    (tmp_path / "some" / "model.safetensors").touch()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelError, match=r"no such folder \(did you mean 'hf:some/folder'\?\); a repository is"):
+        load_model("hf:./some/folderr")
+    monkeypatch.setattr(transformers.utils, "cached_file", away)
+    meant = r"some/folderr is no folder here \(did you mean 'hf:some/folder'\?\), and no repository of that name"
+    with pytest.raises(ModelError, match=meant):
+        load_model("hf:some/folderr")
+    with pytest.raises(ModelError, match=r"model hf:another: another is no folder here, and no repository .*connect"):
+        load_model("hf:another")
+    with pytest.raises(ModelError, match="is a file; give the folder in which it is"):
+        load_model("hf:some/model.safetensors")
+
+
 def test_it_never_unpickles(tmp_path: Path) -> None:
     spec = published(tmp_path, "ViTForImageClassification", processor("ViTImageProcessor"))
     torch.save(load_file(tmp_path / "model.safetensors"), tmp_path / "pytorch_model.bin")
