@@ -54,7 +54,7 @@ def load(spec: str) -> Source:
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
     image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
-    alone. A repository of timm goes to timm.
+    alone. A repository that timm has saved goes to timm.
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
@@ -76,7 +76,7 @@ def load(spec: str) -> Source:
     where = {"revision": revision} if revision else {}
     with reading(spec, ADVICE):
         told = _config(transformers, name, spec, where)
-        if told.get("model_type") == "timm_wrapper":
+        if told.get("model_type") == "timm_wrapper" and "architectures" not in told:  # which timm itself has saved
             return timm.load_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
@@ -231,6 +231,11 @@ def _with_names(make: Callable[[Any], nn.Module]) -> Callable[[Loaded], Source]:
 
 
 KINDS = (
+    Kind(
+        _called("TimmWrapperForImageClassification"),
+        "AutoModelForImageClassification",
+        lambda loaded: timm.of_wrapped(loaded, names_of(loaded.network.config)),
+    ),
     Kind(
         _called("ForImageClassification"),
         "AutoModelForImageClassification",
