@@ -16,22 +16,22 @@ from advsearch import load_model
 from advsearch.errors import ModelError
 from advsearch.models import Model
 
-WHY = "is not installed, or not for this torch: make test-zoo"
+WHY = "is not installed, since it needs another torch: make test-zoo"
 LEVELS = np.random.default_rng(0).integers(0, 256, (160, 160, 3), np.uint8)
 PICTURE = torch.from_numpy(LEVELS).float() / 255.0
 
 
 @pytest.fixture
 def torchvision() -> Any:
-    return pytest.importorskip("torchvision", reason=f"torchvision {WHY}", exc_type=Exception)
+    return pytest.importorskip("torchvision", reason=f"torchvision {WHY}")
 
 
 @pytest.fixture
 def timm() -> Any:
-    return pytest.importorskip("timm", reason=f"timm {WHY}", exc_type=Exception)
+    return pytest.importorskip("timm", reason=f"timm {WHY}")
 
 
-def stirred(network: nn.Module) -> nn.Module:
+def stirred(network: Any) -> Any:
     """The network with answers that differ, in evaluation mode."""
     torch.manual_seed(0)
     for parameter in network.parameters():

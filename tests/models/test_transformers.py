@@ -239,9 +239,9 @@ def test_the_output_of_a_detector_is_read_as_the_library_reads_it(tmp_path: Path
     with torch.no_grad():
         answer = network(pixel_values=PICTURES[:1].permute(0, 3, 1, 2))
         theirs = prepared.post_process_object_detection(answer, threshold=0.0, target_sizes=[(SIDE, SIDE)])[0]
-    ours = task.judge(model(PICTURES[:1]), Place((0,), (0, 0, SIDE, SIDE), (SIDE, SIDE)))[0].payload
+    ours: Any = task.judge(model(PICTURES[:1]), Place((0,), (0, 0, SIDE, SIDE), (SIDE, SIDE)))[0].payload
     best = int(theirs["scores"].argmax())
-    (found,) = [one for one in ours["found"] if one["score"] == round(float(theirs["scores"][best]), 3)]  # type: ignore[index,call-overload,union-attr]
+    (found,) = [one for one in ours["found"] if one["score"] == round(float(theirs["scores"][best]), 3)]
     assert found["label"] == NAMES[int(theirs["labels"][best])]
     assert found["box"] == [pytest.approx(x, abs=0.06) for x in theirs["boxes"][best].tolist()]
 
