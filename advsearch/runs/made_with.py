@@ -54,7 +54,8 @@ def changed_file(before: Sequence[Mapping[str, object]], now: Mapping[str, str])
 
 def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of each file that settings name, in hexadecimal, and of each that was read for it: materials,
-    pictures and buffers that a mesh or a scene names. What is bundled or gone has none."""
+    pictures and buffers that a mesh or a scene names. A folder that was read has one for all that was read in it. What
+    is bundled or gone has none."""
     from advsearch.settings.configuration import FILES
 
     found: dict[str, str] = {}
@@ -63,6 +64,10 @@ def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
             with suppress(OSError, ValueError):
                 own = os.path.abspath(path)
                 parts = opened_for(own)
+                if os.path.isdir(own):
+                    if parts:
+                        found[path] = _digest_of_all(own, parts)
+                    continue
                 if (parts or name in FILES) and Path(path).is_file():
                     found[path] = _digest(Path(path))
                 for part in parts:
@@ -86,6 +91,13 @@ def _paths(value: object) -> Iterator[str]:
             yield from dict.fromkeys(
                 one.strip() for one in (name, name.rpartition("@")[2], name.partition("#")[0]) if one.strip()
             )
+
+
+def _digest_of_all(folder: str, parts: Sequence[str]) -> str:
+    """Return the SHA-256 of the names and digests of files in a folder."""
+    there = (Path(part) for part in sorted(parts) if Path(part).is_file())
+    lines = [f"{os.path.relpath(part, folder)} {_digest(part)}\n" for part in there]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def _digest(path: Path) -> str:

@@ -11,10 +11,11 @@ from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.detection import Detection
 from advsearch.tasks.segmentation import Segmentation
+from advsearch.tasks.similarity import Similarity
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation)},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation, Similarity)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -55,6 +56,7 @@ __all__ = [
     "Mark",
     "Segmentation",
     "Sight",
+    "Similarity",
     "Task",
     "make_task",
 ]

@@ -32,6 +32,11 @@ LARGEST_PIXELS = 1 << 26
 MOST_SCANS = 64
 """Scans of a progressive JPEG, each of which takes as long to decode as a picture of its own; usual are ten."""
 
+ORIENTATION = 0x0112
+"""The tag of EXIF that says how a picture is to be turned, and these are the ways: mirrored left to right first, then
+turned by so many right angles against the clock."""
+_TURNS = {2: (True, 0), 3: (False, 2), 4: (True, 2), 5: (True, 1), 6: (False, 3), 7: (True, 3), 8: (False, 1)}
+
 _BAND = 1 << 22  # pixels of a large picture that are averaged at a time
 
 
@@ -56,8 +61,10 @@ def check_pixels(path: Path | str, width: int, height: int, limit: int = LARGEST
         raise files.too_large(path, expected, f"{width} x {height}")
 
 
-def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = False) -> Floats:
+def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = False, upright: bool = False) -> Floats:
     """Read a picture file; arguments and result as for `display_image`.
+
+    With `upright` it is turned as its file (EXIF) says that the camera was held.
 
     Raises:
         FileFormatError: it is missing, no ordinary file, no picture, too large or damaged.
@@ -67,7 +74,8 @@ def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = F
         with warnings.catch_warnings(), without_pillows_limit():
             warnings.simplefilter("ignore")  # of odd metadata
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                return display_image(image, limit, path, raw=raw)
+                values = display_image(image, limit, path, raw=raw)
+                return _turned(values, image.getexif().get(ORIENTATION, 1)) if upright else values
     except (OSError, ValueError, SyntaxError, EOFError) as error:
         reason = getattr(error, "strerror", None) or "one that cannot be read"
         raise FileFormatError(f"{path}: expected a picture file such as PNG, got {reason}; check the path") from error
@@ -128,6 +136,11 @@ def display_image(
         if weighted:
             colors = np.where(share > 0.0, averaged[:, :, 4:] / np.maximum(share, 1e-9), colors)
         return np.concatenate([linear_to_srgb(colors), share] if alpha else [linear_to_srgb(colors)], axis=2)
+
+
+def _turned(values: Floats, orientation: object) -> Floats:
+    mirrored, turns = _TURNS.get(orientation, (False, 0)) if isinstance(orientation, int) else (False, 0)
+    return np.ascontiguousarray(np.rot90(values[:, ::-1] if mirrored else values, turns))
 
 
 def _scans(image: Image.Image) -> int:
