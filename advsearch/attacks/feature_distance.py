@@ -88,7 +88,8 @@ def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, 
 
     def objective(output: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
         moved = functional.normalize(output, dim=1) - reference.to(output)
-        return moved.square().sum(dim=1) / 2.0 + moved @ away.to(output)
+        distance: Tensor = moved.square().sum(dim=1) / 2.0 + moved @ away.to(output)
+        return distance
 
     return objective
 

@@ -139,9 +139,7 @@ class Similarity(Classification):
         """
         found = pooled(answer[0] if type(answer) in (tuple, list) and answer else answer, token=True)
         if found is None or found.dim() != 2 or found.shape[0] != count:
-            raise ValueError(
-                f"expected features ({count}, D), or an answer with {', '.join(PARTS[:-1])} or {PARTS[-1]}"
-            )
+            raise ValueError(f"expected features ({count}, D), or what has one of {', '.join(PARTS)}")
         return found.float()
 
     def logits(self, output: Tensor) -> Tensor:

@@ -122,6 +122,6 @@ class _Features(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         asked = self.network.get_image_features if self.compares else self.network
-        answer = asked(pixel_values=images)  # type: ignore[operator]
+        answer = asked(pixel_values=images)
         found = pooled(answer, token=self.has_token)
         return answer if found is None else found
