@@ -97,7 +97,7 @@ def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, 
 def _away(reference: Tensor) -> Tensor:
     """Return a fixed direction (F,) of length `NEARBY`."""
     away = torch.randn(reference.shape, generator=torch.Generator().manual_seed(0)).to(reference)
-    return NEARBY * away / torch.linalg.vector_norm(away)
+    return away * (NEARBY / float(torch.linalg.vector_norm(away)))
 
 
 def _reference(features: ReadFeatures, clean: Tensor) -> Tensor:

@@ -41,6 +41,8 @@ MOST_DECIMALS = 4
 PROBABILITY_DECIMALS = 1
 """Of a probability that a model gives."""
 
+_TAKES = (SEGMENTATION, SIMILARITY)
+"""Tasks of which an answer takes the object for something."""
 WHOLE = ("background", "itself", "something else")
 """Answers without an article."""
 
@@ -183,9 +185,7 @@ def calls(task: str, thing: str, label: str) -> str:
         return f"calls {thing} {with_article(label)}"
     if task == DETECTION:
         return _detects("finds", "sees", "takes", thing, label)
-    return (
-        f"takes {thing} for {_stuff(label)}" if task in (SEGMENTATION, SIMILARITY) else f'answers "{label}" for {thing}'
-    )
+    return f"takes {thing} for {_stuff(label)}" if task in _TAKES else f'answers "{label}" for {thing}'
 
 
 def calling(task: str, label: str) -> str:
@@ -196,7 +196,7 @@ def calling(task: str, label: str) -> str:
         return f"calling it {with_article(label)}"
     if task == DETECTION:
         return _detects("finding", "seeing", "taking", "it", label)
-    return f"taking it for {_stuff(label)}" if task in (SEGMENTATION, SIMILARITY) else f'answering "{label}"'
+    return f"taking it for {_stuff(label)}" if task in _TAKES else f'answering "{label}"'
 
 
 def _stuff(label: str) -> str:
