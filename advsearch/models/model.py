@@ -228,7 +228,7 @@ def _task_of(answer: Any) -> str | None:
     scores; else None."""
     if _has_boxes(answer):
         return "detection"
-    if not isinstance(answer, Mapping) and hasattr(answer, "last_hidden_state") and not hasattr(answer, "logits"):
+    if hasattr(answer, "last_hidden_state") and not hasattr(answer, "logits"):
         return "similarity"
     tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
     kinds = {2: "classification", 4: "segmentation"}

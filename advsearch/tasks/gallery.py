@@ -106,7 +106,7 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
     paths = [(number, one) for number, (_, where) in enumerate(names) for one in _pictures(where)]
     if len(paths) > files.scaled(MOST):
         raise files.too_large(root, f"at most {files.scaled(MOST):,} reference pictures", f"{len(paths):,}")
-    with torch.no_grad(), files.reading(root):  # what is read belongs to the folder
+    with torch.no_grad():
         shown = (_cut(_read(one), model.input_size) for _, one in paths)
         parts = [_features(model, batch, root) for batch in _batches(shown)]
     features = torch.cat(parts)

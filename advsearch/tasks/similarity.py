@@ -65,7 +65,7 @@ class Similarity(Classification):
 
     name = "similarity"
     reads_logits = False
-    takes_labels = False
+    names_from = "its folders"
 
     references: str = ""
     method: str = METHODS[0]

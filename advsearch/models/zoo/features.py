@@ -61,9 +61,8 @@ def no_classes(name: str, what: str) -> ModelError:
         what: it is, such as "is a Dinov2Model".
     """
     return ModelError(
-        f"model {name}: {what}, which answers with features and has no classes: use --task "
-        f"'{TASK}={{references: FOLDER}}' (`task={TASK}` of load_model), which compares them, or give a network with a "
-        "head"
+        f"model {name}: {what}, which answers with features and has no classes: use `task={TASK}`, which compares "
+        "them with those of other pictures, or give a network with a head"
     )
 
 
