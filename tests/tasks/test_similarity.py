@@ -246,8 +246,8 @@ def test_objectives_of_logits_have_a_true_gradient(
     step = 2e-3 * gradient / gradient.norm()
     with torch.no_grad():
         ends = [float(found(model(one), one[None], (0,))) for one in (picture + step, picture - step)]
-    assert ends[0] - ends[1] == pytest.approx(2.0 * 2e-3 * float(gradient.norm()), rel=0.02)
         value = float(found(model(picture), picture[None], (0,)))
+    assert ends[0] - ends[1] == pytest.approx(2.0 * 2e-3 * float(gradient.norm()), rel=0.02)
     if objective == "margin":
         assert value == pytest.approx(task.judge(model(picture.detach()), (0,))[0].margin)
 
