@@ -63,7 +63,8 @@ RULES = {
     "bundled": Rule({"scene"}),
     "controls": Rule({"scene"}),
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
-    "tasks": Rule({"models"}, {"torch"}),
+    # pictures of references are read as those of scenes are
+    "tasks": Rule({"models", "scene"}, {"torch"}),
     "attacks": Rule({"tasks"}, {"torch", "numpy", "scipy", "cma", "ribs"}),
     "cluster": Rule({"scene", "settings"}, {"distributed", "dask"}),
     "engine": Rule(

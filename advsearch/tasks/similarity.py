@@ -99,8 +99,8 @@ class Similarity(Classification):
         if not self.references and self.threshold is None:
             raise InputError(
                 "task similarity: references: expected a folder with a folder of pictures for each name, or a "
-                "`threshold` of the cosine to the clean picture, got neither; write --task "
-                "'similarity={references: FOLDER}' or 'similarity={threshold: 0.8}'"
+                "`threshold` of the cosine to the clean picture, got neither; write "
+                "`task='similarity={references: FOLDER}'` or `task='similarity={threshold: 0.8}'`"
             )
         if target is not None and not self.references:
             raise InputError("target: a `threshold` knows no names; give `references` to task similarity")
