@@ -28,6 +28,7 @@ COMMON = {
     "files",
     "interrupts",
     "options",
+    "pictures",
     "registry",
     "seeds",
     "threads",
@@ -55,6 +56,7 @@ class Rule:
 HEAVY = frozenset(RENDERER | {"torch"})
 RULES = {
     **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
+    "pictures": Rule(set(), {"numpy", "PIL"}, HEAVY),
     "yaml_text": Rule(set(), {"yaml"}),
     # typing_extensions for the type checker only
     "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),
@@ -63,8 +65,7 @@ RULES = {
     "bundled": Rule({"scene"}),
     "controls": Rule({"scene"}),
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
-    # pictures of references are read as those of scenes are
-    "tasks": Rule({"models", "scene"}, {"torch"}),
+    "tasks": Rule({"models"}, {"torch"}),
     "attacks": Rule({"tasks"}, {"torch", "numpy", "scipy", "cma", "ribs"}),
     "cluster": Rule({"scene", "settings"}, {"distributed", "dask"}),
     "engine": Rule(

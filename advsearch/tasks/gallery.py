@@ -15,12 +15,13 @@ from torch.nn import functional
 from advsearch import files
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.pictures import upright
 
 MOST = 10_000
 """Pictures of a gallery, before `advsearch.files.scaled`."""
 
 SIDE = 1024
-"""Longest side in pixels of a picture as it is kept; larger ones are averaged down, in linear light."""
+"""Longest side in pixels of a picture as it is kept; larger ones are averaged down."""
 
 AT_ONCE = 16
 """Pictures that a network is shown at once."""
@@ -185,9 +186,7 @@ def _pictures(folder: Path) -> Sequence[Path]:
 
 def _read(path: Path) -> Tensor:
     """Return a picture (H, W, 3), display-referred sRGB in [0, 1]."""
-    from advsearch.scene.importing.images import read_picture  # once there are some: it takes a library for pictures
-
-    return torch.from_numpy(read_picture(path, SIDE, upright=True))
+    return torch.from_numpy(upright(path, SIDE))
 
 
 def _cut(picture: Tensor, size: tuple[int, int]) -> Tensor:
