@@ -13,11 +13,12 @@ from advsearch.tasks.classification import Classification
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
 from advsearch.tasks.segmentation import Segmentation
+from advsearch.tasks.similarity import Similarity
 from advsearch.tasks.together import Together
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation, Depth)},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation, Depth, Similarity)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -73,6 +74,7 @@ __all__ = [
     "Mark",
     "Segmentation",
     "Sight",
+    "Similarity",
     "Task",
     "make_task",
 ]

@@ -227,6 +227,7 @@ class Task(ABC):
         reads_logits: whether its models answer with logits (N, classes). Then their answers are checked as such, and
             the objectives of classification take them.
         labelled: whether it takes a label; with one that takes none, others get it (`together`).
+        names_from: where its names come from, if neither from the model nor from the setting `labels`.
         varies: whether the truth depends on the configuration; it is asked for at each one then.
     """
 
@@ -234,6 +235,7 @@ class Task(ABC):
     objective: ClassVar[str] = "score"
     reads_logits: ClassVar[bool] = False
     labelled: ClassVar[bool] = True
+    names_from: ClassVar[str] = ""
     varies: ClassVar[bool] = False
 
     minimise: bool = field(default=False, metadata=FROM_RUN)

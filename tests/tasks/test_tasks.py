@@ -248,7 +248,7 @@ def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch
 
 
 def test_tasks_have_names() -> None:
-    assert list(TASKS) == ["classification", "detection", "segmentation", "depth"]
+    assert list(TASKS) == ["classification", "detection", "segmentation", "depth", "similarity"]
     assert make_task("classification") == Classification()
     mine = Yaw(tolerance=5.0)
     assert make_task(mine) is mine
