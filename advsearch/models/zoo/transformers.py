@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from advsearch.errors import ModelError
 from advsearch.models.source import Source
-from advsearch.models.zoo import timm, zero_shot
+from advsearch.models.zoo import language, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
 from advsearch.models.zoo.loaded import Loaded
 from advsearch.models.zoo.processors import processor_of
@@ -222,6 +222,7 @@ KINDS = (
         "AutoModelForObjectDetection",
         _with_names(_Detector),
     ),
+    Kind(language.speaks, "AutoModelForImageTextToText", language.source),
     Kind(lambda architecture, network: zero_shot.compares(network), "AutoModel", zero_shot.source),
 )
 """Every kind that is read, the particular ones first."""
