@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import sys
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -33,6 +34,10 @@ TOLERANCE = 1e-4
 
 LEVELS = 0.05
 """What values of pixels may be off from the processor's for 8-bit pictures, as a share of the largest: it rounds."""
+
+
+SLOW = 1.0
+"""Seconds for an answer from which on a run says how long one takes."""
 
 
 def speaks(architecture: str, network: Any) -> bool:
@@ -80,6 +85,7 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
         module = _Named(reader, tokens)
         with torch.no_grad():
             _check(loaded, module, side)
+            seconds = _seconds(module, side)
     except (InputError, ModelError):
         raise
     except Exception as error:  # any network may raise anything
@@ -88,6 +94,14 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
             f"can ({first_line(error)})"
         ) from error
     _say_what_begins_another(tokens, names, loaded.name)
+    if seconds > SLOW:
+        count = sum(one.numel() for one in loaded.network.parameters())
+        warnings.warn(
+            f"model {loaded.name} has {count / 1e9:.3g} billion weights and took {seconds:.3g} s to answer one picture "
+            "here, without a gradient",
+            ModelWarning,
+            stacklevel=4,
+        )
     return source_of(module, loaded.name, labels=names, batch_limits=(1, 1), **described)
 
 
@@ -232,7 +246,7 @@ class _Reader(nn.Module):
         super().__init__()
         self.network, self._inputs, self._pixels = network, inputs, pixels
         taken = inspect.signature(network.forward).parameters
-        self.cache = "cache" if "cache" in taken else "past_key_values"  # which the first is called from 5.23 on
+        self.cache = "cache" if "cache" in taken else "past_key_values"  # its older name
         self._prompts: dict[tuple[int, int], dict[str, Tensor]] = {}
 
     def prompt(self, side: tuple[int, int]) -> dict[str, Tensor]:
@@ -256,9 +270,16 @@ class _Reader(nn.Module):
         return {**given, "pixel_values": pixels.to(placed.device, placed.dtype)}
 
     def begin(self, image: Tensor) -> tuple[Tensor, Any]:
-        """Return the logits (tokens,) float32 of what follows picture and prompt, and the keys and values so far."""
+        """Return the logits (tokens,) float32 of what follows picture and prompt, and the keys and values so far.
+
+        Raises:
+            ValueError: the network keeps none.
+        """
         answer = self.network(**self.given(image), use_cache=True)
-        return answer.logits[0, -1].float(), answer[self.cache]
+        past = answer.get(self.cache)
+        if past is None:
+            raise ValueError("it keeps no keys and values of what it has read")
+        return answer.logits[0, -1].float(), past
 
     def go_on(self, tokens: Tensor, past: Any) -> Tensor:
         """Return the logits (N, L, tokens) float32 of what follows each of N x L tokens; `past` is of one picture."""
@@ -322,6 +343,12 @@ def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
     size = max(TOLERANCE, 8.0 * torch.finfo(loaded.network.dtype).eps) * max(1.0, abs(own))
     if not abs(own - ours) <= size:
         raise _another(loaded, f"goes on otherwise after what it has kept ({ours:.6g} for {own:.6g})")
+
+
+def _seconds(module: nn.Module, side: tuple[int, int]) -> float:
+    begun = time.perf_counter()
+    module(torch.zeros((1, 3, *side)))
+    return time.perf_counter() - begun
 
 
 def _another(loaded: Loaded, what: str) -> ModelError:
