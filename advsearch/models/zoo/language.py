@@ -36,8 +36,8 @@ LEVELS = 0.05
 """What values of pixels may be off from the processor's for 8-bit pictures, as a share of the largest: it rounds."""
 
 
-SLOW = 1.0
-"""Seconds for an answer from which on a run says how long one takes."""
+LARGE = 500_000_000
+"""Weights from which on a run says how many there are, and how long an answer takes."""
 
 
 def speaks(architecture: str, network: Any) -> bool:
@@ -94,11 +94,12 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
             f"can ({first_line(error)})"
         ) from error
     _say_what_begins_another(tokens, names, loaded.name)
-    if seconds > SLOW:
-        count = sum(one.numel() for one in loaded.network.parameters())
+    weights = list(loaded.network.parameters())
+    if (count := sum(one.numel() for one in weights)) >= LARGE:
+        size = sum(one.nbytes for one in weights)
         warnings.warn(
-            f"model {loaded.name} has {count / 1e9:.3g} billion weights and took {seconds:.3g} s to answer one picture "
-            "here, without a gradient",
+            f"model {loaded.name} has {count / 1e9:.3g} billion weights, {size / 1e9:.3g} GB, and took {seconds:.2g} s "
+            "to answer one picture here; a gradient takes longer",
             ModelWarning,
             stacklevel=4,
         )
