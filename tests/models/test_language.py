@@ -12,9 +12,12 @@ import torch
 from torch import Tensor
 
 import advsearch
+from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.zoo import language, memory
+from advsearch.runs.images import read_png
+from advsearch.runs.store import Store
 from tests.models.test_zero_shot import loud
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
@@ -203,8 +206,9 @@ def test_a_name_that_begins_another_is_said(tmp_path: Path) -> None:
 
 
 WRONG: dict[str, tuple[dict[str, Any], type[AdvsearchError], str]] = {
-    "no names": ({}, InputError, "answers in words and has no classes of its own: name them"),
-    "one name": ({"labels": ["mug"]}, InputError, "labels: expected two names at least"),
+    "no names": ({}, InputError, "labels: expected two names at least, .* got none; with `task=answer` it"),
+    "one name": ({"labels": ["mug"]}, InputError, "labels: expected two names at least, .* got 'mug'"),
+    "names of an answer": ({"labels": NAMES, "task": "answer"}, InputError, "task answer has no classes; leave them"),
     "two questions": ({"labels": NAMES, "prompt": "a | b"}, InputError, "prompt: expected one question .* got 2"),
     "too long": ({"labels": NAMES, "prompt": "the " * 64}, InputError, "to have at most 64 tokens for model .* got 7"),
 }
@@ -214,7 +218,7 @@ WRONG: dict[str, tuple[dict[str, Any], type[AdvsearchError], str]] = {
 def test_wrong_uses_are_refused(tmp_path: Path, wrong: str) -> None:
     given, error, text = WRONG[wrong]
     with pytest.raises(error, match=text):
-        load_model(published(tmp_path, llava()), **given)
+        advsearch.load_model(published(tmp_path, llava()), **given)
 
 
 def test_captioners_are_refused(tmp_path: Path) -> None:
@@ -258,3 +262,38 @@ def test_it_is_attacked_by_name(tmp_path: Path) -> None:
     rows = list(result.rows("verification"))
     assert len(rows) == 6 and all(row.label in NAMES for row in rows)
     assert f"prompt: {QUESTION}" in (tmp_path / "run" / "run.yaml").read_text()
+
+
+def spoken(folder: Path, picture: Any, count: int) -> str:
+    """What the library's own greedy decoding says of a picture."""
+    network = transformers.AutoModelForImageTextToText.from_pretrained(folder).eval()
+    processor = transformers.AutoProcessor.from_pretrained(folder)
+    parts = [{"type": "image"}, {"type": "text", "text": QUESTION}]
+    text = processor.apply_chat_template([{"role": "user", "content": parts}], add_generation_prompt=True)
+    given = processor(images=[picture], text=[text], return_tensors="pt")
+    tokens = network.generate(**given, do_sample=False, max_new_tokens=count)[0, given["input_ids"].shape[1] :]
+    said: str = processor.decode(tokens, skip_special_tokens=True)
+    return said
+
+
+@pytest.mark.parametrize("family", ["llava", "qwen"])
+def test_a_free_answer_is_the_librarys(tmp_path: Path, family: str) -> None:
+    if family == "qwen" and not TORCHVISION:
+        pytest.skip("the library's processor of Qwen-VL needs torchvision")
+    spec, more = published(tmp_path, llava() if family == "llava" else qwen()), {"qwen": {"input_size": 56}}
+    model = advsearch.load_model(spec, task={"name": "answer", "tokens": 6}, prompt=QUESTION, **more.get(family, {}))
+    (said,) = model(torch.from_numpy(levels(model)).float() / 255.0)
+    assert said["text"] == spoken(tmp_path, levels(model), 6) and len(said["text"].split()) > 1
+    assert said["logits"].shape == (6, READS["vocab_size"]) and said["begins"]("mug") == [KNOWN["mug"]]
+
+
+def test_its_free_answer_is_attacked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec, run = published(tmp_path / "llava", llava()), tmp_path / "run"
+    asked = ["--task", "answer={tokens: 3}", "--prompt", QUESTION, "--label", ",".join(WORDS[:-1]), "--control", "light"]
+    few = ["--policy", "pgd", "--steps", "2", "--trials", "6", "--spp", "2", "--verify-spp", "2", "--resolution", "16"]
+    assert main(["attack", "--object", "mug", "--model", spec, *asked, *few, "--denoise", "none", "--run", str(run)]) < 2
+    with Store(run / "results.sqlite", read_only=True) as store:
+        rows = list(store.rows("verification"))
+    assert len(rows) == 6
+    picture = np.rint(read_png(run / "images" / "verification-00.png") * 255).astype(np.uint8)
+    assert rows[0].label == spoken(tmp_path / "llava", picture, 3)

@@ -1,4 +1,7 @@
-"""Networks that read a picture and a text and go on in words, as LLaVA and Qwen-VL do: classifiers of given names."""
+"""Networks that read a picture and a text and go on in words, as LLaVA and Qwen-VL do.
+
+They are classifiers of names that are given, or answer freely.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +39,9 @@ LEVELS = 0.05
 """What values of pixels may be off from the processor's for 8-bit pictures, as a share of the largest: it rounds."""
 
 
+CHECKED = "a coffee mug"
+"""What is read after the prompt to see that a network which answers freely goes on as it reads."""
+
 LARGE = 500_000_000
 """Weights from which on a run says how many there are, and how long an answer takes."""
 
@@ -48,7 +54,7 @@ def speaks(architecture: str, network: Any) -> bool:
 
 
 def source(loaded: Loaded) -> Source:
-    """Return the source of a network that becomes a classifier when names are there.
+    """Return the source of a network that is finished when names are there, or a free answer is asked for.
 
     Raises:
         ModelError: it has an encoder for texts of its own, or its processor can't be had.
@@ -68,10 +74,15 @@ def source(loaded: Loaded) -> Source:
 
 
 def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
-    """Return the classifier of these names."""
-    names = purpose.named(loaded.name, "answers in words")
-    if len(names) < 2:
-        raise InputError(f"labels: expected two names at least, of which {loaded.name} chooses one, got {names[0]!r}")
+    """Return the classifier of these names, or what answers freely."""
+    free, names = purpose.task == "answer", purpose.names
+    if free and names is not None:
+        raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")
+    if not free and (names is None or len(names) < 2):
+        raise InputError(
+            f"labels: expected two names at least, such as mug,cup,bowl, of which model {loaded.name} chooses one, got "
+            f"{'none' if names is None else repr(names[0])}; with `task=answer` it answers freely"
+        )
     if len(purpose.prompts or ()) > 1:
         raise InputError(f"prompt: expected one question for model {loaded.name}, got {len(purpose.prompts or ())}")
     try:
@@ -80,11 +91,12 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
         reader = _Reader(loaded.network, partial(_inputs, processor, text), pixels)
         side = described.get("input_size", (SIDE, SIDE))
         prompt = reader.prompt(side)["input_ids"][0].tolist()
-        tokens = _tokens(processor, text, prompt, names, side)
-        _check_length(loaded, len(prompt) + max(map(len, tokens)))
-        module = _Named(reader, tokens)
+        tokens = _tokens(processor, text, prompt, names or (CHECKED,), side)
+        _check_length(loaded, len(prompt) + max(purpose.tokens if free else 0, *map(len, tokens)))
+        named = _Named(reader, tokens)
+        module = _Free(reader, processor.tokenizer, _ends(loaded.network), purpose.tokens) if free else named
         with torch.no_grad():
-            _check(loaded, module, side)
+            _check(loaded, named, side)
             seconds = _seconds(module, side)
     except (InputError, ModelError):
         raise
@@ -93,7 +105,8 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
             f"model {loaded.spec}: is a {type(loaded.network).__name__}, which can't be asked about a picture as LLaVA "
             f"can ({first_line(error)})"
         ) from error
-    _say_what_begins_another(tokens, names, loaded.name)
+    if names is not None:
+        _say_what_begins_another(tokens, names, loaded.name)
     weights = list(loaded.network.parameters())
     if (count := sum(one.numel() for one in weights)) >= LARGE:
         size = sum(one.nbytes for one in weights)
@@ -323,6 +336,41 @@ class _Named(nn.Module):
         if len(stems):
             likely = torch.cat([likely, self.reader.go_on(stems, past).log_softmax(dim=-1).flatten(0, 1)])
         return (likely[rows, columns] * self.get_buffer("counts")).sum(dim=1)
+
+
+class _Free(nn.Module):
+    """What is said of each picture, `advsearch.tasks.answers.Said`: the likeliest token after the other."""
+
+    def __init__(self, reader: _Reader, tokenizer: Any, ends: frozenset[int], most: int) -> None:
+        super().__init__()
+        self.reader, self.tokenizer, self.ends, self.most = reader, tokenizer, ends, most
+
+    def forward(self, images: Tensor) -> list[dict[str, Any]]:
+        return [self._said(image) for image in images]
+
+    def _said(self, image: Tensor) -> dict[str, Any]:
+        logits, past = self.reader.begin(image)
+        steps, tokens = [logits], [int(logits.argmax())]
+        while tokens[-1] not in self.ends and len(tokens) < self.most:
+            steps.append(self.reader.go_on(logits.new_tensor([tokens[-1:]], dtype=torch.long), past)[0, -1])
+            tokens.append(int(steps[-1].argmax()))
+        text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
+        return {"text": text, "logits": torch.stack(steps), "begins": self.begins}
+
+    def begins(self, word: str) -> list[int]:
+        """Return the tokens that begin a word, in small letters or with a capital, after a blank or without one."""
+        found = set()
+        for form in {word, word.capitalize(), f" {word}", f" {word.capitalize()}"}:
+            numbers = self.tokenizer(form, add_special_tokens=False)["input_ids"]
+            number = next((one for one in numbers if self.tokenizer.decode([one]).strip()), None)
+            found |= {number} - {None, self.tokenizer.unk_token_id}
+        return sorted(found)
+
+
+def _ends(network: Any) -> frozenset[int]:
+    """Return the tokens that end an answer."""
+    said = network.generation_config.eos_token_id
+    return frozenset(said if isinstance(said, (list, tuple)) else [said]) - {None}
 
 
 def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
