@@ -18,6 +18,7 @@ from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.zoo import language, memory
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
+from advsearch.tasks import FreeAnswer
 from tests.models.test_zero_shot import loud
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
@@ -27,7 +28,7 @@ NAMES = ("mug", "coffee mug", "cup", "tea cup", "tea bowl")
 QUESTION = "what is on the table ?"
 MARKS = ["<image>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>"]
 SPECIAL = ["[PAD]", "[UNK]", "<s>", "</s>", *MARKS]
-WORDS = "user assistant what is on the this in picture table ? : mug cup bowl tea coffee answer with its name only .".split()
+WORDS = "user assistant what is on the this table ? : mug cup bowl tea coffee answer with its name only .".split()
 KNOWN = {word: number for number, word in enumerate([*SPECIAL, *WORDS])}
 SIZES = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "intermediate_size": 16}
 READS = {
@@ -163,12 +164,41 @@ def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> Non
     assert float(ends[0] - ends[1]) / 4e-3 == pytest.approx(float((gradient * way).sum()), rel=0.02)
 
 
+@pytest.mark.filterwarnings("ignore:__array__ implementation")
+def test_a_prompt_that_is_read_both_ways_does_not_see_the_name(tmp_path: Path) -> None:
+    """PaliGemma reads picture and prompt in both directions, and what is said after them in one."""
+    config = transformers.PaliGemmaConfig(
+        vision_config={"image_size": 16, "patch_size": 8, **SIZES},
+        text_config={"model_type": "gemma", "head_dim": 8, **READS},
+        image_token_index=KNOWN["<image>"],
+        projection_dim=16,
+        hidden_size=16,
+        vocab_size=READS["vocab_size"],
+    )
+    prepared = transformers.SiglipImageProcessor(size={"height": 16, "width": 16})
+    prepared.image_seq_length = 4
+    words = tokenizer(extra_special_tokens={"image_token": "<image>"})
+    words.add_tokens = lambda names: 0  # of places, a thousand of them
+    processor = transformers.PaliGemmaProcessor(prepared, words)
+    network = transformers.PaliGemmaForConditionalGeneration(config)
+    model = load_model(published(tmp_path, (network, processor)), labels=NAMES, prompt=QUESTION)
+    network.eval()
+    for number, name in enumerate(NAMES):
+        given = processor(images=[levels(model)], text=[f"<image>{QUESTION}"], suffix=[name], return_tensors="pt")
+        told = {key: value[:, :-1] if value.ndim == 2 else value for key, value in given.items() if key != "labels"}
+        count = len(name.split())
+        with torch.no_grad():
+            likely = network(**told).logits[0, -count - 1 : -1].log_softmax(dim=-1)
+        asked = float(likely.gather(1, told["input_ids"][0, -count:, None]).sum())
+        assert float(shown(model)[0, number]) == pytest.approx(asked, abs=1e-4)
+
+
 @pytest.mark.skipif(TORCHVISION, reason="torchvision is there")
 def test_torchvision_is_asked_for_where_it_lacks(tmp_path: Path) -> None:
     loud(transformers.Qwen2_5_VLForConditionalGeneration(qwen_config())).save_pretrained(tmp_path)
     transformers.Qwen2VLImageProcessor().save_pretrained(tmp_path)
     tokenizer().save_pretrained(tmp_path)
-    with pytest.raises(ModelError, match=r"most of such networks need torchvision .*pip install 'advsearch\[torchvision"):
+    with pytest.raises(ModelError, match=r"of such networks need torchvision .*pip install 'advsearch\[torchvision"):
         load_model(f"hf:{tmp_path}", labels=NAMES)
 
 
@@ -182,7 +212,7 @@ def test_weights_stay_as_they_are_stored(tmp_path: Path) -> None:
 def test_what_a_large_network_takes_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = published(tmp_path, llava())
     monkeypatch.setattr(language, "LARGE", 1000)
-    with pytest.warns(ModelWarning, match=r"has 1\.\d+e-05 billion weights, 4\.\d+e-05 GB, and took \S+ s to answer one"):
+    with pytest.warns(ModelWarning, match=r"has 1\.\d+e-05 billion weights, 4\.\d+e-05 GB, and took \S+ s to answer"):
         load_model(spec, labels=NAMES)
 
 
@@ -229,7 +259,7 @@ def test_captioners_are_refused(tmp_path: Path) -> None:
     )
     prepared = transformers.BlipImageProcessor(size={"height": 16, "width": 16})
     spec = published(tmp_path, (network, transformers.BlipProcessor(prepared, tokenizer())))
-    with pytest.raises(ModelError, match="BlipForConditionalGeneration, which .* keeps no keys and values of what it"):
+    with pytest.raises(ModelError, match=r"BlipForConditionalGeneration, which .* keeps no keys and values of what it"):
         load_model(spec, labels=NAMES)
 
 
@@ -287,13 +317,26 @@ def test_a_free_answer_is_the_librarys(tmp_path: Path, family: str) -> None:
     assert said["logits"].shape == (6, READS["vocab_size"]) and said["begins"]("mug") == [KNOWN["mug"]]
 
 
+def test_the_margin_of_a_free_answer_has_the_gradient_of_differences(tmp_path: Path) -> None:
+    model = advsearch.load_model(published(tmp_path, llava()), task="answer", prompt=QUESTION)
+    image = (torch.from_numpy(levels(model)).float() / 255.0 * 0.8 + 0.1).requires_grad_()
+    task = FreeAnswer()
+    (gradient,) = torch.autograd.grad(task.margin(model(image), ("cup", "mug")).sum(), image)
+    way = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        ends = [float(task.margin(model(image + size * way), ("cup", "mug"))) for size in (1e-3, -1e-3)]
+    assert (ends[0] - ends[1]) / 2e-3 == pytest.approx(float((gradient * way).sum()), rel=0.02)
+
+
 def test_its_free_answer_is_attacked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec, run = published(tmp_path / "llava", llava()), tmp_path / "run"
-    asked = ["--task", "answer={tokens: 3}", "--prompt", QUESTION, "--label", ",".join(WORDS[:-1]), "--control", "light"]
-    few = ["--policy", "pgd", "--steps", "2", "--trials", "6", "--spp", "2", "--verify-spp", "2", "--resolution", "16"]
-    assert main(["attack", "--object", "mug", "--model", spec, *asked, *few, "--denoise", "none", "--run", str(run)]) < 2
+    asked = ["--task", "answer={tokens: 3}", "--prompt", QUESTION, "--label", ",".join(WORDS[:-1])]
+    few = ["--control", "light", "--policy", "random", "--steps", "2", "--trials", "6", "--resolution", "16"]
+    quick = ["--spp", "2", "--verify-spp", "2", "--denoise", "none", "--measure", "no"]
+    assert main(["attack", "--object", "mug", "--model", spec, *asked, *few, *quick, "--run", str(run)]) < 2
     with Store(run / "results.sqlite", read_only=True) as store:
         rows = list(store.rows("verification"))
     assert len(rows) == 6
-    picture = np.rint(read_png(run / "images" / "verification-00.png") * 255).astype(np.uint8)
-    assert rows[0].label == spoken(tmp_path / "llava", picture, 3)
+    kept = [read_png(run / "images" / f"verification-{number:02d}.png") for number in range(4)]
+    told = [spoken(tmp_path / "llava", np.rint(one * 255).astype(np.uint8), 3) for one in kept]
+    assert [row.label for row in rows[:4]] == [text or "(nothing)" for text in told] and any(told)

@@ -10,7 +10,7 @@ import inspect
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -33,7 +33,7 @@ SIDE = 448
 """Side in pixels of pictures for networks that take any size: a multiple of 28 and of 32, the cells of Qwen's."""
 
 TOLERANCE = 1e-4
-"""What a log-likelihood may be off from the network's own for the whole text, as a share of itself and at least of 1."""
+"""What a log-likelihood may be off from the network's own for the whole text, as a share of itself or of 1."""
 
 LEVELS = 0.05
 """What values of pixels may be off from the processor's for 8-bit pictures, as a share of the largest: it rounds."""
@@ -133,7 +133,9 @@ def _written(processor: Any, question: str) -> str:
 
 def _inputs(processor: Any, text: str, picture: Any, **options: Any) -> dict[str, Tensor]:
     """Return what the processor makes of a picture and a text, without what is for training."""
-    given = processor(images=[picture], text=[text], return_tensors="pt", **options)
+    with warnings.catch_warnings():  # of how the library reads arrays
+        warnings.simplefilter("ignore")
+        given = processor(images=[picture], text=[text], return_tensors="pt", **options)
     return {key: value for key, value in given.items() if isinstance(value, Tensor) and key != "labels"}
 
 
@@ -180,7 +182,7 @@ def _called(processor: Any, text: str, image: Tensor) -> Tensor:
 
 
 def _check_pixels(loaded: Loaded, processor: Any, text: str, pixels: Pixels, described: Measured) -> None:
-    """Raise a ModelError where a picture of slopes arrives otherwise than the processor's own does from 8-bit values."""
+    """Raise a ModelError where a picture of slopes arrives otherwise than from 8-bit values by the processor."""
     height, width = described["input_size"]
     down, across = torch.linspace(0, 200, height)[:, None], torch.linspace(0, 200, width)
     levels = torch.stack([(down + 0 * across), (across + 0 * down), (down + across) / 4 + 100]).round()
@@ -242,8 +244,8 @@ def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[st
         for second, long in enumerate(tokens):
             if first != second and list(long[: len(short)]) == list(short):
                 warnings.warn(
-                    f"model {name} reads {names[first]!r} (#{first}) as the beginning of {names[second]!r} (#{second}): "
-                    "whoever says the second has said the first",
+                    f"model {name} reads {names[first]!r} (#{first}) as the beginning of {names[second]!r} "
+                    f"(#{second}): whoever says the second has said the first",
                     ModelWarning,
                     stacklevel=5,
                 )
@@ -278,7 +280,8 @@ class _Reader(nn.Module):
         height, width = image.shape[1:]
         prompt, pixels = self.prompt((height, width)), self._pixels(image)
         if pixels.shape != prompt["pixel_values"].shape:
-            raise ValueError(f"expected values of shape {tuple(prompt['pixel_values'].shape)}, got {tuple(pixels.shape)}")
+            expected = tuple(prompt["pixel_values"].shape)
+            raise ValueError(f"expected values of shape {expected}, got {tuple(pixels.shape)}")
         placed = next(self.network.parameters())
         given = {key: value.to(placed.device) for key, value in prompt.items()}
         return {**given, "pixel_values": pixels.to(placed.device, placed.dtype)}
@@ -330,12 +333,13 @@ class _Named(nn.Module):
         return torch.stack([self._scores(image) for image in images])
 
     def _scores(self, image: Tensor) -> Tensor:
-        stems, rows, columns = (self.get_buffer(key) for key in ("stems", "rows", "columns"))
         first, past = self.reader.begin(image)
+        kept = (self.get_buffer(key).to(first.device) for key in ("stems", "rows", "columns", "counts"))
+        stems, rows, columns, counts = kept
         likely = first.log_softmax(dim=-1)[None]
         if len(stems):
             likely = torch.cat([likely, self.reader.go_on(stems, past).log_softmax(dim=-1).flatten(0, 1)])
-        return (likely[rows, columns] * self.get_buffer("counts")).sum(dim=1)
+        return (likely[rows, columns] * counts).sum(dim=1)
 
 
 class _Free(nn.Module):

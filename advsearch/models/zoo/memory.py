@@ -37,7 +37,7 @@ def free_bytes(told: Path | None = None) -> int | None:
 
 
 def _stored(transformers: Any, name: str, where: Mapping[str, Any]) -> int:
-    """Return the bytes of the weights: as the index of several files says, or the size of one; 0 where there is none."""
+    """Return the bytes of the weights: as the index of several files says, or the size of one; 0 of none."""
 
     def kept(file: str) -> str | None:
         found: str | None = transformers.utils.cached_file(

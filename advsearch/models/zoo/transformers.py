@@ -130,9 +130,9 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForSemanticSegmentation or ForObjectDetection in it, one that compares pictures with texts, as CLIPModel, or one "
-        "that goes on in words, as LlavaForConditionalGeneration. "
-        "Wrap another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
+        "ForSemanticSegmentation or ForObjectDetection in it, one that compares pictures with texts, as CLIPModel, or "
+        "one that goes on in words, as LlavaForConditionalGeneration. Wrap another in an nn.Module whose answer a task "
+        "can judge, your own too, and give that from Python"
     )
 
 
