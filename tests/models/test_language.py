@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from advsearch.models.zoo import language, memory
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import FreeAnswer
-from tests.models.test_zero_shot import loud
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -96,6 +96,15 @@ def qwen() -> tuple[Any, Any]:
     return transformers.Qwen2_5_VLForConditionalGeneration(qwen_config()), processor
 
 
+def loud(network: Any) -> Any:
+    """The network with random weights that are large enough for answers that differ, always the same."""
+    generator = torch.Generator().manual_seed(0)
+    for parameter in network.parameters():
+        if parameter.dim() > 1:
+            parameter.data = torch.randn(parameter.shape, generator=generator) * 0.3
+    return network
+
+
 def published(folder: Path, made: tuple[Any, Any], dtype: torch.dtype = torch.float32) -> str:
     """Publish a tiny network with its processor into a folder, as `save_pretrained` does."""
     network, processor = made
@@ -139,8 +148,9 @@ def loaded(folder: Path, family: str, **more: Any) -> Model:
         if not TORCHVISION:
             pytest.skip("the library's processor of Qwen-VL needs torchvision")
         more = {"input_size": 56, **more}
-    made = {"llava": llava, "qwen": qwen, "no template": lambda: llava(None)}[family]()
-    return load_model(published(folder, made), labels=NAMES, prompt=QUESTION, **more)
+    made: dict[str, Callable[[], tuple[Any, Any]]]
+    made = {"llava": llava, "qwen": qwen, "no template": lambda: llava(None)}
+    return load_model(published(folder, made[family]()), labels=NAMES, prompt=QUESTION, **more)
 
 
 @pytest.mark.parametrize("family", ["llava", "qwen", "no template"])
@@ -310,8 +320,10 @@ def spoken(folder: Path, picture: Any, count: int) -> str:
 def test_a_free_answer_is_the_librarys(tmp_path: Path, family: str) -> None:
     if family == "qwen" and not TORCHVISION:
         pytest.skip("the library's processor of Qwen-VL needs torchvision")
-    spec, more = published(tmp_path, llava() if family == "llava" else qwen()), {"qwen": {"input_size": 56}}
-    model = advsearch.load_model(spec, task={"name": "answer", "tokens": 6}, prompt=QUESTION, **more.get(family, {}))
+    spec = published(tmp_path, llava() if family == "llava" else qwen())
+    model = advsearch.load_model(
+        spec, task={"name": "answer", "tokens": 6}, prompt=QUESTION, input_size=16 if family == "llava" else 56
+    )
     (said,) = model(torch.from_numpy(levels(model)).float() / 255.0)
     assert said["text"] == spoken(tmp_path, levels(model), 6) and len(said["text"].split()) > 1
     assert said["logits"].shape == (6, READS["vocab_size"]) and said["begins"]("mug") == [KNOWN["mug"]]

@@ -154,7 +154,7 @@ def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measur
     side = _side(loaded.network.config)
     try:
         described = measured(lambda **given: processor(text=[text], **given), loaded.spec)
-        described = Measured(**{**described, "input_size": described.get("input_size", side)})  # type: ignore[typeddict-item]
+        described = Measured(**{**described, "input_size": described.get("input_size", side)})
         pixels: Pixels = _alone
     except ModelError:
         if importlib.util.find_spec("torchvision") is None:
@@ -215,7 +215,7 @@ def _tokens(
     gap = "" if text[-1:].isspace() or prompt[-1] in tokenizer.all_special_ids else " "
     grey = np.full((*side, 3), 128, np.uint8)
     begun = tokenizer(text, verbose=False)["input_ids"]
-    found = []
+    found: list[list[int]] = []
     for name in spoken(names):
         whole = tokenizer(f"{text}{gap}{name}", verbose=False)["input_ids"]
         if not found:  # whether what the processor adds stands before or behind
@@ -363,12 +363,11 @@ class _Free(nn.Module):
 
     def begins(self, word: str) -> list[int]:
         """Return the tokens that begin a word, in small letters or with a capital, after a blank or without one."""
-        found = set()
+        found: set[int] = set()
         for form in {word, word.capitalize(), f" {word}", f" {word.capitalize()}"}:
             numbers = self.tokenizer(form, add_special_tokens=False)["input_ids"]
-            number = next((one for one in numbers if self.tokenizer.decode([one]).strip()), None)
-            found |= {number} - {None, self.tokenizer.unk_token_id}
-        return sorted(found)
+            found.update([one for one in numbers if self.tokenizer.decode([one]).strip()][:1])
+        return sorted(found - {self.tokenizer.unk_token_id})
 
 
 def _ends(network: Any) -> frozenset[int]:
