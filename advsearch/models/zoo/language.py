@@ -11,6 +11,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -151,17 +152,18 @@ def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measur
     Raises:
         ModelError: it does neither, or something else to values than to 8-bit pictures.
     """
-    side = _side(loaded.network.config)
-    try:
+    described, side = Measured(), _side(loaded.network.config)
+    with suppress(ModelError):  # it is called then
         described = measured(lambda **given: processor(text=[text], **given), loaded.spec)
-        described = Measured(**{**described, "input_size": described.get("input_size", side)})
+    if "mean" in described:
+        described["input_size"] = described.get("input_size", side)
         pixels: Pixels = _alone
-    except ModelError:
-        if importlib.util.find_spec("torchvision") is None:
-            raise ModelError(
-                f"model {loaded.spec}: its processor cuts pictures into patches or tiles, and lets gradients through "
-                "with torchvision only, which is not installed: pip install 'advsearch[torchvision]'"
-            ) from None
+    elif importlib.util.find_spec("torchvision") is None:
+        raise ModelError(
+            f"model {loaded.spec}: its processor cuts pictures into patches or tiles, and lets gradients through with "
+            "torchvision only, which is not installed: pip install 'advsearch[torchvision]'"
+        )
+    else:
         described, pixels = Measured(input_size=side), partial(_called, processor, text)
     _check_pixels(loaded, processor, text, pixels, described)
     return pixels, described
