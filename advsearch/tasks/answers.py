@@ -106,8 +106,9 @@ class FreeAnswer(Task):
         return torch.stack([_margin(one, truth) for one in output])
 
     def answers(self, output: Sequence[Said], count: int = 1) -> list[tuple[Answer, ...]]:
-        """Return the text of each picture."""
-        return [(Answer(one["text"] or SILENCE),) for one in output]
+        """Return the text of each picture, in one line without signs that steer a terminal."""
+        shown = ("".join(sign if sign.isprintable() else " " for sign in one["text"]) for one in output)
+        return [(Answer(" ".join(text.split()) or SILENCE),) for text in shown]
 
 
 def _words(setting: str, text: str) -> Words:
