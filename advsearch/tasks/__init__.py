@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from advsearch.errors import UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry
+from advsearch.tasks.answers import FreeAnswer
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.detection import Detection
@@ -15,7 +16,7 @@ from advsearch.tasks.similarity import Similarity
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation, Similarity)},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation, Similarity, FreeAnswer)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "Classification",
     "Detection",
     "Facts",
+    "FreeAnswer",
     "Judgement",
     "Mark",
     "Segmentation",
