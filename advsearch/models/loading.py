@@ -128,7 +128,8 @@ def _loaded(
     if prompts is not None and not (isinstance(found, Source) and found.reads_text):
         raise InputError(f"prompt: model {found.name} has classes of its own and reads no text; leave `prompt` out")
     if isinstance(found, Source) and found.finish is not None:
-        found = found.finish(Purpose(task.name if task else "classification", names, prompts))
+        purpose = Purpose(task.name if task else "classification", names, prompts, getattr(task, "tokens", 16))
+        found = found.finish(purpose)
     if isinstance(found, Source) and isinstance(found.module, nn.Module):
         called_under(found.module, switches)
     if isinstance(found, Model):

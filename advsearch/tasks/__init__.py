@@ -8,6 +8,7 @@ from typing import Any
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import JOINED, check_options
 from advsearch.registry import Registry
+from advsearch.tasks.answers import FreeAnswer
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.depth import Depth
@@ -18,7 +19,7 @@ from advsearch.tasks.together import Together
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation, Depth, Similarity)},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation, Depth, Similarity, FreeAnswer)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -70,6 +71,7 @@ __all__ = [
     "Depth",
     "Detection",
     "Facts",
+    "FreeAnswer",
     "Judgement",
     "Mark",
     "Segmentation",

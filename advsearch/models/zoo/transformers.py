@@ -18,9 +18,10 @@ from torch.nn import functional
 from advsearch.errors import ModelError, resembling
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
-from advsearch.models.zoo import depth_maps, features, mask_queries, timm, zero_shot
+from advsearch.models.zoo import depth_maps, features, language, mask_queries, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
 from advsearch.models.zoo.loaded import Loaded
+from advsearch.models.zoo.memory import check_fits
 from advsearch.models.zoo.processors import processor_of
 
 
@@ -50,7 +51,8 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `KINDS`.
 
-    One that compares pictures with texts gets its classes from its user (`zero_shot`).
+    One that compares pictures with texts (`zero_shot`), or goes on in words (`language`), gets its classes from its
+    user.
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
     image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
@@ -58,7 +60,7 @@ def load(spec: str) -> Source:
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
-            kind, or its processor does what `advsearch.models.preprocessing` can't.
+            kind or larger than the memory, or its processor does what `advsearch.models.preprocessing` can't.
 
     Warns:
         ModelWarning: it has no image processor.
@@ -81,6 +83,7 @@ def load(spec: str) -> Source:
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
+        check_fits(transformers, name, where, spec)
         network, found = getattr(transformers, kind.loader or architecture).from_pretrained(
             name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
         )
@@ -130,8 +133,9 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
         "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, one that "
-        "compares pictures with texts, as CLIPModel, or one that has features, as Dinov2Model. "
-        "Wrap another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
+        "compares pictures with texts, as CLIPModel, one that goes on in words, as LlavaForConditionalGeneration, or "
+        "one that has features, as Dinov2Model. Wrap another in an nn.Module whose answer a task can judge, your own too, "
+        "and give that from Python"
     )
 
 
@@ -262,6 +266,7 @@ KINDS = (
         "AutoModelForObjectDetection",
         _with_names(_Detector),
     ),
+    Kind(language.speaks, "AutoModelForImageTextToText", language.source),
     Kind(
         _called("ForDepthEstimation"),
         "AutoModelForDepthEstimation",

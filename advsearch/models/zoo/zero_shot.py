@@ -68,22 +68,22 @@ def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose
     prompts = patterns(purpose.prompts)
     if len(names) < 2:
         raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
-    spoken, alone = _spoken(names), hasattr(network, "logit_bias")
+    words, alone = spoken(names), hasattr(network, "logit_bias")
     try:
         with torch.no_grad():
             network = sharing_copy(network).eval()
             scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
-            each = [_embedded(network, tokenizer, [one.replace("{}", word) for word in spoken]) for one in prompts]
+            each = [_embedded(network, tokenizer, [one.replace("{}", word) for word in words]) for one in prompts]
             head = nn.Linear(each[0].shape[1], len(names))
             head.weight.copy_(scale.float() * functional.normalize(torch.stack(each).mean(dim=0), dim=-1))
             head.bias.copy_(network.logit_bias.float() if alone else torch.zeros(()))
             compared = _Compared(network, head.to(network.device))
-            _check(network, compared, tokenizer, prompts[0].replace("{}", spoken[0]), described, name)
+            _check(network, compared, tokenizer, prompts[0].replace("{}", words[0]), described, name)
     except (InputError, ModelError):
         raise
     except Exception as error:  # any network may raise anything
         raise ModelError(f"model {name}: cannot embed the names of `labels` ({first_line(error)})") from error
-    _say_what_is_one(tokenizer, [prompts[0].replace("{}", word) for word in spoken], names, name)
+    _say_what_is_one(tokenizer, [prompts[0].replace("{}", word) for word in words], names, name)
     if alone:
         warnings.warn(
             f"model {name} judges each name by itself, with a sigmoid of its logit: the scores that are shown are a "
@@ -94,7 +94,7 @@ def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose
     return source_of(compared, name, labels=names, dtype=network.dtype, **described)
 
 
-def _spoken(names: Sequence[str]) -> list[str]:
+def spoken(names: Sequence[str]) -> list[str]:
     """Return what stands for each name in a text: of synonyms with commas between them the first, if that is one's."""
     first = [one.partition(",")[0].strip() or one for one in names]
     return [short if first.count(short) == 1 else name for short, name in zip(first, names, strict=True)]
