@@ -24,6 +24,7 @@ from advsearch.models import load_model
 from advsearch.options import as_setting
 from advsearch.tasks import TASKS, Answer, Classification, Facts, Judgement, Task, make_task
 from advsearch.tasks.base import typical
+from advsearch.tasks.together import Together
 
 LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 4.0], [2.0, 2.0, 0.0], [math.nan, 0.0, 1.0]])
 NAMED = Classification(labels=("mug", "bowl", "vase"))
