@@ -134,8 +134,8 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
         "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, one that "
         "compares pictures with texts, as CLIPModel, one that goes on in words, as LlavaForConditionalGeneration, or "
-        "one that has features, as Dinov2Model. Wrap another in an nn.Module whose answer a task can judge, your own too, "
-        "and give that from Python"
+        "one that has features, as Dinov2Model. Wrap another in an nn.Module whose answer a task can judge, your own "
+        "too, and give that from Python"
     )
 
 
