@@ -17,9 +17,9 @@ from torch.nn import functional
 
 from advsearch.errors import ModelError
 from advsearch.models.source import Source
-from advsearch.models.zoo import timm, zero_shot
+from advsearch.models.zoo import open_vocabulary, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
-from advsearch.models.zoo.loaded import Loaded
+from advsearch.models.zoo.loaded import Loaded, in_pixels
 from advsearch.models.zoo.processors import processor_of
 
 
@@ -49,7 +49,7 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `KINDS`.
 
-    One that compares pictures with texts gets its classes from its user (`zero_shot`).
+    One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`).
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
     image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
@@ -192,10 +192,7 @@ class _Detector(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         answer = self.network(pixel_values=images)
-        height, width = images.shape[2:]
-        middle, size = answer.pred_boxes.split(2, dim=-1)
-        corners = torch.cat([middle - size / 2, middle + size / 2], dim=-1)
-        boxes = corners * corners.new_tensor([width, height, width, height])
+        boxes = in_pixels(answer.pred_boxes, images)
         if answer.logits.shape[-1] > self.classes:
             return boxes, answer.logits.softmax(dim=-1)[..., :-1]
         return boxes, answer.logits.sigmoid()
@@ -216,6 +213,11 @@ KINDS = (
         _called("ForSemanticSegmentation"),
         "AutoModelForSemanticSegmentation",
         _with_names(_Segmenter),
+    ),
+    Kind(
+        lambda architecture, network: open_vocabulary.finds(architecture),
+        "AutoModelForZeroShotObjectDetection",
+        open_vocabulary.source,
     ),
     Kind(
         _called("ForObjectDetection"),
