@@ -15,7 +15,7 @@ from advsearch import files
 from advsearch.errors import ModelError
 from advsearch.models.deadline import TookTooLong, within
 from advsearch.models.labels import fitting_labels
-from advsearch.models.model import Model, ModelWarning, each_tensor, logits_of, read_by
+from advsearch.models.model import Joined, Model, ModelWarning, each_tensor, logits_of, read_by
 
 #: Rows that are non-negative and sum to 1 within this are taken for probabilities.
 PROBABILITY_TOLERANCE = 1e-3
@@ -44,6 +44,9 @@ STEP = 1e-3
 MASKED = 0.9
 """Share of a change by which answers may miss what the gradient foretells: a sign that is wrong is a miss of 2, a step
 function one of 1; kinks of ordinary networks stay under a half."""
+
+AGREES = 0.5
+"""Share of a change by which answers may miss what a gradient foretells that is to take the network's own one's place."""
 
 SMALLEST = 1e-5
 """Smallest change that is looked at, as a share of the answers: what is less may be rounding."""
@@ -106,6 +109,8 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
         _warn(f"model {model.name} answers with {odd}. {ODD_ADVICE}")
     if not repeatable:
         _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
+    if repeatable and _is_cut(model, noise):
+        model = dataclasses.replace(model, joined=True)
     return dataclasses.replace(
         model,
         labels=found,
@@ -146,7 +151,7 @@ def _answer(model: Model, images: Tensor) -> tuple[Any, int]:
     padded = torch.cat([images, images[-1:].expand(max(model.batch_limits[0] - len(images), 0), -1, -1, -1)])
     x = model.preprocessing(padded.to(model.device)).to(model.dtype)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
-        return _guarded(model, lambda: model.module(x)), len(padded)
+        return _guarded(model, lambda: model.answer(x)), len(padded)
 
 
 def _numbers(output: Any) -> Tensor:
@@ -241,6 +246,38 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
     return low, high
 
 
+def _is_cut(model: Model, images: Tensor) -> bool:
+    """Return whether `detach` hides from the gradient how answers change: where it does nothing, differences agree.
+
+    They are taken along the signs of what it hides. Networks that round, and hide this so, keep their own gradient: the
+    other one is zero.
+    """
+    leaf = images.clone().requires_grad_()
+    slopes = []
+    with suppress(RuntimeError, ModelError), torch.enable_grad():  # what has no gradient is said elsewhere
+        with Joined() as joined:
+            whole = _told(_run(model, leaf))
+        if not joined.cut:
+            return False
+        slopes = [torch.autograd.grad(one, leaf)[0] for one in (whole, _told(_run(model, leaf)))]
+    if len(slopes) < 2 or torch.allclose(*slopes):
+        return False
+    for size in (STEP, STEP / 8.0):
+        step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * (slopes[0] - slopes[1]).sign()
+        ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
+        with torch.no_grad():
+            seen = float(_told(_run(model, ends[0])) - _told(_run(model, ends[1])))
+        whole, own = (float(((ends[0] - ends[1]) * slope).sum()) for slope in slopes)
+        if abs(seen - whole) < min(abs(seen - own), AGREES * abs(whole)):
+            return True
+    return False
+
+
+def _told(rows: Tensor) -> Tensor:
+    """Return one number of what `_run` returns, whose gradient is looked at."""
+    return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
+
+
 def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
     """Return whether a gradient of the logits reaches the image; warn if not, and if answers do not follow it."""
     leaf = images.clone().requires_grad_()
@@ -249,11 +286,10 @@ def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
             logits = _run(model, leaf)
             if model.read is not None and not bool(logits[:, 0].any()):
                 return True  # a detector that sees nothing in noise: its pictures will tell
-            weights = torch.linspace(-1.0, 1.0, logits.shape[1])
-            gradient = torch.autograd.grad((logits * weights).sum(), leaf)[0]
+            gradient = torch.autograd.grad(_told(logits), leaf)[0]
         reaches, why = bool((gradient != 0).any()), "it is zero everywhere"
         if reaches and repeatable:
-            _check_gradient(model, images, gradient, weights)
+            _check_gradient(model, images, gradient)
     except (RuntimeError, ModelError) as error:
         reaches, why = False, first_line(error)
     if not reaches:
@@ -261,7 +297,7 @@ def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
     return reaches
 
 
-def _check_gradient(model: Model, images: Tensor, gradient: Tensor, weights: Tensor) -> None:
+def _check_gradient(model: Model, images: Tensor, gradient: Tensor) -> None:
     """Warn if a network's answers do not move as its gradient says: it is masked, or not of this network."""
     sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)  # what suppression leaves may jump in the first only
     for size in sizes:
@@ -271,7 +307,7 @@ def _check_gradient(model: Model, images: Tensor, gradient: Tensor, weights: Ten
             answers = [_run(model, end) for end in ends]
             if model.read is not None and len({_choices(model, one) for one in (images, *ends)}) > 1:
                 return  # nothing can be said of what jumps
-        seen = float(((answers[0] - answers[1]) * weights).sum())
+        seen = float(_told(answers[0] - answers[1]))
         expected = float(((ends[0] - ends[1]) * gradient).sum())
         change = max(abs(seen), abs(expected))
         if change <= SMALLEST * float(answers[0].abs().sum()) or abs(seen - expected) <= MASKED * change:

@@ -12,8 +12,8 @@ from PIL import Image
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch import load_model
+from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
@@ -188,7 +188,8 @@ def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str, monkey
 
     def value(given: Tensor) -> Tensor:
         boxes, scores = model.module(model.preprocessing(given))
-        return scores[0, :, 0].logit().sum() + boxes[0].mean()
+        total: Tensor = scores[0, :, 0].logit().sum() + boxes[0].mean()
+        return total
 
     gradient = torch.autograd.grad(value(image), image)[0]
     with torch.no_grad():
