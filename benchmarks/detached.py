@@ -1,20 +1,22 @@
-"""How a search gets past detectors that cut their queries off from the picture, as RT-DETR does: four ways compared.
+"""How a search gets past detectors that cut their queries off from the picture, as RT-DETR does: five ways compared.
 
-    python benchmarks/detached.py [--family RTDetr] [--train 1500] [--starts 40] [--steps 20]
+    python benchmarks/detached.py [--family RTDetr] [--train 1200] [--starts 20] [--steps 12] [--weights FILE]
 
 RT-DETR, RT-DETRv2, D-FINE, DEIMv2, two-stage Deformable DETR and Grounding DINO choose queries by scores of their
 encoder and detach these and their reference points, in evaluation too: a gradient misses how the picture moves them. A
-tiny one is trained here on drawn pictures of squares, discs and crosses, for minutes. Then the texture of an object that
-it finds is to be changed such that it vanishes, within an l-infinity ball, by `pgd` with the gradient
+tiny RT-DETR is trained here for minutes on drawn pictures of squares, discs and crosses, or read from FILE. Then the
+texture of an object that it finds is changed such that it vanishes, within an l-infinity ball, by `pgd` with the
+gradient
 
 - own: of the network as it is;
-- joined: where `detach` does nothing;
+- attached: where `detach` does nothing;
 - encoder: as it is, with the objective of the encoder's own boxes and scores added;
-- both: joined, with the same added;
+- both: attached, with the same added;
 
-and by `nes` without a gradient, at as many pictures, and at as many seconds. Printed are how many of the starts each
-finds, how far it gets in the median (log-odds of the confidence less those of the best right box), the milliseconds of
-an evaluation, and the cosine between each gradient and differences along random directions.
+and by `nes` without one; with as many pictures, and again with as many seconds as `attached` takes. Printed are the
+cosine of each gradient and differences along random directions, and its length as a share of theirs; then how many of
+the starts each way finds, the median of the best objective (log-odds of the confidence less those of the best right
+box), and the milliseconds of an evaluation. It runs on one thread.
 """
 
 from __future__ import annotations
@@ -26,16 +28,17 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
 import transformers
 from torch import Tensor
 from torch.nn import functional
-from torch.overrides import TorchFunctionMode
 
 from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
-from advsearch.models.model import mend_batch_norms
+from advsearch.models.model import Detaching, mend_batch_norms
 from advsearch.tasks.detection import Detection, Place
 
 SIDE, TEXELS = 64, 8
@@ -44,13 +47,6 @@ EPSILONS = (0.05, 0.15)
 SMALL, ALONG = 5e-4, 16
 """Step of the differences that gradients are compared with, and along how many directions."""
 MEAN = 0.5
-
-
-class Joined(TorchFunctionMode):
-    """Where `detach` does nothing."""
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return args[0] if func is torch.Tensor.detach else func(*args, **(kwargs or {}))
 
 
 # ---- pictures -------------------------------------------------------------------------------------------------------
@@ -107,23 +103,16 @@ def scene(rng: torch.Generator, things: int) -> Scene:
 
 def made(family: str) -> Any:
     """Return a tiny network without weights."""
+    layers: dict[str, Any] = {"embedding_size": 16, "hidden_sizes": [16, 24, 32, 48], "depths": [1, 1, 1, 1]}
+    layers |= {"layer_type": "basic", "out_features": ["stage2", "stage3", "stage4"]}
     sizes: dict[str, Any] = {"encoder_hidden_dim": 32, "d_model": 32, "encoder_ffn_dim": 64, "decoder_ffn_dim": 64}
     sizes |= {"encoder_attention_heads": 2, "decoder_attention_heads": 2, "decoder_in_channels": [32] * 3}
-    sizes |= {"decoder_layers": 3, "num_queries": 12, "num_denoising": 12, "id2label": dict(enumerate(NAMES))}
-    layers: dict[str, Any] = {"embedding_size": 16, "hidden_sizes": [16, 24, 32, 48], "depths": [1, 1, 1, 1]}
-    if family in ("DFine", "Deimv2"):
-        stages = {"stem_channels": [3, 8, 16], "stage_in_channels": [16, 24, 32, 48], "stage_mid_channels": [16] * 4}
-        stages |= {"stage_out_channels": [24, 32, 48, 48], "hidden_sizes": [24, 32, 48, 48], "stage_num_blocks": [1] * 4}
-        layers = {**layers, **stages, "stage_numb_of_layers": [2] * 4}
-        backbone = transformers.HGNetV2Config(**layers, out_features=["stage2", "stage3", "stage4"])
-        sizes |= {"encoder_in_channels": [32, 48, 48]}
-    else:
-        backbone = transformers.RTDetrResNetConfig(
-            **layers, layer_type="basic", out_features=["stage2", "stage3", "stage4"]
-        )
-        sizes |= {"encoder_in_channels": [24, 32, 48]}
+    sizes |= {"encoder_in_channels": [24, 32, 48], "decoder_layers": 3, "num_queries": 12, "num_denoising": 12}
     config = getattr(transformers, f"{family}Config")(
-        backbone_config=backbone, freeze_backbone_batch_norms=False, **sizes
+        backbone_config=transformers.RTDetrResNetConfig(**layers),
+        freeze_backbone_batch_norms=False,
+        id2label=dict(enumerate(NAMES)),
+        **sizes,
     )
     return getattr(transformers, f"{family}ForObjectDetection")(config)
 
@@ -172,13 +161,13 @@ class Search:
     @property
     def truth(self) -> Place:
         x, y, half = (self.scene.places[0] * SIDE).tolist()
-        box = tuple(round(one) for one in (x - half, y - half, x + half, y + half))
-        return Place((self.scene.kinds[0],), box, (SIDE, SIDE))  # type: ignore[arg-type]
+        left, top, right, bottom = (round(one) for one in (x - half, y - half, x + half, y + half))
+        return Place((self.scene.kinds[0],), (left, top, right, bottom), (SIDE, SIDE))
 
     def scores(self, u: Tensor, way: str = "own") -> tuple[Tensor, Tensor]:
         """Return what success is read off, and what is differentiated."""
         picture = self.scene.drawn(u.reshape(3, TEXELS, TEXELS))[None]
-        with Joined() if way in ("joined", "both") else nullcontext():
+        with Detaching(ignored=True) if way in ("attached", "both") else nullcontext():
             answer = self.network(pixel_values=picture - MEAN)
         mend_batch_norms([answer.pred_boxes, answer.logits, answer.enc_outputs_class])
         found = TASK.score(read(answer.pred_boxes, answer.logits), self.truth)[0]
@@ -223,60 +212,56 @@ class Search:
         }
 
 
-WAYS = ("own", "joined", "encoder", "both")
+WAYS = ("own", "attached", "encoder", "both")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--family", default="RTDetr", choices=["RTDetr", "RTDetrV2", "DFine", "Deimv2"])
-    parser.add_argument("--train", type=int, default=1500)
-    parser.add_argument("--starts", type=int, default=40)
-    parser.add_argument("--steps", type=int, default=20)
-    parser.add_argument("--weights", help="safetensors file that a trained network is kept in")
+    parser.add_argument("--family", default="RTDetr", choices=["RTDetr", "RTDetrV2"])
+    parser.add_argument("--train", type=int, default=1200)
+    parser.add_argument("--starts", type=int, default=20)
+    parser.add_argument("--steps", type=int, default=12)
+    parser.add_argument("--weights", type=Path, help="safetensors file to read, or else to write")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    network = kept(given.family, given.train, given.weights)
-    rng, starts = torch.Generator().manual_seed(2), []
-    tried = 0
+    if given.weights and given.weights.exists():
+        network = made(given.family)
+        safetensors.torch.load_model(network, given.weights)
+        network.eval().requires_grad_(False)
+    else:
+        network = trained(given.family, given.train)
+        if given.weights:
+            safetensors.torch.save_model(network, str(given.weights))
+    rng, tried = torch.Generator().manual_seed(2), 0
+    starts: list[Search] = []
     while len(starts) < given.starts:
         one, tried = Search(network, scene(rng, 2)), tried + 1
         with torch.no_grad():
             if float(one.scores(one.scene.textures[0].flatten())[0]) < 0.0:
                 starts.append(one)
-    print(f"{given.family}: {given.starts} of {tried} scenes are found; {given.steps} steps each")
+    print(f"{given.family}: the first thing of {given.starts} in {tried} scenes is found")
     gradients = [one.compared(rng) for one in starts]
     for way in WAYS:
         cosine, length = (statistics.median(one[way][part] for one in gradients) for part in (0, 1))
         print(f"  {way}: cosine {cosine:.2f}, length {length:.2f}", flush=True)
     for epsilon in EPSILONS:
-        clock: dict[str, float] = {}
-        for policy, way, steps in [*(("pgd", way, given.steps) for way in WAYS), ("nes", "own", given.steps), ("nes", "own", 0)]:
-            if not steps:
-                steps = round(given.steps * clock["own"] / clock["nes"])
-            began = time.process_time()
-            found = [one.best(policy, way, epsilon, steps, seed) for seed, one in enumerate(starts)]
-            each = (time.process_time() - began) / len(starts) / steps
-            clock["nes" if policy == "nes" else way] = each
-            print(
-                f"  {epsilon} {policy} {way} ({steps} steps): {sum(one > 0 for one in found)} of {len(found)}, "
-                f"median {statistics.median(found):+.2f}, {1e3 * each:.0f} ms",
-                flush=True,
-            )
+        each = {way: tried_out(starts, "pgd", way, epsilon, given.steps) for way in WAYS}
+        each["nes"] = tried_out(starts, "nes", "own", epsilon, given.steps)
+        for policy, way, key in (("pgd", "own", "own"), ("pgd", "encoder", "encoder"), ("nes", "own", "nes")):
+            tried_out(starts, policy, way, epsilon, round(given.steps * each["attached"] / each[key]))
 
 
-def kept(family: str, steps: int, weights: str | None) -> Any:
-    from pathlib import Path
-
-    from safetensors.torch import load_model, save_model
-
-    if weights and Path(weights).exists():
-        network = made(family)
-        load_model(network, weights)
-        return network.eval().requires_grad_(False)
-    network = trained(family, steps)
-    if weights:
-        save_model(network, weights)
-    return network
+def tried_out(starts: Sequence[Search], policy: str, way: str, epsilon: float, steps: int) -> float:
+    """Search from every start, print how it went, and return the CPU seconds of a step."""
+    began = time.process_time()
+    found = [one.best(policy, way, epsilon, steps, seed) for seed, one in enumerate(starts)]
+    seconds = (time.process_time() - began) / len(starts) / steps
+    print(
+        f"  epsilon {epsilon}, {policy} {way}, {steps} steps: {sum(one > 0.0 for one in found)} of {len(found)}, "
+        f"median {statistics.median(found):+.2f}, {1e3 * seconds:.0f} ms",
+        flush=True,
+    )
+    return seconds
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ class Model:
         batch_limits: (fewest, most) images that the network takes at once. Larger batches are cut, smaller ones padded.
         probabilities: the network answers with probabilities; their logarithm is returned: differences are log-odds.
         differentiable: a gradient of the logits reaches the image.
-        joined: its gradient is that of its answers only where `detach` does nothing, see `Joined`.
+        attached: its gradient is that of its answers only where `detach` does nothing, see `Detaching`.
         named: False if `labels` are placeholders.
         dtype: the type of the network's floating-point input.
         device: where the network lives. Images go there, the output comes back.
@@ -68,7 +68,7 @@ class Model:
     batch_limits: tuple[int, int] = (1, 64)
     probabilities: bool = False
     differentiable: bool = True
-    joined: bool = False
+    attached: bool = False
     named: bool = True
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
@@ -136,29 +136,35 @@ class Model:
 
     def answer(self, x: Tensor) -> Any:
         """Return what the network itself gives for a batch as `batches` yields it."""
-        joined = Joined() if self.joined and torch.is_grad_enabled() else nullcontext()
-        with joined, torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
+        mode = Detaching(ignored=True) if self.attached and torch.is_grad_enabled() else nullcontext()
+        with mode, torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
             return self.module(x)
 
 
-class Joined(TorchFunctionMode):
-    """While it is on, `detach` does nothing, so that gradients are those of the answers.
+class Detaching(TorchFunctionMode):
+    """Looks on as a network detaches something, which it may be kept from: then gradients are those of its answers.
 
     RT-DETR and its like choose queries by the scores of their encoder, and cut these off from their decoder, in
     evaluation too: that makes training stable (Zhu et al. 2020, arXiv 2010.04159, appendix A.4), and hides from a
     search how the picture moves them.
 
+    Args:
+        ignored: whether `detach` does nothing.
+
     Attributes:
-        cut: whether something that has a gradient was to be detached.
+        seen: whether something with a gradient was to be detached.
     """
 
-    cut = False
+    def __init__(self, *, ignored: bool = False) -> None:
+        super().__init__()
+        self.ignored, self.seen = ignored, False
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call torch's function, or return what was to be detached as it is."""
         if function is torch.Tensor.detach:
-            self.cut = self.cut or args[0].requires_grad
-            return args[0]
+            self.seen = self.seen or args[0].requires_grad
+            if self.ignored:
+                return args[0]
         return function(*args, **(kwargs or {}))
 
 

@@ -15,7 +15,7 @@ from advsearch import files
 from advsearch.errors import ModelError
 from advsearch.models.deadline import TookTooLong, within
 from advsearch.models.labels import fitting_labels
-from advsearch.models.model import Joined, Model, ModelWarning, each_tensor, logits_of, read_by
+from advsearch.models.model import Detaching, Model, ModelWarning, each_tensor, logits_of, read_by
 
 #: Rows that are non-negative and sum to 1 within this are taken for probabilities.
 PROBABILITY_TOLERANCE = 1e-3
@@ -46,7 +46,7 @@ MASKED = 0.9
 function one of 1; kinks of ordinary networks stay under a half."""
 
 AGREES = 0.5
-"""Share of a change by which answers may miss what a gradient foretells that is to take the network's own one's place."""
+"""Share of a change by which answers may miss what a gradient foretells that takes the place of the network's own."""
 
 SMALLEST = 1e-5
 """Smallest change that is looked at, as a share of the answers: what is less may be rounding."""
@@ -109,15 +109,12 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
         _warn(f"model {model.name} answers with {odd}. {ODD_ADVICE}")
     if not repeatable:
         _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
-    if repeatable and _is_cut(model, noise):
-        model = dataclasses.replace(model, joined=True)
     return dataclasses.replace(
-        model,
+        _with_gradient(model, noise, repeatable),
         labels=found,
         named=labels is not None,
         probabilities=probabilities,
         batch_limits=_batch_limits(model, torch.cat([grey, noise]), rows if repeatable else None),
-        differentiable=_gradient_reaches(model, noise, repeatable),
     )
 
 
@@ -246,47 +243,20 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
     return low, high
 
 
-def _is_cut(model: Model, images: Tensor) -> bool:
-    """Return whether `detach` hides from the gradient how answers change: where it does nothing, differences agree.
-
-    They are taken along the signs of what it hides. Networks that round, and hide this so, keep their own gradient: the
-    other one is zero.
-    """
-    leaf = images.clone().requires_grad_()
-    slopes = []
-    with suppress(RuntimeError, ModelError), torch.enable_grad():  # what has no gradient is said elsewhere
-        with Joined() as joined:
-            whole = _told(_run(model, leaf))
-        if not joined.cut:
-            return False
-        slopes = [torch.autograd.grad(one, leaf)[0] for one in (whole, _told(_run(model, leaf)))]
-    if len(slopes) < 2 or torch.allclose(*slopes):
-        return False
-    for size in (STEP, STEP / 8.0):
-        step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * (slopes[0] - slopes[1]).sign()
-        ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
-        with torch.no_grad():
-            seen = float(_told(_run(model, ends[0])) - _told(_run(model, ends[1])))
-        whole, own = (float(((ends[0] - ends[1]) * slope).sum()) for slope in slopes)
-        if abs(seen - whole) < min(abs(seen - own), AGREES * abs(whole)):
-            return True
-    return False
-
-
-def _told(rows: Tensor) -> Tensor:
-    """Return one number of what `_run` returns, whose gradient is looked at."""
-    return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
-
-
-def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
-    """Return whether a gradient of the logits reaches the image; warn if not, and if answers do not follow it."""
-    leaf = images.clone().requires_grad_()
+def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
+    """Return the model with `differentiable` and `attached` set; warn if no gradient of its answers reaches the image,
+    and if answers do not follow it."""
     try:
-        with torch.enable_grad():
-            logits = _run(model, leaf)
-            if model.read is not None and not bool(logits[:, 0].any()):
-                return True  # a detector that sees nothing in noise: its pictures will tell
-            gradient = torch.autograd.grad(_told(logits), leaf)[0]
+        with Detaching() as detaching:
+            rows, gradient = _slope(model, images)
+        if model.read is not None and not bool(rows[:, 0].any()):
+            return dataclasses.replace(model, differentiable=True)  # it sees nothing in noise: its pictures will tell
+        if repeatable and detaching.seen:
+            whole = dataclasses.replace(model, attached=True)
+            with suppress(RuntimeError, ModelError):  # it may detach what must have no gradient, such as for numpy
+                slope = _slope(whole, images)[1]
+                if _is_better(model, images, slope, gradient):
+                    model, gradient = whole, slope
         reaches, why = bool((gradient != 0).any()), "it is zero everywhere"
         if reaches and repeatable:
             _check_gradient(model, images, gradient)
@@ -294,7 +264,39 @@ def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
         reaches, why = False, first_line(error)
     if not reaches:
         _warn(f"no gradient of model {model.name} reaches its image ({why}): use `auto` or a policy without gradients")
-    return reaches
+    return dataclasses.replace(model, differentiable=reaches)
+
+
+def _slope(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what `_run` does of images, and the gradient of `_told` of it; zero where nothing is found."""
+    leaf = images.clone().requires_grad_()
+    with torch.enable_grad():
+        rows = _run(model, leaf)
+        if model.read is not None and not bool(rows[:, 0].any()):
+            return rows, torch.zeros_like(images)
+        return rows, torch.autograd.grad(_told(rows), leaf)[0]
+
+
+def _told(rows: Tensor) -> Tensor:
+    """Return one number of what `_run` returns, whose gradient is looked at."""
+    return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
+
+
+def _is_better(model: Model, images: Tensor, whole: Tensor, own: Tensor) -> bool:
+    """Return whether answers change as a gradient without `detach` says, and less so as the network's own does.
+
+    Changes are taken along the signs of the difference of the two. Networks that round behind a `detach` keep their
+    own: the other one is zero.
+    """
+    for size in (STEP, STEP / 8.0):
+        step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * (whole - own).sign()
+        ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
+        with torch.no_grad():
+            seen = float(_told(_run(model, ends[0]) - _run(model, ends[1])))
+        told, less = (float(((ends[0] - ends[1]) * slope).sum()) for slope in (whole, own))
+        if abs(seen - told) < min(abs(seen - less), AGREES * abs(told)):
+            return True
+    return False
 
 
 def _check_gradient(model: Model, images: Tensor, gradient: Tensor) -> None:
