@@ -259,7 +259,7 @@ def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
                     model, gradient = whole, slope
         reaches, why = bool((gradient != 0).any()), "it is zero everywhere"
         if reaches and repeatable:
-            _check_gradient(model, images, gradient)
+            _check_gradient(model, images, gradient, detaching.seen and not model.attached)
     except (RuntimeError, ModelError) as error:
         reaches, why = False, first_line(error)
     if not reaches:
@@ -299,8 +299,8 @@ def _is_better(model: Model, images: Tensor, whole: Tensor, own: Tensor) -> bool
     return False
 
 
-def _check_gradient(model: Model, images: Tensor, gradient: Tensor) -> None:
-    """Warn if a network's answers do not move as its gradient says: it is masked, or not of this network."""
+def _check_gradient(model: Model, images: Tensor, gradient: Tensor, detached: bool) -> None:
+    """Warn if a network's answers do not move as its gradient says: it is masked, cut off, or not of this network."""
     sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)  # what suppression leaves may jump in the first only
     for size in sizes:
         step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * gradient.sign()
@@ -314,9 +314,12 @@ def _check_gradient(model: Model, images: Tensor, gradient: Tensor) -> None:
         change = max(abs(seen), abs(expected))
         if change <= SMALLEST * float(answers[0].abs().sum()) or abs(seen - expected) <= MASKED * change:
             return
+    why = "Steps that round, or a defence that masks gradients?"
+    if detached:
+        why = "It detaches a part of what it computes, where it rounds or for another reason."
     _warn(
         f"the gradient of model {model.name} does not say how its answers change: {expected:.3g} expected, "
-        f"{seen:.3g} seen for a small step along it. Steps that round, or a defence that masks gradients? A search "
+        f"{seen:.3g} seen for a small step along it. {why} A search "
         "that follows them may find nothing: try a policy without gradients beside it"
     )
 
