@@ -24,7 +24,7 @@ class Tokens(nn.Module):
         torch.manual_seed(0)
         self.begin, self.norm = nn.Conv2d(3, 6, 3, stride=2), nn.BatchNorm2d(6)
         self.order, self.end = nn.LayerNorm(6), nn.Linear(6, 4)
-        nn.init.uniform_(self.norm.running_var, 0.1, 2.0)
+        self.norm.register_buffer("running_var", torch.linspace(0.1, 2.0, 6))
 
     def forward(self, images: Tensor) -> Tensor:
         tokens = self.norm(self.begin(images)).flatten(2).transpose(1, 2)
@@ -65,7 +65,8 @@ class Cut(nn.Module):
         gate = torch.tanh(self.gate(pixels))
         detached = gate.detach()
         if self.how == "numpy":
-            return self.scores(pixels) * 1e-3 + torch.from_numpy(detached.numpy().copy())
+            cut: Tensor = self.scores(pixels) * 1e-3 + torch.from_numpy(detached.numpy().copy())
+            return cut
         if self.how in ("unused", "rounded"):
             detached = gate
         scores: Tensor = self.scores(pixels) * detached
