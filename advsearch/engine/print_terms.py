@@ -39,18 +39,22 @@ def variation(colors: Tensor) -> Tensor:
     return length
 
 
-def off_print(colors: Tensor) -> Tensor:
-    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest printable colour; of a picture
-    (h, w, 4) of those that its last channel has."""
+def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
+    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest printable colour, of a palette
+    (P, 3) where one is given; of a picture (h, w, 4) of those that its last channel has."""
     colors = colors if colors.shape[-1] == 3 else colors[colors[..., 3] > 0][:, None, :3]
-    nearest = (LOW + STEP * ((colors.detach() - LOW) / STEP).round()).clamp(LOW, HIGH)
+    if palette is None:
+        nearest = (LOW + STEP * ((colors.detach() - LOW) / STEP).round()).clamp(LOW, HIGH)
+    else:
+        palette = palette.to(colors)
+        nearest = palette[torch.cdist(colors.detach().reshape(-1, 3), palette).argmin(dim=1)].reshape(colors.shape)
     distance: Tensor = torch.linalg.vector_norm(colors - nearest, dim=2).mean()
     return distance
 
 
 def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
     """Both terms, summed over what is to be printed."""
-    found = [colors for control, part in space.slices(u) if (colors := control.printed(part)) is not None]
+    found = list(space.printed(u).values())
     if not found:
         raise InputError(
             "printable: expected a search over the colours of a texture or a patch, got "
