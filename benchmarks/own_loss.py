@@ -24,6 +24,7 @@ from advsearch import threads
 
 threads.configure()
 
+import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 import advsearch  # noqa: E402
@@ -66,9 +67,9 @@ def times(scene: advsearch.Scene, model: advsearch.Model, turns: int) -> None:
 
 def of_the_page() -> dict[str, Any]:
     """What the block of the page with the paper's loss defines."""
-    names: dict[str, Any] = {}
+    names: dict[str, Any] = {"torch": torch, "losses": losses}
     (block,) = re.findall(r"^```python\n((?:(?!```).)*?def sharif.*?)^```$", PAGE.read_text("utf-8"), re.M | re.S)
-    exec(compile(block, str(PAGE), "exec"), names)
+    exec(compile(block.partition("\n\nresult = ")[0], str(PAGE), "exec"), names)
     return names
 
 
