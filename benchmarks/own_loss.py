@@ -110,8 +110,7 @@ def gradients(scene: advsearch.Scene, model: advsearch.Model, seeds: int) -> Non
     for seed in range(seeds):
         for name, (estimator, step) in ways.items():
             with mock.patch.object(plan, "SEARCH_STEP", step):
-                found = advsearch.attack(scene, model, estimators=estimator, seed=seed, **settings)
-            verified = found.summary.verified
+                verified = advsearch.attack(scene, model, estimators=estimator, seed=seed, **settings).summary.verified
             margins[name].append(verified.margin if verified is not None else float("nan"))
         print(f"seed {seed}:", *(f"{one[-1]:7.2f}" for one in margins.values()), flush=True)
     first = next(iter(margins.values()))

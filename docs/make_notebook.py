@@ -26,7 +26,9 @@ def notebook() -> dict[str, Any]:
         if isinstance(last, ast.Assign) and ast.unparse(last.targets[0]) == "result":
             text += "\nresult"
         if text:
-            kind = {"cell_type": "code", "execution_count": None, "outputs": []} if code else {"cell_type": "markdown"}
+            kind: dict[str, Any] = {"cell_type": "markdown"}
+            if code:
+                kind = {"cell_type": "code", "execution_count": None, "outputs": []}
             source = text.splitlines(keepends=True)
             cells.append({**kind, "id": f"cell-{len(cells)}", "metadata": {}, "source": source})
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}

@@ -48,7 +48,7 @@ def test_u_may_be_an_array_or_a_batch(scene: advsearch.Scene) -> None:
     assert several.grad is not None and several.grad.shape == (2, 1) and bool((several.grad != 0.0).all())
     assert render(np.array([[0.5], [0.75]]), spp=1).shape == (2, 8, 8, 3)
     with pytest.raises(InputError, match="expected u as a tensor or an array of numbers, got str"):
-        render("start", spp=1)
+        render("start", spp=1)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"expected u of shape \(1,\), got \(2,\)"):
         render(np.zeros((3, 2)), spp=1)
 
@@ -65,7 +65,7 @@ def test_a_class_in_the_place_of_an_instance_is_told_how_to_be_one(scene: advsea
     with pytest.raises(InputError, match=r"policy: .* got the class Random; write Random\(\)"):
         advsearch.attack(scene, easy(), policy=Random)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"task: .* got the class Classification; write Classification\(\)"):
-        make_task(Classification)
+        make_task(Classification)  # type: ignore[arg-type]
     assert scene.renderer(PoseControl(yaw=[0, 10]), resolution=8).start.shape == (1,)
 
 
@@ -98,7 +98,7 @@ def test_a_function_that_says_yes_or_no_is_no_task() -> None:
     ):
         task.margin(torch.zeros(2, 1), Facts("mug"))
     with pytest.raises(InputError, match="got float"):
-        make_task(lambda output, truth: 1.0).margin(torch.zeros(2, 1), Facts("mug"))
+        make_task(lambda output, truth: output.sum().item()).margin(torch.zeros(2, 1), Facts("mug"))
     whole = make_task(lambda output, truth: output.sum())
     assert whole.judge(torch.tensor([[3.0, 1.0]]), Facts("mug", "cup"))[0].margin == 4.0
     assert whole.answers(torch.tensor([[3.0, 1.0]]))[0][0].label == "3, 1"
