@@ -495,7 +495,7 @@ def test_every_python_example_compiles_and_names_what_exists(page: Path) -> None
                 assert node.attr in advsearch.__all__
             if isinstance(node, ast.Call) and re.fullmatch(r"advsearch\.\w+", ast.unparse(node.func)):
                 known = parameters(ast.unparse(node.func).removeprefix("advsearch."))
-                assert not {keyword.arg for keyword in node.keywords} - known
+                assert not {keyword.arg for keyword in node.keywords if keyword.arg} - known
 
 
 @pytest.mark.slow
