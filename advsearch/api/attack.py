@@ -129,7 +129,7 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
-    task = task if isinstance(task, (str, Mapping)) else make_task(task)
+    task = make_task(task) if callable(task) else task
     loaded_already = not all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
     if loaded_already or callable(objective) or only_here(controls) or only_here(over) or isinstance(task, OwnTask):
         check_not_spread(options)

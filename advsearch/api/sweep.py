@@ -116,7 +116,7 @@ def sweep(
     networks = _several(brought.get("model", "reference") if model is None else model)
     controls = controls or brought.get("controls", ())
     task = brought.get("task", task) if task == "classification" else task
-    task = task if isinstance(task, (str, Mapping)) else make_task(task)
+    task = make_task(task) if callable(task) else task
     names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
     if names and len(names) < len(scenes):
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
