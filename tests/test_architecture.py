@@ -28,6 +28,7 @@ COMMON = {
     "files",
     "interrupts",
     "options",
+    "pictures",
     "registry",
     "seeds",
     "threads",
@@ -55,6 +56,7 @@ class Rule:
 HEAVY = frozenset(RENDERER | {"torch"})
 RULES = {
     **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
+    "pictures": Rule(set(), {"numpy", "PIL"}, HEAVY),
     "yaml_text": Rule(set(), {"yaml"}),
     # typing_extensions for the type checker only
     "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),

@@ -20,7 +20,7 @@ from typing import Any, final
 
 from torch import Tensor
 
-from advsearch.attacks.feature_distance import ReadFeatures, feature_distance
+from advsearch.attacks.feature_distance import ReadFeatures, cosine_distance, feature_distance
 from advsearch.attacks.logit_objectives import (
     cross_entropy,
     dlr,
@@ -34,7 +34,7 @@ from advsearch.attacks.logit_objectives import (
 from advsearch.attacks.own_objective import More, Objective, checked, form_of, nothing_more
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
-from advsearch.tasks import Classification, Segmentation, Task
+from advsearch.tasks import TASKS, Classification, Segmentation, Similarity, Task
 from advsearch.tasks.classes import ClassTask
 from advsearch.tasks.detection import GOALS, Detection
 
@@ -70,8 +70,8 @@ class ObjectiveKind:
         plain: the function of the right answers, which may ask for more as a user's own does; None for one that has to
             be made for a run.
         targeted: the same, of a target in their place; None if it has no such form.
-        task: name of the task whose outputs it takes; None for any.
-        needs_features: whether it is made from the model's features and a clean picture.
+        task: name of the task whose outputs it takes, and of those tasks that are kinds of it; None for any.
+        of_features: what makes it from the model's features and a clean picture; None where nothing does.
         of_task: what makes it from the task, which knows of target and direction itself; None where nothing does.
     """
 
@@ -81,8 +81,19 @@ class ObjectiveKind:
     plain: Callable[..., Tensor] | None = None
     targeted: Callable[..., Tensor] | None = None
     task: str | None = Classification.name
-    needs_features: bool = False
+    of_features: Callable[[ReadFeatures, Tensor], Callable[..., Tensor]] | None = None
     of_task: Callable[[Any], Objective] | None = None
+
+    @property
+    def needs_features(self) -> bool:
+        """Whether it is made from features."""
+        return self.of_features is not None
+
+    def fits(self, task: str) -> bool:
+        """Whether it takes the outputs of the task of that name."""
+        return self.task in (None, task) or (
+            self.task in TASKS and task in TASKS and issubclass(TASKS[task], TASKS[self.task])
+        )
 
     def form(self, *, targeted: bool) -> Callable[..., Tensor]:
         """Return the plain or the targeted function."""
@@ -145,7 +156,14 @@ _OWN = {
             "feature_distance",
             "how far the features lie from those of the clean picture",
             "lengths of the clean features",
-            needs_features=True,
+            of_features=feature_distance,
+        ),
+        ObjectiveKind(
+            "distance",
+            "how far the features lie from those of the clean picture, by the angle",
+            "1 - cosine",
+            task=Similarity.name,
+            of_features=cosine_distance,
         ),
         ObjectiveKind(
             "score",
@@ -219,17 +237,17 @@ def get_objective(
         found = checked(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
         return kind.of_task(task)
-    elif kind.needs_features:
+    elif kind.of_features is not None:
         if features is None or clean is None:
             raise InputError(
                 f"objective {kind.name!r}: expected the model's features and a clean picture, got none; use "
                 "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
             )
-        found = _plain(feature_distance(features, clean))
+        found = _plain(kind.of_features(features, clean))
     else:
         form = kind.form(targeted=targeted)
         found = _plain(form) if _OWN.get(kind.name) is kind else checked(form)
-        if isinstance(task, ClassTask) and task.nothing:
+        if isinstance(task, Similarity) or (isinstance(task, ClassTask) and task.nothing):
             found = _of_answers(found, task)
     found = _aimed(found, task.target) if targeted else found
     return negated(found) if task.minimise else found
@@ -265,8 +283,8 @@ def check_objective(
     if kind is None:
         form_of(objective)  # type: ignore[arg-type]
         return
-    if kind.task not in (None, task):
-        fitting = [name for name, one in OBJECTIVE_KINDS.items() if one.task in (None, task)]
+    if not kind.fits(task):
+        fitting = [name for name, one in OBJECTIVE_KINDS.items() if one.fits(task)]
         raise InputError(
             f"objective: expected one of task {task} ({', '.join(fitting)}), got {kind.name}, which takes outputs of "
             f"{kind.task}"

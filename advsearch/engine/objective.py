@@ -63,11 +63,11 @@ def objective_for(
         return of_ensemble([get_objective(wanted, one) for one in task.tasks], ensemble or "mean"), ""
     if not of_features:
         return get_objective(wanted, task), ""
-    features = features_of(model)
+    features = features_of(model) if task.reads_logits else None  # otherwise they are what the model answers with
     with torch.no_grad():
         clean = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
-    note = "" if features.penultimate else features.source
-    return get_objective(wanted, task, features=features, clean=clean), note
+    note = "" if features is None or features.penultimate else features.source
+    return get_objective(wanted, task, features=features or model, clean=clean), note
 
 
 def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:

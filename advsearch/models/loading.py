@@ -120,6 +120,8 @@ def _loaded(
 ) -> Model:
     read = read or (task and task.reader)
     names, origin = None if labels is None else read_labels(labels), labels_origin(labels)
+    if names is not None and task and task.names_from:
+        raise InputError(f"labels: the names of task {task.name} are those of {task.names_from}; leave `labels` out")
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
     found = _find(spec)
     switches = turned_by_code()

@@ -28,6 +28,7 @@ GIVEN_BY = {
     "classification": "a row of scores is what a classifier gives",
     "detection": "boxes are what a detector gives",
     "segmentation": "a score for each pixel is what a segmenter gives",
+    "similarity": "features are what a network without a head gives",
 }
 """What networks of a task answer with, by task, for messages."""
 
@@ -203,7 +204,7 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
     if advice := _no_scores(output):
         raise ModelError(f"{expected}, got {described(tensor if tensor is not None else output)}; {advice}")
     meant = _task_of(output)
-    if meant in ("detection", "segmentation") and (tensor is None or tensor.dim() != 4):
+    if meant in ("detection", "segmentation", "similarity") and (tensor is None or tensor.dim() != 4):
         raise ModelError(f"{expected}, got {described(output)}; {_other_task(meant)}")
     if tensor is None:
         raise ModelError(f"{expected}, got {type(output).__name__}; wrap the network so that it returns one tensor")
@@ -238,9 +239,12 @@ def _no_scores(answer: Any) -> str:
 
 
 def _task_of(answer: Any) -> str | None:
-    """Return the task whose networks answer like that: boxes, a score for each pixel, or rows of scores; else None."""
+    """Return the task whose networks answer like that: boxes, features, a score for each pixel, or rows of
+    scores; else None."""
     if _has_boxes(answer):
         return "detection"
+    if hasattr(answer, "last_hidden_state") and not hasattr(answer, "logits"):
+        return "similarity"
     tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
     kinds = {2: "classification", 4: "segmentation"}
     if (

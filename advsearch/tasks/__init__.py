@@ -15,10 +15,11 @@ from advsearch.tasks.classification import Classification
 from advsearch.tasks.detection import Detection
 from advsearch.tasks.own import own_task
 from advsearch.tasks.segmentation import Segmentation
+from advsearch.tasks.similarity import Similarity
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation)},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation, Similarity)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -63,6 +64,7 @@ __all__ = [
     "Mark",
     "Segmentation",
     "Sight",
+    "Similarity",
     "Task",
     "make_task",
 ]

@@ -204,7 +204,7 @@ every_form_of_logits = pytest.mark.parametrize(("name", "chosen"), [one for one 
 def test_the_battery_knows_every_objective() -> None:
     known = {"margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score"}
     assert {name for name, _ in all_forms()} == known, "a new objective needs a test of its values above"
-    assert set(OBJECTIVE_KINDS) - known == {*GOALS, "pixel_margin"}
+    assert set(OBJECTIVE_KINDS) - known == {*GOALS, "pixel_margin", "distance"}
     assert set(OBJECTIVES) == {name for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None}
     for name, kind in OBJECTIVE_KINDS.items():
         assert kind.name == name and kind.unit and kind.summary == objective_summaries()[name]

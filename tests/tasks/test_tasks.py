@@ -248,7 +248,7 @@ def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch
 
 def test_tasks_have_names() -> None:
     assert (
-        list(TASKS) == ["classification", "detection", "segmentation"]
+        list(TASKS) == ["classification", "detection", "segmentation", "similarity"]
         and make_task("classification") == Classification()
     )
     mine = Yaw(tolerance=5.0)

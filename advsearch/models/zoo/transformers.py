@@ -18,7 +18,7 @@ from torch.nn import functional
 from advsearch.errors import ModelError, resembling
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
-from advsearch.models.zoo import timm, zero_shot
+from advsearch.models.zoo import features, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
 from advsearch.models.zoo.loaded import Loaded
 from advsearch.models.zoo.processors import processor_of
@@ -31,7 +31,7 @@ class Kind:
     Args:
         ours: whether a network is of it, by the name of its architecture (``DeiTForImageClassificationWithTeacher``)
             and the network or its class.
-        loader: the class of transformers that builds it.
+        loader: the class of transformers that builds it; "" for the architecture itself.
         source: makes the model's source of it.
     """
 
@@ -81,10 +81,10 @@ def load(spec: str) -> Source:
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
-        network, found = getattr(transformers, kind.loader).from_pretrained(
+        network, found = getattr(transformers, kind.loader or architecture).from_pretrained(
             name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
         )
-        _check_whole(found, spec)
+        _check_whole(network, found, spec)
         processor = processor_of(transformers, name, where)
     part = partial(_part, transformers, spec, name, where)
     return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part))
@@ -129,7 +129,8 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForSemanticSegmentation or ForObjectDetection in it, or one that compares pictures with texts, as CLIPModel. "
+        "ForSemanticSegmentation or ForObjectDetection in it, one that compares pictures with texts, as CLIPModel, or "
+        "one that has features, as Dinov2Model. "
         "Wrap another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
     )
 
@@ -166,10 +167,15 @@ def _near_folders(name: str) -> str:
     return f" (did you mean {' or '.join(near)}?)" if near else ""
 
 
-def _check_whole(told: Any, spec: str) -> None:
-    """Raise a ModelError where weights are not in the file: they would be random, and others at each load."""
+def _check_whole(network: Any, told: Any, spec: str) -> None:
+    """Raise a ModelError where weights are not in the file: they would be random, and others at each load.
+
+    A pooler that was never trained is left out: what it would read is the first token, and that is taken then.
+    """
     lacking = sorted({*told.get("missing_keys", ()), *(key for key, *_ in told.get("mismatched_keys", ()))})
-    if lacking:
+    if lacking and getattr(network, "pooler", None) and all(str(one).startswith("pooler.") for one in lacking):
+        network.pooler = None
+    elif lacking:
         shown = ", ".join(map(str, lacking[:3])) + (", ..." if len(lacking) > 3 else "")
         raise ModelError(
             f"model {spec}: its files lack {len(lacking)} of the network's weights ({shown}), which would be random. "
@@ -239,7 +245,7 @@ KINDS = (
     Kind(
         _called("ForImageClassification"),
         "AutoModelForImageClassification",
-        _with_names(_Classifier),
+        features.also(_with_names(_Classifier)),
     ),
     Kind(
         _called("ForSemanticSegmentation"),
@@ -251,6 +257,11 @@ KINDS = (
         "AutoModelForObjectDetection",
         _with_names(_Detector),
     ),
-    Kind(lambda architecture, network: zero_shot.compares(network), "AutoModel", zero_shot.source),
+    Kind(
+        lambda architecture, network: zero_shot.compares(network),
+        "AutoModel",
+        features.also(zero_shot.source, reads_text=True),
+    ),
+    Kind(features.answers_with_features, "", features.source),
 )
 """Every kind that is read, the particular ones first."""

@@ -39,11 +39,7 @@ def source(loaded: Loaded) -> Source:
         ModelError: it takes patches in place of pictures.
     """
     network = loaded.network
-    if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
-        raise ModelError(
-            f"model {loaded.spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a "
-            "checkpoint of a fixed resolution, such as hf:google/siglip2-base-patch16-224"
-        )
+    check_takes_pictures(network, loaded.spec)
     tokenizer, described = loaded.part("AutoTokenizer"), loaded.described
     side = getattr(getattr(network.config, "vision_config", None), "image_size", None)
     if "input_size" not in described and isinstance(side, int):
@@ -51,6 +47,15 @@ def source(loaded: Loaded) -> Source:
     return Source(
         network, loaded.name, finish=partial(_named, network, tokenizer, loaded.name, described), reads_text=True
     )
+
+
+def check_takes_pictures(network: Any, spec: str) -> None:
+    """Raise a ModelError for a network that takes patches in place of pictures; `spec` is for the message."""
+    if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
+        raise ModelError(
+            f"model {spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a "
+            "checkpoint of a fixed resolution, such as hf:google/siglip2-base-patch16-224"
+        )
 
 
 def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
