@@ -82,9 +82,10 @@ RULES = {
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
     "explanations": Rule({"attacks", "recipes", "config", "settings"}, {"numpy", "scipy"}, HEAVY),
     "recipes": Rule({"attacks", "runs", "report", "config", "settings"}, {"matplotlib", "pydantic"}, HEAVY),
+    "losses": Rule({"attacks", "engine"}, {"torch"}),
     "api": Rule(None),
     "cli": Rule(None),
-    "": Rule({"api", "engine", "models"}, set()),
+    "": Rule({"api", "engine", "losses", "models"}, set()),
 }
 """As in docs/design.md, "Rooms, and who may know whom". The empty name is `advsearch/__init__.py`."""
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from torch import Tensor
+
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.options import JOINED, check_options
+from advsearch.options import JOINED, check_options, told
 from advsearch.registry import Registry
 from advsearch.tasks.answers import FreeAnswer
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
+from advsearch.tasks.own import own_task
 from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.similarity import Similarity
 from advsearch.tasks.together import Together
@@ -26,13 +29,13 @@ TASKS: Registry[type[Task]] = Registry(
 """Every task that has a name."""
 
 
-AnyTask = str | Mapping[str, object] | Task
-"""A task: its name, a mapping with its `name` and options, or the task itself."""
+AnyTask = str | Mapping[str, object] | Task | Callable[[Any, Facts], Tensor]
+"""A task: its name, a mapping with its `name` and options, the task itself, or a function `judge(output, truth)`."""
 
 
 def make_task(task: AnyTask) -> Task:
-    """Return the task of that name, of that `name` with these options, which are its dataclass's fields, or the task
-    itself.
+    """Return the task of that name, of that `name` with these options, which are its dataclass's fields, the task
+    itself, or that of a function (`advsearch.tasks.own.own_task`).
 
     Of several tasks at once, "detection+depth", the options of each stand under its name.
 
@@ -42,6 +45,10 @@ def make_task(task: AnyTask) -> Task:
     """
     if isinstance(task, Task):
         return task
+    if callable(task) and not isinstance(task, type):
+        return own_task(task)
+    if not isinstance(task, (str, Mapping)):
+        raise InputError(f"task: expected a name, a mapping with a `name`, a Task or a function, got {told(task)}")
     given = {"name": task} if isinstance(task, str) else task
     name, options = str(given.get("name", Classification.name)), {key: given[key] for key in given if key != "name"}
     if JOINED in name:

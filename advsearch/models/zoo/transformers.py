@@ -11,16 +11,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.errors import ModelError, resembling
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
-from advsearch.models.zoo import depth_maps, features, language, mask_queries, timm, zero_shot
+from advsearch.models.zoo import depth_maps, features, language, mask_queries, open_vocabulary, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
-from advsearch.models.zoo.loaded import Loaded
+from advsearch.models.zoo.loaded import Loaded, in_pixels
 from advsearch.models.zoo.memory import check_fits
 from advsearch.models.zoo.processors import processor_of
 
@@ -51,8 +50,7 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `KINDS`.
 
-    One that compares pictures with texts (`zero_shot`), or goes on in words (`language`), gets its classes from its
-    user.
+    One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`, `language`).
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
     image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
@@ -226,10 +224,7 @@ class _Detector(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         answer = self.network(pixel_values=images)
-        height, width = images.shape[2:]
-        middle, size = answer.pred_boxes.split(2, dim=-1)
-        corners = torch.cat([middle - size / 2, middle + size / 2], dim=-1)
-        boxes = corners * corners.new_tensor([width, height, width, height])
+        boxes = in_pixels(answer.pred_boxes, images)
         if answer.logits.shape[-1] > self.classes:
             return boxes, answer.logits.softmax(dim=-1)[..., :-1]
         return boxes, answer.logits.sigmoid()
@@ -260,6 +255,11 @@ KINDS = (
         mask_queries.is_ours,
         "AutoModelForUniversalSegmentation",
         lambda loaded: mask_queries.source(loaded, names_of(loaded.network.config) or None),
+    ),
+    Kind(
+        lambda architecture, network: open_vocabulary.finds(architecture),
+        "AutoModelForZeroShotObjectDetection",
+        open_vocabulary.source,
     ),
     Kind(
         _called("ForObjectDetection"),
