@@ -40,6 +40,8 @@ from advsearch.engine.loading import (
     settings_of,
 )
 from advsearch.engine.memory import Memory
+from advsearch.engine.metrics import Metric, Metrics, check_shared, load_metrics, metrics_as_settings
+from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
     OF_SCENE,
     AnyModel,
@@ -95,6 +97,7 @@ def attack(
     objective: str | Callable[..., Tensor] | None = None,
     policy: str | Mapping[str, object] | Policy[Any] = "auto",
     over: Controls = (),
+    metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
@@ -117,6 +120,8 @@ def attack(
             task's own.
         policy: a name, a mapping with a `name` and options, or an instance.
         over: controls that vary by chance: the answer has to hold for all of their values.
+        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
+            truth) that return a number, or a dict of some. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory only.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
@@ -146,6 +151,7 @@ def attack(
         "objective": _own_name(objective) if callable(objective) else objective,
         "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
         "set": _set_by(scene, settings.get("exposure")),
+        "metrics": metrics_as_settings(metrics or {}),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     parts = [f"the model {model_name(one)}" for one in several(model) if exists_here(one)]
@@ -154,6 +160,9 @@ def attack(
     parts += [f"the objective {config.objective}"] if callable(objective) else []
     parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, _policy_of) else []
     parts += [f"the control {name}" for name in (*only_here(controls), *only_here(over))]
+    parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
+    if config.workers is not None or config.cluster is not None:
+        check_shared(config.metrics)
     config = config.with_only_here(parts)
     if config.is_matrix and config.ensemble is None:
         raise InputError(
@@ -173,7 +182,8 @@ def attack(
     stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
     with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
         loaded = _model(model, config, asked)
-        job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None)
+        measured = load_metrics(config.metrics, metrics)
+        job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
         if folder is None:
             return _carry_out(job, progress or NullProgress())
         return _go_on(job, folder, progress or NullProgress())
@@ -326,6 +336,7 @@ class _Job:
     objective: str | Callable[..., Tensor]
     policy: str | Policy[Any]
     keep: bool
+    metrics: Metrics = field(default_factory=dict)
     clean: CleanMatrix = field(default_factory=CleanMatrix)
 
 
@@ -339,7 +350,8 @@ def _job(config: AttackConfig) -> _Job:
     given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given, camera=config.camera)
     model = _model(config.model, config, task)
-    return _Job(config, scene, model, task, searched, drawn, objective, policy, True)
+    metrics = load_metrics(config.metrics)
+    return _Job(config, scene, model, task, searched, drawn, objective, policy, True, metrics)
 
 
 def _given(config: AttackConfig, scene: Scene, model: Model) -> _Job:
@@ -452,6 +464,7 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
         searched=len(job.controls),
         printable=config.printable,
         aovs=aovs_of(config.aov),
+        metrics=job.metrics,
     )
     problem.draws = search_size(config, problem)[1]
     return problem
@@ -509,7 +522,10 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
         if kept is not None:
-            check_made_of(kept, [job.loaded[0]], {"objective": job.objective if callable(job.objective) else None})
+            own = {"objective": job.objective if callable(job.objective) else None}
+            check_made_of(
+                kept, [job.loaded[0]], {**own, **{f"metric {name}": one for name, one in job.metrics.items()}}
+            )
         memory = Memory(kept)
         with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
             recorder = Recorder(kept, problem, memory, Ahead(executor))

@@ -20,6 +20,8 @@ from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.budget import verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, only_here, settings_of
+from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
+from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
     AnyModel,
     check_not_of_scene,
@@ -78,6 +80,7 @@ def sweep(
     samples: int | None = None,
     controls: Controls = (),
     answer_of: str | Path | AttackResult | None = None,
+    metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
     progress: Progress | None = None,
     **settings: Unpack[SweepKeywords],
@@ -98,6 +101,8 @@ def sweep(
         answer_of: an attack that was kept, or its folder, whose answer is swept beside the clean scene, under the same
             draws; `summary.beside` compares the two. Where neither `grid` nor `controls` is given, what the attack was
             over varies.
+        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
+            truth) that return a number, or a dict of some. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
         progress: told how far it is.
 
@@ -124,6 +129,7 @@ def sweep(
         "grid": dict(grid or {}),
         "samples": samples,
         "answer_of": _folder(answer_of),
+        "metrics": metrics_as_settings(metrics or {}),
     }
     loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
     if loaded:
@@ -135,7 +141,10 @@ def sweep(
     parts = [f"the model {model_name(one)}" for one in networks if exists_here(one)]
     parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
+    parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
     config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
+    if config.workers is not None or config.cluster is not None:
+        check_shared(config.metrics)
     if config.keep_pictures != "none" and config.run is None:
         raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
     if config.aov is not None and config.run is None:
@@ -151,6 +160,7 @@ def sweep(
     asked = task if isinstance(task, Task) else config.task
     with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as folder:
         job = _job(config, loaded or _places(config), several(networks), asked, controls)
+        job = replace(job, metrics=load_metrics(config.metrics, metrics))
         if config.run is not None:
             return _kept(config, job, progress, folder)
         with _executor(config, progress) as executor:
@@ -253,7 +263,8 @@ def _described(places: Sequence[NamedScene]) -> dict[str, object]:
 
 def job_of(config: SweepConfig) -> Job:
     """Find and load everything that a configuration names."""
-    return _job(config, _places(config), config.models, config.task, config.controls)
+    job = _job(config, _places(config), config.models, config.task, config.controls)
+    return replace(job, metrics=load_metrics(config.metrics))
 
 
 def _job(
@@ -356,7 +367,7 @@ def _stopped(config: SweepConfig) -> Path | None:
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
     with RunDirectory.of(config, resumed) as run, _executor(config, progress) as executor:
-        check_made_of(run, job.models)
+        check_made_of(run, job.models, {f"metric {name}": one for name, one in job.metrics.items()})
         return carry_out(job, run, progress, executor)
 
 

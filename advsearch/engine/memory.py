@@ -236,7 +236,9 @@ def _evaluation(entry: Entry) -> Evaluation:
         cost=facts.cost,
         judgement=None
         if told is None
-        else Judgement(told.score, told.margin, told.right, Answer(**vars(told.answer)), told.payload),
+        else Judgement(
+            told.score, told.margin, told.right, Answer(**vars(told.answer)), told.payload, metrics=told.metrics
+        ),
     )
 
 

@@ -34,14 +34,15 @@ def scene_settings(fixed: Given | None, exposure: float | None) -> Given:
     return given
 
 
-def code_of(models: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
+def code_of(models: Iterable[str], kinds: Iterable[str], metrics: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the Python code that is imported for what is named: "package.module:attribute".
 
     Args:
         models: as `load_model` takes them.
         kinds: of the controls.
+        metrics: as settings name them.
     """
-    code = [named_code(name) for name in models]
+    code = [*(named_code(name) for name in models), *metrics]
     code += [name for name in kinds if CONTROLS.names_class(name)]
     return tuple(dict.fromkeys(name for name in code if name))
 

@@ -23,7 +23,6 @@ from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.searches import UNPRINTED
 from advsearch.engine.transport import remark
-from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
 from advsearch.report.studies import search_axes
@@ -98,7 +97,8 @@ class AttackResult:
             the summary names; its `clean` has what the model says of it.
         adversarial: the same of `u`.
         artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w, 3) sRGB in [0, 1].
-        search: the search's own log and claim.
+        search: the search's own log and claim; None where nothing was searched, and of a run that was loaded.
+        in_memory: the rows, where there is no run directory.
     """
 
     summary: AttackSummary
@@ -108,6 +108,7 @@ class AttackResult:
     adversarial: Tensor
     artifacts: dict[str, Tensor]
     search: SearchResult | None
+    in_memory: tuple[store.Row, ...] = ()
 
     @property
     def found(self) -> bool:
@@ -115,21 +116,18 @@ class AttackResult:
         return self.summary.ending == Ending.FOUND.value
 
     def rows(self, kind: str | None = None) -> Iterator[store.Row]:
-        """Yield every evaluated configuration, or those of one kind ("search", "verification", ...), in order.
-
-        Raises:
-            InputError: the run was not kept, so that nothing but the answer is there.
-        """
+        """Yield every evaluated configuration, or those of one kind ("search", "verification", ...), in order."""
         if self.run is None:
-            raise InputError("rows: expected a run that was kept, got none; give the attack a `run` to keep it in")
+            yield from (row for row in self.in_memory if kind in (None, row.kind))
+            return
         with store.Store(self.run / store.NAME, read_only=True) as results:
             yield from results.rows(kind)
 
     def to_pandas(self, kind: str | None = None) -> Any:
-        """Return these rows as a `pandas.DataFrame`; columns as in an export (docs/runs.md).
+        """Return these rows as a `pandas.DataFrame`: columns as in an export (docs/runs.md), units in its `attrs`.
 
         Raises:
-            InputError: the run was not kept, or pandas is not installed.
+            InputError: pandas is not installed.
         """
         return to_pandas(self.rows(kind))
 
@@ -140,7 +138,7 @@ class AttackResult:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        searched = [record.objective for record in self.search.history] if self.search else []
+        searched = [row.objective for row in self.rows("search") if row.phase != "ranking"]
         search_axes({self.summary.policy: searched}, self.summary.objective, axes)
         return axes
 
@@ -192,7 +190,14 @@ def summarise(
         if not findings.interrupted:
             run.finish()
     return AttackResult(
-        summary, None if run is None else run.path, u, clean.picture, adversarial.picture, artifacts, search
+        summary,
+        None if run is None else run.path,
+        u,
+        clean.picture,
+        adversarial.picture,
+        artifacts,
+        search,
+        tuple(recorder.rows),
     )
 
 

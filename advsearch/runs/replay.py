@@ -47,6 +47,7 @@ class LoggedJudgement(Fields):
     right: bool
     answer: ClassAnswer
     payload: Payload = None
+    metrics: dict[str, float | None] | None = None
 
 
 class LoggedEvaluation(Fields):
