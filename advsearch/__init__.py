@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from advsearch.api.explain import explain as explain
     from advsearch.api.gap import gap as gap
     from advsearch.api.harden import harden as harden
+    from advsearch.api.model import load_model as load_model
     from advsearch.api.photos import photo_agreement as photo_agreement
     from advsearch.api.plan import plan as plan
     from advsearch.api.precision import precision as precision
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from advsearch.engine.outcome import AttackResult as AttackResult
     from advsearch.engine.sweeps.answer import SweepResult as SweepResult
     from advsearch.models import Model as Model
-    from advsearch.models import load_model as load_model
 
 __version__ = "0.1.0"
 
@@ -48,7 +48,7 @@ _HOMES = {
     "explain": "advsearch.api.explain",
     "gap": "advsearch.api.gap",
     "harden": "advsearch.api.harden",
-    "load_model": "advsearch.models",
+    "load_model": "advsearch.api.model",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.api.photos",
     "plan": "advsearch.api.plan",

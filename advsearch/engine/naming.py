@@ -59,7 +59,7 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
     threads.configure(config.used_threads)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(load_model(one, labels=config.labels, prompt=config.prompt, read=task.reader) for one in models)
+        loaded = tuple(load_model(one, labels=config.labels, prompt=config.prompt, task=task) for one in models)
     sentences = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
     for one in caught:
         if not issubclass(one.category, ModelWarning):

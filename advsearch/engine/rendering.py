@@ -223,7 +223,7 @@ def render(
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     made = make_task(task)
-    model = load_model(model, read=made.reader)
+    model = load_model(model, task=made)
     asked = made.on(model)
     instances = as_controls(controls)
     if around is not None and any(_turns(one) for one in instances):

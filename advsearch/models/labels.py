@@ -245,19 +245,31 @@ def labels_origin(given: object) -> str:
     return f"label file {given}" if is_file else "labels"
 
 
-def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...]:
-    """Return the texts that a name is put into, ``{}`` in its place, from a list or a text with | between them.
+def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
+    """Return the texts that a model is given beside a picture, from a list or a text with | between them.
+
+    Raises:
+        InputError: one is no text, or empty.
+    """
+    if given is None:
+        return None
+    listed = [part.strip() for part in given.split("|")] if isinstance(given, str) else list(given)
+    for one in listed or [""]:
+        if not isinstance(one, str) or not one:
+            raise InputError(f"prompt: expected a text, such as {PROMPT!r}, got {one!r}")
+    return tuple(listed)
+
+
+def patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
+    """Return the texts that a name is put into, ``{}`` in its place; one of our own for None.
 
     Raises:
         InputError: one has no ``{}``.
     """
-    if given is None:
-        return (PROMPT,)
-    listed = [part.strip() for part in given.split("|")] if isinstance(given, str) else list(given)
-    for one in listed or [""]:
-        if not isinstance(one, str) or "{}" not in one:
+    for one in prompts or ():
+        if "{}" not in one:
             raise InputError(f"prompt: expected a text with {{}} where the name goes, such as {PROMPT!r}, got {one!r}")
-    return tuple(listed)
+    return prompts or (PROMPT,)
 
 
 def sets_of(classes: int) -> list[str]:

@@ -18,7 +18,7 @@ from advsearch.models.labels import fitting_labels, labels_origin, names_in, rea
 from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
-from advsearch.models.source import Source, source_of
+from advsearch.models.source import Purpose, Source, source_of
 from advsearch.models.switches import called_under, plainly, turned_by_code
 from advsearch.models.zoo import timm, torchvision, transformers
 from advsearch.registry import Registry
@@ -54,6 +54,7 @@ def load_model(
     layout: str | None = None,
     channels: str | None = None,
     max_batch: int | None = None,
+    task: Any = None,
     read: Read | None = None,
 ) -> Model:
     """Load a model, look at its answers once, and return it as a function from images to logits.
@@ -78,7 +79,9 @@ def load_model(
         channels: ``"RGB"`` (default) or ``"BGR"``.
         max_batch: the most images at once; default 64, or what the program allows.
         read: what finds the output in the network's answer to so many images, where it is not logits: a tensor (N, ...)
-            or a list of N things. A task that is not classification has one (`Task.reader`).
+            or a list of N things.
+        task: what the model is to do, as in `attack`: its name ("detection"), a mapping with its name and options, or
+            the task itself. It says how answers are read. Default: classification, unless there is `read`.
 
     Raises:
         UnknownNameError: `spec` is a name that means nothing; near matches are given.
@@ -99,9 +102,10 @@ def load_model(
         "max_batch": max_batch,
     }
     given = {key: value for key, value in options.items() if value is not None}
+    loaded = _loaded(spec, given, labels, prompt, name, max_batch, task, read)
     if isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None:
-        return dataclasses.replace(_loaded(spec, given, labels, prompt, name, max_batch, read), asked=os.fspath(spec))
-    return _loaded(spec, given, labels, prompt, name, max_batch, read)
+        return dataclasses.replace(loaded, asked=os.fspath(spec))
+    return loaded
 
 
 def _loaded(
@@ -111,21 +115,18 @@ def _loaded(
     prompt: str | Sequence[str] | None,
     name: str | None,
     max_batch: int | None,
+    task: Any,
     read: Read | None,
 ) -> Model:
+    read = read or (task and task.reader)
     names, origin = None if labels is None else read_labels(labels), labels_origin(labels)
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
     found = _find(spec)
     switches = turned_by_code()
-    if isinstance(found, Source) and found.of_names:
-        if names is None:
-            raise InputError(
-                f"model {found.name} compares a picture with texts and has no classes of its own: name them, two at "
-                "least, such as `labels=mug,cup,bowl` or `labels=imagenet`"
-            )
-        found = found.of_names(names, prompts)
-    elif prompt is not None:
+    if prompts is not None and not (isinstance(found, Source) and found.reads_text):
         raise InputError(f"prompt: model {found.name} has classes of its own and reads no text; leave `prompt` out")
+    if isinstance(found, Source) and found.finish is not None:
+        found = found.finish(Purpose(task.name if task else "classification", names, prompts))
     if isinstance(found, Source) and isinstance(found.module, nn.Module):
         called_under(found.module, switches)
     if isinstance(found, Model):

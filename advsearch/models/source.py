@@ -15,12 +15,44 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import nn
 
-from advsearch.errors import FileFormatError, ModelError
+from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.files import open_regular
 from advsearch.models.archive import LARGEST
 from advsearch.models.model import CPU, ModelWarning
 from advsearch.models.preprocessing import Triple
 from advsearch.models.probe import first_line
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What a network is to be asked.
+
+    Args:
+        task: by name.
+        names: of the classes, as the user gave them; None if they did not.
+        prompts: the texts that the user gave; None if they gave none.
+    """
+
+    task: str = "classification"
+    names: tuple[str, ...] | None = None
+    prompts: tuple[str, ...] | None = None
+
+    def named(self, model: str, what: str) -> tuple[str, ...]:
+        """Return the names, for a network that has no classes of its own.
+
+        Args:
+            model: for messages.
+            what: it does, such as "compares a picture with texts".
+
+        Raises:
+            InputError: there are none.
+        """
+        if self.names is None:
+            raise InputError(
+                f"model {model} {what} and has no classes of its own: name them, two at least, such as "
+                "`labels=mug,cup,bowl` or `labels=imagenet`"
+            )
+        return self.names
 
 
 @dataclass(frozen=True)
@@ -34,8 +66,8 @@ class Source:
         batch_limits: (fewest, most) images at once.
         dtype: floating type of the input.
         device: where its weights are.
-        of_names: of a network that compares pictures with texts and has no classes of its own: makes a classifier of
-            the names and the prompts that they stand in.
+        finish: of a network that is built for what it is asked: makes its source. None where the network is ready.
+        reads_text: whether it is given texts beside the picture.
     """
 
     module: Callable[[torch.Tensor], Any]
@@ -49,7 +81,8 @@ class Source:
     batch_limits: tuple[int, int] = (1, 64)
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
-    of_names: Callable[[tuple[str, ...], tuple[str, ...]], Source] | None = None
+    finish: Callable[[Purpose], Source] | None = None
+    reads_text: bool = False
 
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:

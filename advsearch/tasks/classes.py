@@ -62,7 +62,7 @@ class ClassTask(Task):
     def _other_reader(self) -> str:
         if self.reads_logits:
             return "expected logits, and it was loaded for another task; leave `read` out"
-        return f"it was loaded for its logits; load it with read={type(self).__name__}().reader"
+        return f'it was loaded for its logits; load it with task="{self.name}"'
 
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
         """The names of the classes that a model answers with, and whether they are names."""

@@ -198,7 +198,7 @@ def test_a_network_from_python_brings_its_tokenizer(tmp_path: Path) -> None:
     made = transformers.CLIPModel(transformers.CLIPConfig(vision_config=SIZES, text_config=SIZES))
     with pytest.warns(ModelWarning, match=r"reads 'mug' \(#0\) and 'mug' \(#2\) as the same text"):
         load_model(network, labels=["mug", "cup", "mug", "bowl"])
-    with pytest.raises(ModelError, match="Load it with from_pretrained, from where its tokenizer"):
+    with pytest.raises(ModelError, match="Give a repository, or a folder, in which it is beside the network"):
         load_model(made, labels=NAMES)
 
 
@@ -210,7 +210,7 @@ WRONG: dict[str, tuple[dict[str, Any], type[AdvsearchError], str]] = {
     "an empty name": ({"labels": "mug,,cup"}, InputError, "labels: expected a name .* for class 1, got ''"),
     "no place": ({"labels": NAMES, "prompt": "a photo"}, InputError, "prompt: expected a text with {} where the name"),
     "one no place": ({"labels": NAMES, "prompt": "a {}|b"}, InputError, "prompt: expected a text .* got 'b'"),
-    "no prompt": ({"labels": NAMES, "prompt": []}, InputError, "prompt: expected a text with {}"),
+    "no prompt": ({"labels": NAMES, "prompt": []}, InputError, "prompt: expected a text, such as"),
     "too long": ({"labels": NAMES, "prompt": "a {}" + " a" * 12}, InputError, "at most 12 tokens, got 16: 'a mug a a"),
 }
 

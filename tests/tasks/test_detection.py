@@ -355,7 +355,7 @@ def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
     assert Detection().on(load_model(replace(model, labels=()), labels=NAMES)).labels == NAMES, "named afterwards"
     with pytest.raises(InputError, match="labels: 2 labels, but model Pixels has 3 classes"):
         Detection().on(replace(model, labels=("a", "b")))
-    with pytest.raises(InputError, match=r"loaded for its logits; load it with read=Detection\(\).reader"):
+    with pytest.raises(InputError, match='loaded for its logits; load it with task="detection"'):
         Detection().on(replace(model, read=None))
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import sys
-import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,27 +16,38 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.errors import ModelError
-from advsearch.models.model import ModelWarning
-from advsearch.models.source import Source, source_of
+from advsearch.models.source import Source
 from advsearch.models.zoo import timm, zero_shot
 from advsearch.models.zoo.library import library, reading
-from advsearch.models.zoo.processors import Measured, measured, processor_of
+from advsearch.models.zoo.loaded import Loaded
+from advsearch.models.zoo.processors import processor_of
 
-KINDS = {
-    "ForImageClassification": "AutoModelForImageClassification",
-    "ForSemanticSegmentation": "AutoModelForSemanticSegmentation",
-    "ForObjectDetection": "AutoModelForObjectDetection",
-}
-"""What the name of an architecture has in it, as ``DeiTForImageClassificationWithTeacher``, and what builds it."""
-COMPARES = "compares pictures with texts"
-"""The kind of an architecture such as ``CLIPModel``."""
-TIMM = "timm_wrapper"
-"""The kind of a repository of timm."""
+
+@dataclass(frozen=True)
+class Kind:
+    """Networks of transformers that are loaded and asked alike.
+
+    Args:
+        ours: whether a network is of it, by the name of its architecture (``DeiTForImageClassificationWithTeacher``)
+            and the network or its class.
+        loader: the class of transformers that builds it.
+        source: makes the model's source of it.
+    """
+
+    ours: Callable[[str, Any], bool]
+    loader: str
+    source: Callable[[Loaded], Source]
+
+
+def _called(part: str) -> Callable[[str, Any], bool]:
+    return lambda architecture, network: part in architecture
+
+
 ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has made as 'hf:FOLDER'"
 
 
 def load(spec: str) -> Source:
-    """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network that classifies, segments or finds objects.
+    """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `KINDS`.
 
     One that compares pictures with texts gets its classes from its user (`zero_shot`).
 
@@ -62,28 +74,18 @@ def load(spec: str) -> Source:
     with reading(spec, ADVICE):
         _check_not_open_clips(transformers, name, spec, where)
         told, _ = transformers.PretrainedConfig.get_config_dict(name, **where)
-        if told.get("model_type") == TIMM:
+        if told.get("model_type") == "timm_wrapper":
             return timm.load_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
-        maker = getattr(transformers, KINDS.get(kind, "AutoModel"))
-        network, found = maker.from_pretrained(
+        network, found = getattr(transformers, kind.loader).from_pretrained(
             name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
         )
         _check_whole(found, spec)
         processor = processor_of(transformers, name, where)
-        described = Measured() if processor is None else measured(processor, spec)
-        tokenizer = None if kind in KINDS else _tokenizer(transformers, name, where)
-    if processor is None:
-        warnings.warn(_UNPREPARED.format(spec=spec), ModelWarning, stacklevel=3)
-    return _source(network, kind, name.rstrip("/").rpartition("/")[2], described, tokenizer)
-
-
-_UNPREPARED = (
-    "model {spec} comes without an image processor: pictures are given as they are, RGB in [0, 1]. Say `mean`, `std` "
-    "and `input_size` of load_model if it wants them otherwise"
-)
+    part = partial(_part, transformers, spec, name, where)
+    return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part))
 
 
 def of_network(network: nn.Module) -> Source | None:
@@ -99,60 +101,35 @@ def of_network(network: nn.Module) -> Source | None:
         return None
     spec = type(network).__name__
     kind, origin = _kind(spec, network, spec), str(getattr(network, "name_or_path", "") or "")
-    described = tokenizer = None
+    where, processor = {"local_files_only": True}, None
     if origin:
-        try:
-            with reading(spec, ""):
-                processor = processor_of(transformers, origin, {"local_files_only": True})
-                described = None if processor is None else measured(processor, spec)
-        except ModelError:  # it is not there any more: said below
-            described = None
-    if kind not in KINDS:
-        with reading(spec, "Load it with from_pretrained, from where its tokenizer is beside it"):
-            tokenizer = _tokenizer(transformers, origin, {"local_files_only": True})
-    if described is None:
-        warnings.warn(_UNPREPARED.format(spec=spec), ModelWarning, stacklevel=4)
-    return _source(network, kind, spec, described or Measured(), tokenizer)
+        with suppress(ModelError), reading(spec, ""):  # it may not be there any more
+            processor = processor_of(transformers, origin, where)
+    return kind.source(Loaded(network, spec, spec, processor, partial(_part, transformers, spec, origin, where)))
 
 
-def _tokenizer(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
-    return transformers.AutoTokenizer.from_pretrained(name, trust_remote_code=False, **where)
+def _part(transformers: Any, spec: str, name: str, where: Mapping[str, Any], loader: str) -> Any:
+    """Return another part of a repository or a folder, see `Loaded.part`."""
+    with reading(spec, "Give a repository, or a folder, in which it is beside the network"):
+        return getattr(transformers, loader).from_pretrained(name, trust_remote_code=False, **where)
 
 
-def _source(network: Any, kind: str, name: str, described: Measured, tokenizer: Any) -> Source:
-    if kind == COMPARES:
-        return zero_shot.unnamed(network, tokenizer, name, described)
-    labels = getattr(network.config, "id2label", None) or {}
-    names = tuple(str(labels[key]) for key in sorted(labels, key=int))
-    if all(re.fullmatch(r"LABEL_\d+", one) for one in names):  # what transformers puts where there are no names
-        names = ()
-    made: dict[str, Callable[[], nn.Module]] = {
-        "ForImageClassification": lambda: _Classifier(network),
-        "ForSemanticSegmentation": lambda: _Segmenter(network),
-        "ForObjectDetection": lambda: _Detector(network, len(labels)),
-    }
-    return source_of(made[kind](), name, labels=names or None, **described)
-
-
-def _kind(architecture: str, network: Any, spec: str) -> str:
-    """Return which of `KINDS` an architecture is of, or `COMPARES`; a ModelError says what it is otherwise.
+def _kind(architecture: str, network: Any, spec: str) -> Kind:
+    """Return which of `KINDS` an architecture is of; a ModelError says what it is otherwise.
 
     Args:
         architecture: by name.
         network: of it, or its class.
         spec: the model, for messages.
     """
-    kind = next((kind for kind in KINDS if kind in architecture), None)
-    if kind is None and zero_shot.compares(network):
-        zero_shot.check_size_fixed(network, spec)
-        return COMPARES
-    if kind is None:
-        raise ModelError(
-            f"model {spec}: is a {architecture}; expected one of {', '.join(KINDS)}, or one that compares "
-            "pictures with texts, as CLIPModel. Wrap another in an "
-            "nn.Module whose answer a task can judge, your own too, and give that from Python"
-        )
-    return kind
+    for kind in KINDS:
+        if kind.ours(architecture, network):
+            return kind
+    raise ModelError(
+        f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
+        "ForSemanticSegmentation or ForObjectDetection in it, or one that compares pictures with texts, as CLIPModel. "
+        "Wrap another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
+    )
 
 
 def _check_not_open_clips(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> None:
@@ -174,6 +151,13 @@ def _check_whole(told: Any, spec: str) -> None:
             f"model {spec}: its files lack {len(lacking)} of the network's weights ({shown}), which would be random. "
             "Give a repository that was trained for this, not one of its beginnings"
         )
+
+
+def names_of(config: Any) -> tuple[str, ...]:
+    """Return the names of the classes in a network's ``config``; none where transformers only numbers them."""
+    labels = getattr(config, "id2label", None) or {}
+    names = tuple(str(labels[key]) for key in sorted(labels, key=int))
+    return () if all(re.fullmatch(r"LABEL_\d+", one) for one in names) else names
 
 
 class _Classifier(nn.Module):
@@ -202,9 +186,9 @@ class _Detector(nn.Module):
     each class by itself.
     """
 
-    def __init__(self, network: nn.Module, classes: int) -> None:
+    def __init__(self, network: Any) -> None:
         super().__init__()
-        self.network, self.classes = network, classes
+        self.network, self.classes = network, len(network.config.id2label)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         answer = self.network(pixel_values=images)
@@ -215,3 +199,29 @@ class _Detector(nn.Module):
         if answer.logits.shape[-1] > self.classes:
             return boxes, answer.logits.softmax(dim=-1)[..., :-1]
         return boxes, answer.logits.sigmoid()
+
+
+def _with_names(make: Callable[[Any], nn.Module]) -> Callable[[Loaded], Source]:
+    """Return what makes the source of a network whose ``config`` has the names of its classes."""
+    return lambda loaded: loaded.source(make(loaded.network), labels=names_of(loaded.network.config) or None)
+
+
+KINDS = (
+    Kind(
+        _called("ForImageClassification"),
+        "AutoModelForImageClassification",
+        _with_names(_Classifier),
+    ),
+    Kind(
+        _called("ForSemanticSegmentation"),
+        "AutoModelForSemanticSegmentation",
+        _with_names(_Segmenter),
+    ),
+    Kind(
+        _called("ForObjectDetection"),
+        "AutoModelForObjectDetection",
+        _with_names(_Detector),
+    ),
+    Kind(lambda architecture, network: zero_shot.compares(network), "AutoModel", zero_shot.source),
+)
+"""Every kind that is read, the particular ones first."""

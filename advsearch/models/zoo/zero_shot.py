@@ -13,9 +13,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.errors import InputError, ModelError
+from advsearch.models.labels import patterns
 from advsearch.models.model import ModelWarning
 from advsearch.models.probe import first_line
-from advsearch.models.source import Source, sharing_copy, source_of
+from advsearch.models.source import Purpose, Source, sharing_copy, source_of
+from advsearch.models.zoo.loaded import Loaded
 from advsearch.models.zoo.processors import Measured
 
 TEXTS = 64
@@ -30,38 +32,35 @@ def compares(network: Any) -> bool:
     return all(hasattr(network, f"get_{half}_features") for half in ("image", "text"))
 
 
-def check_size_fixed(network: Any, spec: str) -> None:
-    """Raise a ModelError where a network, or the class of one, takes patches in place of pictures."""
+def source(loaded: Loaded) -> Source:
+    """Return the source of a network that becomes a classifier when names are there.
+
+    Raises:
+        ModelError: it takes patches in place of pictures.
+    """
+    network = loaded.network
     if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
         raise ModelError(
-            f"model {spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a checkpoint of "
-            "a fixed resolution, such as hf:google/siglip2-base-patch16-224"
+            f"model {loaded.spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a "
+            "checkpoint of a fixed resolution, such as hf:google/siglip2-base-patch16-224"
         )
-
-
-def unnamed(network: Any, tokenizer: Any, name: str, described: Measured) -> Source:
-    """Return the source of a network that becomes a classifier when names are there (`Source.of_names`).
-
-    Args:
-        network: of transformers, which `compares`.
-        tokenizer: of its texts.
-        name: what to call it.
-        described: what is done to pictures.
-    """
+    tokenizer, described = loaded.part("AutoTokenizer"), loaded.described
     side = getattr(getattr(network.config, "vision_config", None), "image_size", None)
     if "input_size" not in described and isinstance(side, int):
         described = Measured(**{**described, "input_size": (side, side)})
-    return Source(network, name, of_names=partial(_named, network, tokenizer, name, described))
+    return Source(
+        network, loaded.name, finish=partial(_named, network, tokenizer, loaded.name, described), reads_text=True
+    )
 
 
-def _named(
-    network: Any, tokenizer: Any, name: str, described: Measured, names: tuple[str, ...], prompts: tuple[str, ...]
-) -> Source:
+def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
     """Return the classifier of these names.
 
     The weights of a name are its texts: one of each prompt, embedded, normalised, averaged, and normalised again
     (Radford et al. 2021, arXiv 2103.00020, section 3.1.4).
     """
+    names = purpose.named(name, "compares a picture with texts")
+    prompts = patterns(purpose.prompts)
     if len(names) < 2:
         raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
     spoken, alone = _spoken(names), hasattr(network, "logit_bias")

@@ -1,0 +1,58 @@
+"""What has been loaded of a network of transformers, for whatever makes a model of it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from torch import nn
+
+from advsearch.models.model import ModelWarning
+from advsearch.models.source import Source, source_of
+from advsearch.models.zoo.processors import Measured, measured
+
+UNPREPARED = (
+    "model {spec} comes without an image processor: pictures are given as they are, RGB in [0, 1]. Say `mean`, `std` "
+    "and `input_size` of load_model if it wants them otherwise"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """A network of transformers, and what comes with it.
+
+    Args:
+        network: itself, a `PreTrainedModel`.
+        name: what to call it.
+        spec: what its user wrote, for messages.
+        processor: its image processor; None where it has none.
+        part: loads another part by the class of transformers that does it, such as "AutoTokenizer".
+    """
+
+    network: Any
+    name: str
+    spec: str
+    processor: Any
+    part: Callable[[str], Any]
+
+    @cached_property
+    def described(self) -> Measured:
+        """What is done to pictures.
+
+        Raises:
+            ModelError: see `measured`.
+
+        Warns:
+            ModelWarning: it has no image processor.
+        """
+        if self.processor is None:
+            warnings.warn(UNPREPARED.format(spec=self.spec), ModelWarning, stacklevel=4)
+            return Measured()
+        return measured(self.processor, self.spec)
+
+    def source(self, module: nn.Module, **fields: Any) -> Source:
+        """Return the source of a module that is given pictures as the network wants them; `fields` go to `Source`."""
+        return source_of(module, self.name, **{**self.described, **fields})
