@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from advsearch.api.explain import explain as explain
     from advsearch.api.gap import gap as gap
     from advsearch.api.harden import harden as harden
+    from advsearch.api.load_run import load_run as load_run
     from advsearch.api.model import load_model as load_model
     from advsearch.api.photos import photo_agreement as photo_agreement
     from advsearch.api.plan import plan as plan
@@ -50,6 +51,7 @@ _HOMES = {
     "harden": "advsearch.api.harden",
     "load_model": "advsearch.api.model",
     "load_scene": "advsearch.engine.loading",
+    "load_run": "advsearch.api.load_run",
     "photo_agreement": "advsearch.api.photos",
     "plan": "advsearch.api.plan",
     "precision": "advsearch.api.precision",

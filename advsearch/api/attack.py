@@ -13,6 +13,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.keywords import AttackKeywords, asks
+from advsearch.api.watching import Watched, told
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.attacks.policies import POLICIES
@@ -54,7 +55,7 @@ from advsearch.engine.naming import (
     several,
 )
 from advsearch.engine.objective import Wanted, objective_for, task_for
-from advsearch.engine.outcome import AttackResult, Question, summarise
+from advsearch.engine.outcome import Asked, AttackResult, Question, summarise
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
@@ -68,7 +69,8 @@ from advsearch.models.ensemble import together
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.wording import count
-from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
+from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
+from advsearch.runs.directory import only_here as only_python_has
 from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.scene.description import SceneDescription
@@ -100,7 +102,7 @@ def attack(
     metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[AttackKeywords],
 ) -> AttackResult:
     """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
@@ -125,7 +127,7 @@ def attack(
         run: folder to keep the run in; None keeps it in memory only.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
@@ -185,8 +187,8 @@ def attack(
         measured = load_metrics(config.metrics, metrics)
         job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
         if folder is None:
-            return _carry_out(job, progress or NullProgress())
-        return _go_on(job, folder, progress or NullProgress())
+            return _carry_out(job, told(progress))
+        return _go_on(job, folder, told(progress))
 
 
 def attack_from_config(
@@ -240,6 +242,32 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
         denoise: another denoiser than the configuration's.
     """
     job = _job(AttackConfig.of(config, denoise=denoise or config.denoise))
+    problem = _problem(job)
+    return problem, [*job.loaded[1], *sentences(problem.space.moved)]
+
+
+def asked_in(run: Path) -> Asked:
+    """Find and load everything that the run of an attack was asked with, as its answer is judged.
+
+    Raises:
+        InputError: only the Python session that asked has what judges it.
+    """
+    if needed := [one for one in only_python_has(run) if not one.startswith(("the objective", "the policy"))]:
+        raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its answer")
+    return _job(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
+
+
+def problem_asked(asked: Asked, **changes: object) -> tuple[Problem, list[str]]:
+    """Return the problem that an attack was asked with, and warnings on the way.
+
+    Args:
+        asked: as a result has it.
+        **changes: settings that are different; of another `model`, its name.
+    """
+    assert isinstance(asked, _Job)
+    config = asked.config.model_copy(update=changes)
+    model = _model(config.model, config, asked.task) if "model" in changes else (asked.loaded[0], [*asked.loaded[1]])
+    job = replace(asked, config=config, loaded=model)
     problem = _problem(job)
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
@@ -522,10 +550,9 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
         if kept is not None:
-            own = {"objective": job.objective if callable(job.objective) else None}
-            check_made_of(
-                kept, [job.loaded[0]], {**own, **{f"metric {name}": one for name, one in job.metrics.items()}}
-            )
+            functions = {f"metric {name}": one for name, one in job.metrics.items()}
+            objective = {"objective": job.objective} if callable(job.objective) else {}
+            check_made_of(kept, [job.loaded[0]], {**functions, **objective})
         memory = Memory(kept)
         with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
             recorder = Recorder(kept, problem, memory, Ahead(executor))
@@ -537,7 +564,9 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
                 )
             spent = (budget, policy, recorder, memory, stages, preparation_of(job.config))
             findings = Attack(problem, *spent, clean=job.clean).carry_out()
-        return summarise(_question(job), problem, findings, recorder, stages, warnings)
+        found = summarise(_question(job), problem, findings, recorder, stages, warnings)
+        asked = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
+        return replace(found, asked=lambda: asked)
 
 
 def announced_of(settings: JsonObject) -> Call:

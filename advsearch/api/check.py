@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import CheckKeywords, asks, configured
+from advsearch.api.watching import Watched, told
 from advsearch.config import CheckConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.gradients import (
@@ -84,7 +85,7 @@ def check(
     object: str | Path = "mug",
     model: str | Path = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[CheckKeywords],
 ) -> CheckResult:
     """Compare the gradient of every parameter of a scene with differences (docs/gradients.md).
@@ -94,13 +95,13 @@ def check(
     Args:
         object: the name of an object, or a file of one.
         model: the network under test, as `advsearch check` takes it.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(CheckConfig, object=object, model=model, **settings)
-    return check_from_config(config, progress=progress)
+    return check_from_config(config, progress=told(progress))
 
 
 def check_from_config(

@@ -20,6 +20,7 @@ from advsearch import seeds
 from advsearch.api.keywords import ExplainKeywords, asks, configured
 from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
+from advsearch.api.watching import Watched, told
 from advsearch.attacks import clopper_pearson
 from advsearch.config import ExplainConfig, SweepConfig
 from advsearch.config.explain import FEWEST_ROWS
@@ -65,7 +66,7 @@ if TYPE_CHECKING:
 def explain(
     sweeps: str | Path | Sequence[str | Path],
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[ExplainKeywords],
 ) -> ExplainResult:
     """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
@@ -75,12 +76,12 @@ def explain(
     Args:
         sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
             recipe, its sweeps.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=progress)
+    return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=told(progress))
 
 
 def explain_from_config(

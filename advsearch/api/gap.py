@@ -15,6 +15,7 @@ from advsearch import seeds
 from advsearch.api.attack import LOADING, attack_once, check_from_config, executor_for, problem_from_config
 from advsearch.api.keywords import GapKeywords, asks, configured
 from advsearch.api.parts import SETTLED, StudyAttack, chains_of, share
+from advsearch.api.watching import Watched, told
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cluster.executor import Call
@@ -53,7 +54,7 @@ def gap(
     object: str | Path,
     model: str | Path = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[GapKeywords],
 ) -> GapTable:
     """Compare the worst configuration with the average, for each object and each control (docs/questions.md).
@@ -63,13 +64,13 @@ def gap(
     Args:
         object: names of objects, or files of them, separated by commas.
         model: the network under test, as `advsearch gap` takes it.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(GapConfig, object=object, model=model, **settings)
-    return gap_from_config(config, progress=progress)
+    return gap_from_config(config, progress=told(progress))
 
 
 def curve_from_config(

@@ -29,6 +29,7 @@ from advsearch.api.harden_scenes import (
     splits_of,
 )
 from advsearch.api.keywords import HardenKeywords, asks, configured
+from advsearch.api.watching import Watched, told
 from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.config import HardenConfig
@@ -74,7 +75,7 @@ def harden(
     optimiser: MakeOptimiser | None = None,
     beside: Examples | None = None,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[HardenKeywords],
 ) -> HardenResult:
     """Train a copy of a model on its worst cases, and prove what it is better at (docs/harden.md).
@@ -90,7 +91,7 @@ def harden(
             (N,). One is taken with each step.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
@@ -100,7 +101,7 @@ def harden(
     config = configured(HardenConfig, model=model_name(model), **settings)
     path = run_path(config.run) if resume and config.run is not None else None
     resumed = path if path is not None and is_run(path) else None
-    return _carry_out(config, model, optimiser, beside, progress or NullProgress(), resumed)
+    return _carry_out(config, model, optimiser, beside, told(progress), resumed)
 
 
 def harden_from_config(

@@ -15,6 +15,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar
 
+from advsearch.api.watching import watched
 from advsearch.engine.loading import Controls, instances_in, lending, lent_controls, only_here, settings_of
 from advsearch.engine.naming import check_not_spread
 from advsearch.engine.turn import in_turn
@@ -295,10 +296,12 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                 signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
-            kept = ("scene", "model", "beside")
+            kept = ("scene", "model", "beside", "progress", "metrics")
             plain = {key: one if key in kept or not is_shallow(one) else as_python(one) for key, one in given.items()}
             with ExitStack() as stack:
                 stack.enter_context(in_turn())
+                if "progress" in own.parameters:
+                    plain["progress"] = stack.enter_context(watched(plain.get("progress")))
                 for key in {"controls", "over"} & plain.keys() - own.parameters.keys():
                     if instances_in(plain[key]):
                         if only_here(plain[key]):

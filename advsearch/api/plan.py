@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import PlanKeywords, asks, configured
+from advsearch.api.watching import Watched, told
 from advsearch.config import PlanConfig
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
@@ -45,7 +46,7 @@ def plan(
     object: str | Path = "mug",
     model: str | Path = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[PlanKeywords],
 ) -> PlanResult:
     """Choose how every derivative of a search is obtained and what is left out, by measurement (docs/gradients.md).
@@ -55,13 +56,13 @@ def plan(
     Args:
         object: the name of an object, or a file of one.
         model: the network under test, as `advsearch plan` takes it.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(PlanConfig, object=object, model=model, **settings)
-    return plan_from_config(config, progress=progress)
+    return plan_from_config(config, progress=told(progress))
 
 
 def plan_from_config(

@@ -17,6 +17,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, executor_for, problem_from_config
 from advsearch.api.keywords import PrecisionKeywords, asks, configured
+from advsearch.api.watching import Watched, told
 from advsearch.attacks import Policy, make_policy
 from advsearch.cluster.executor import Call, Executor
 from advsearch.config import PrecisionConfig
@@ -71,7 +72,7 @@ def precision(
     object: str | Path = "mug",
     model: str | Path = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[PrecisionKeywords],
 ) -> PrecisionResult:
     """Measure error against run time of a scene, its gradients and searches over it (docs/precision.md).
@@ -81,13 +82,13 @@ def precision(
     Args:
         object: the name of an object, or a file of one.
         model: the network under test, as `advsearch precision` takes it.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(PrecisionConfig, object=object, model=model, **settings)
-    return precision_from_config(config, progress=progress)
+    return precision_from_config(config, progress=told(progress))
 
 
 def precision_from_config(

@@ -17,6 +17,7 @@ from advsearch.api.keywords import RecipeKeywords, asks, configured
 from advsearch.api.photos import Photographs, photographs_in
 from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
+from advsearch.api.watching import Watched, told
 from advsearch.config import AttackConfig, RecipeConfig, SweepConfig
 from advsearch.config.named import name_in
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
@@ -57,19 +58,19 @@ NOTE = "recipe"
 
 
 @asks(RecipeConfig, RecipeKeywords)
-def recipe(recipe: str | Path, *, progress: Progress | None = None, **settings: Unpack[RecipeKeywords]) -> RecipeResult:
+def recipe(recipe: str | Path, *, progress: Watched = None, **settings: Unpack[RecipeKeywords]) -> RecipeResult:
     """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
 
     All other arguments are the settings of `advsearch recipe`. The run is kept, in `run` or under runs/.
 
     Args:
         recipe: the name of a bundled recipe, or a YAML file.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=progress)
+    return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=told(progress))
 
 
 def recipe_from_config(

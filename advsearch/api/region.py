@@ -13,6 +13,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import RegionKeywords, asks, configured
+from advsearch.api.watching import Watched, told
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
@@ -61,7 +62,7 @@ def region(
     object: str | Path,
     model: str | Path = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[RegionKeywords],
 ) -> RegionResult:
     """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md).
@@ -71,13 +72,13 @@ def region(
     Args:
         object: the name of an object, or a file of one.
         model: the network under test, as `advsearch region` takes it.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(RegionConfig, object=object, model=model, **settings)
-    return region_from_config(config, progress=progress)
+    return region_from_config(config, progress=told(progress))
 
 
 def region_from_config(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.api.keywords import StabilityKeywords, asks, configured
+from advsearch.api.watching import Watched, told
 from advsearch.config import StabilityConfig
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
@@ -21,18 +22,18 @@ if TYPE_CHECKING:
 
 
 @asks(StabilityConfig, StabilityKeywords)
-def stability(*, progress: Progress | None = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
+def stability(*, progress: Watched = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
     """Try extreme scenes, objectives and arithmetic, and say whether each of them holds (docs/stability.md).
 
     All other arguments are the settings of `advsearch stability`. The run is kept, in `run` or under runs/.
 
     Args:
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return stability_from_config(configured(StabilityConfig, **settings), progress=progress)
+    return stability_from_config(configured(StabilityConfig, **settings), progress=told(progress))
 
 
 def stability_from_config(

@@ -12,6 +12,7 @@ import torch
 
 from advsearch.api.attack import LOADING, is_named
 from advsearch.api.keywords import SweepKeywords, asks
+from advsearch.api.watching import Watched, told
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, SweepConfig
@@ -82,7 +83,7 @@ def sweep(
     answer_of: str | Path | AttackResult | None = None,
     metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[SweepKeywords],
 ) -> SweepResult:
     """Render every configuration of a grid, and draws by chance, and say how often the model is right.
@@ -104,7 +105,7 @@ def sweep(
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
             truth) that return a number, or a dict of some. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
@@ -151,7 +152,7 @@ def sweep(
         raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
-    progress = progress or NullProgress()
+    progress = told(progress)
     if loaded or only_here(controls) or not all(isinstance(one, (str, Path)) for one in networks):
         check_not_spread(options)
     resumed = _stopped(config)

@@ -10,12 +10,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import final
 
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.switches import plainly
 from advsearch.scene import settings
-from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
+from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -28,6 +32,7 @@ from advsearch.scene.description import (
 )
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.motion import Motion
+from advsearch.scene.importing.images import read_picture
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
@@ -37,6 +42,9 @@ from advsearch.settings import as_python
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 """One control or several, by name or instance; a mapping gives each name its settings, and ``mitsuba:KEY`` a range."""
+
+Texture = str | Path | npt.ArrayLike | Tensor
+"""A picture to paint an object with, see `load_scene`."""
 
 DEFAULT_RESOLUTION = 128
 
@@ -103,6 +111,17 @@ class Scene:
         fixed = "".join(f", {name}={value!r}" for name, value in sorted(described.given_values.items()))
         return f"Scene({described.object_name!r}, {described.environment_name!r}{fixed})"
 
+    def with_texture(self, texture: Texture) -> Scene:
+        """Return the scene with another texture of the object; see `load_scene`.
+
+        Raises:
+            FileFormatError: the file is no picture.
+            InputError: it is no (h, w, 3) picture in [0, 1].
+        """
+        own = self.description
+        painted = replace(own.object, base_color=_texels(texture))
+        return Scene(replace(own, object=painted), only_here=True)
+
     def with_settings(self, given: Given) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
 
@@ -146,6 +165,7 @@ def load_scene(
     up: str | None = None,
     settings: Given | None = None,
     camera: str | None = None,
+    texture: Texture | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -158,6 +178,8 @@ def load_scene(
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
         camera: name of a camera of a scene file; "orbit" or None for the one around the object.
+        texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
+            top; `result.artifacts["texture"]`, say.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
@@ -174,7 +196,24 @@ def load_scene(
     only_here = isinstance(scene, Mapping) or not all(
         one is None or isinstance(one, (str, Path)) for one in (object, environment)
     )
-    return Scene(described if camera is None else described.seen_by(camera), only_here)
+    loaded = Scene(described if camera is None else described.seen_by(camera), only_here)
+    return loaded if texture is None else loaded.with_texture(texture)
+
+
+def _texels(texture: Texture) -> Floats:
+    """A texture as an object has it: (h, w, 3) float32 sRGB in [0, 1]."""
+    if isinstance(texture, (str, Path)):
+        return read_picture(Path(texture), None)
+    given = np.asarray(texture.detach().cpu() if isinstance(texture, Tensor) else texture)
+    texels: Floats = given.astype(np.float32) / (255.0 if given.dtype == np.uint8 else 1.0)
+    if texels.ndim != 3 or texels.shape[2] != 3 or not texels.size:
+        raise InputError(f"texture: expected a picture (h, w, 3), got an array of shape {given.shape}")
+    if not (np.isfinite(texels).all() and texels.min() >= 0.0 and texels.max() <= 1.0):
+        raise InputError(
+            f"texture: expected sRGB in [0, 1], or 8 bits as uint8, got {given.dtype} from {given.min():g} to "
+            f"{given.max():g}"
+        )
+    return np.ascontiguousarray(texels)
 
 
 def named_camera(description: SceneDescription) -> str | None:

@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
-from advsearch.controls import Control, compose
+from advsearch.controls import Control, Space, compose
 from advsearch.controls.clean import sentences
 from advsearch.described import Value
-from advsearch.engine.loading import Controls, Scene, as_controls, framed, load_scene, make_renderer
+from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
 from advsearch.models.switches import plainly
@@ -191,12 +191,14 @@ def render(
     label: str | None = None,
     controls: Controls = (),
     around: int | None = None,
+    texture: Texture | None = None,
     resolution: int | tuple[int, int] | None = None,
     spp: int = PICTURE_SPP,
     denoise: str = "oidn",
     sampler: str = SAMPLER,
     seed: int = 0,
     aov: bool = False,
+    at: Tensor | None = None,
     progress: Progress | None = None,
 ) -> Rendering:
     """Render a scene and ask the model what it sees.
@@ -209,12 +211,14 @@ def render(
         controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
             a range stays where a search would start.
         around: number of views, from azimuths all around the object; None for one, from the scene's own camera.
+        texture: of the object in place of its own, as `load_scene` takes it.
         resolution: side, or (height, width), in pixels; None for what the model takes.
         spp: samples a pixel.
         denoise: "oidn" or "none".
         sampler: "multijitter" or "independent".
         seed: root of the noise.
         aov: keep what is seen in each pixel, for `Rendering.save_aov`.
+        at: (d,) in [0, 1], the configuration of `controls` in place of their start: `result.u`, say.
         progress: told how far it is.
 
     Raises:
@@ -222,6 +226,7 @@ def render(
             control.
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    scene = scene if texture is None else scene.with_texture(texture)
     made = make_task(task)
     model = load_model(model, task=made)
     asked = made.on(model)
@@ -240,12 +245,13 @@ def render(
         space = compose(instances, description)
         renderer = make_renderer(description, space, size, denoise, seed, sampler=sampler)
         formation = renderer.formation  # the same for all, exposure included
+        u = space.start if at is None else _configuration(at, space)
         with torch.no_grad():
-            radiance = renderer.radiance(space.start, seeds.stream(seed, "pictures"), spp)
-            picture = to_8_bit(space.picture(space.start, formation.display(radiance)))
+            radiance = renderer.radiance(u, seeds.stream(seed, "pictures"), spp)
+            picture = to_8_bit(space.picture(u, formation.display(radiance)))
             output, truth = model(picture), None
             if asked.varies:
-                facts = _facts(description, label, partial(renderer.surfaces, space.start), space.describe(space.start))
+                facts = _facts(description, label, partial(renderer.surfaces, u), space.describe(u))
                 try:
                     truth = asked.truth(facts)
                 except InputError as error:
@@ -255,7 +261,7 @@ def render(
             marks = () if truth is None else tuple(asked.marks(output, truth)[0])
         remarks = remarks or asked.remarks
         azimuth = description.number("camera.azimuth")
-        surfaces = renderer.surfaces(space.start) if aov else None
+        surfaces = renderer.surfaces(u) if aov else None
         views.append(View(azimuth, picture, radiance * formation.gain, answers, marks, surfaces, output, truth))
         progress.advance(1)
     assert formation is not None
@@ -263,6 +269,16 @@ def render(
     warnings = (*(space.scene or own).notes, *sentences(space.moved), *untold, *remarks)
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
+
+
+def _configuration(at: Tensor, space: Space) -> Tensor:
+    """A configuration that was given for a space."""
+    u = torch.as_tensor(at, dtype=torch.float32)
+    if u.shape != space.start.shape:
+        raise InputError(
+            f"at: expected ({len(space.start)},) numbers, as `controls` have in this scene, got {tuple(u.shape)}"
+        )
+    return u
 
 
 def _facts(

@@ -495,6 +495,6 @@ def _values(text: str) -> dict[str, Value] | None:
 
 def _metrics(text: str) -> dict[str, float | None] | None:
     """Return the metrics of a row, None where they are not numbers by name."""
-    found = _values(text)
+    found: Any = _values(text)
     numbers = found is not None and all(one is None or type(one) in (int, float) for one in found.values())
-    return found if numbers else None  # type: ignore[return-value]
+    return dict(found) if numbers else None

@@ -699,8 +699,8 @@ def filled(run: RunDirectory) -> Store:
 
 
 COLUMNS = [
-    "id", "kind", "step", "phase", "seed", "spp", "objective", "score", "success", "correct", "margin", "label", "label_index",
-    "probability", "payload",
+    "id", "kind", "step", "phase", "seed", "spp", "objective", "score", "success", "correct", "margin",
+    "label", "label_index", "probability", "payload",
     "pose.yaw [degrees]", "camera.target[0] [sizes]", "camera.target[1] [sizes]", "backdrop.which",
     "renders", "machine", "seconds", "time",
 ]  # fmt: skip
