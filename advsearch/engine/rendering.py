@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked
 from advsearch.report.phrases import seen_text
 from advsearch.runs.files import placed_by
-from advsearch.runs.images import write_exr, write_layers, write_png
+from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
@@ -39,7 +39,7 @@ MOST_ANSWERS = 5
 """Answers of the model that are kept of a picture."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class View:
     """A scene from one direction.
 
@@ -63,8 +63,12 @@ class View:
     output: Any = None
     truth: Any = None
 
+    def __repr__(self) -> str:
+        said = self.answers[0].label if self.answers else None
+        return f"View(azimuth={self.azimuth:g}, {said!r})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Rendering:
     """Pictures of a scene. Made by `render`.
 
@@ -104,9 +108,8 @@ class Rendering:
             if file.suffix.lower() == ".exr":
                 write_exr(file, self.views[0].linear)
                 return self.formation.resolution
-            sheet = self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
-            write_png(file, sheet)
-        return sheet.shape[0], sheet.shape[1]
+            write_png(file, self._shown)
+        return self._shown.shape[0], self._shown.shape[1]
 
     def save_aov(self, path: str | Path, aovs: Sequence[str]) -> Path:
         """Write ground truth of the view as layers of one EXR, whole or not at all, and return the path.
@@ -148,6 +151,20 @@ class Rendering:
         with placed_by("out"):
             write_png(file, contact_sheet(drawn, self._captions) if len(drawn) > 1 else drawn[0])
         return file
+
+    @cached_property
+    def _shown(self) -> Any:
+        """The picture, or the sheet of several views."""
+        return self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
+
+    def __repr__(self) -> str:
+        said = [view.answers[0].label if view.answers else None for view in self.views]
+        height, width = self.formation.resolution
+        of = f"{self.scene.object_name!r}, {self.scene.environment_name!r}, {self.model!r}"
+        return f"Rendering({of} says {', '.join(map(repr, said))}, {height} x {width} pixels)"
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(self._shown)
 
     @property
     def _captions(self) -> list[list[str]]:
