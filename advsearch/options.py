@@ -24,11 +24,16 @@ BY_KEY = "mitsuba"
 def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     """Return controls with ``{"mitsuba:KEY": RANGE}`` as ``{"mitsuba": {KEY: RANGE}}``, all keys together.
 
+    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``.
+
     Raises:
         InputError: a key has no range, or is given twice.
     """
     found, ranges = dict[str, object](), dict[str, object]()
     for name, given in controls.items():
+        _, dot, parameter = str(name).partition(".")
+        if dot and parameter and ":" not in parameter and not (given is None or isinstance(given, Mapping)):
+            given = {parameter: given}  # {"pose.yaw": [0, 90]}
         kind, colon, key = str(name).partition(":")
         if kind != BY_KEY or not colon:
             found[name] = given

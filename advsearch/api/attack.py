@@ -30,14 +30,16 @@ from advsearch.engine.answers import Described, Looked, check_truth, facts_of, s
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import (
+    SCENE,
     Controls,
     PictureSettings,
     Scene,
     framed,
+    lent,
     load_scene,
     make_renderer,
-    named_camera,
     only_here,
+    scene_as_settings,
     settings_of,
 )
 from advsearch.engine.memory import Memory
@@ -142,10 +144,7 @@ def attack(
         )
     scene = _scene(scene, object, settings)
     described = {
-        "object": scene.description.object_name,
-        "environment": scene.description.environment_name,
-        "up": scene.description.up,
-        "camera": named_camera(scene.description),
+        **scene_as_settings(scene),
         "model": ",".join(map(model_name, several(model))),
         "controls": settings_of(controls),
         "over": settings_of(over),
@@ -376,7 +375,9 @@ def _job(config: AttackConfig) -> _Job:
     task, objective = _asked(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **_policy_options(config))
     given = scene_settings(config.set_, config.exposure)
-    scene = load_scene(config.object, config.environment, up=config.up, settings=given, camera=config.camera)
+    scene = lent(SCENE, config.object) or load_scene(
+        config.object, config.environment, up=config.up, settings=given, camera=config.camera
+    )
     model = _model(config.model, config, task)
     metrics = load_metrics(config.metrics)
     return _Job(config, scene, model, task, searched, drawn, objective, policy, True, metrics)

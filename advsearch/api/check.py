@@ -30,8 +30,10 @@ from advsearch.engine.gradients import (
     smooth_loss,
     verdict,
 )
+from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
+from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import (
     CONVERGED,
     COUNTS,
@@ -82,8 +84,8 @@ IN_PARAMETERS = "one for each parameter; `resolution` or fewer controls shorten 
 
 @asks(CheckConfig, CheckKeywords)
 def check(
-    object: str | Path = "mug",
-    model: str | Path = "reference",
+    object: Scene | str | Path = "mug",
+    model: AnyModel = "reference",
     *,
     progress: Watched = None,
     **settings: Unpack[CheckKeywords],
@@ -93,8 +95,8 @@ def check(
     All other arguments are the settings of `advsearch check`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: the name of an object, or a file of one.
-        model: the network under test, as `advsearch check` takes it.
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
         progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:

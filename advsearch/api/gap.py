@@ -22,7 +22,8 @@ from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.ahead import Ahead, AheadAnswer, PictureAhead, seen_by
 from advsearch.engine.answers import one_label_for_several
-from advsearch.engine.naming import different, load_models
+from advsearch.engine.loading import Scene
+from advsearch.engine.naming import AnyModel, different, load_models
 from advsearch.engine.problem import Problem
 from advsearch.engine.transfer import Transfer
 from advsearch.engine.transport import CleanMatrix
@@ -51,8 +52,8 @@ if TYPE_CHECKING:
 
 @asks(GapConfig, GapKeywords)
 def gap(
-    object: str | Path,
-    model: str | Path = "reference",
+    object: Scene | str | Path,
+    model: AnyModel = "reference",
     *,
     progress: Watched = None,
     **settings: Unpack[GapKeywords],
@@ -62,8 +63,8 @@ def gap(
     All other arguments are the settings of `advsearch gap`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: names of objects, or files of them, separated by commas.
-        model: the network under test, as `advsearch gap` takes it.
+        object: from `load_scene`, or names of objects, or files of them, separated by commas.
+        model: from `load_model`, or what that takes.
         progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:

@@ -15,10 +15,25 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar
 
+from torch import nn
+
 from advsearch.api.watching import watched
-from advsearch.engine.loading import Controls, instances_in, lending, lent_controls, only_here, settings_of
-from advsearch.engine.naming import check_not_spread
+from advsearch.engine.loading import (
+    CONTROL,
+    MODEL,
+    SCENE,
+    Controls,
+    Scene,
+    all_lent,
+    instances_in,
+    lending,
+    only_here,
+    scene_as_settings,
+    settings_of,
+)
+from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, model_name
 from advsearch.engine.turn import in_turn
+from advsearch.models import Model
 from advsearch.settings import Config, as_python, is_shallow, settings
 
 Names = str | Sequence[str]
@@ -260,6 +275,9 @@ class StabilityKeywords(RunKeywords, total=False):
     seconds: float | None
 
 
+LOADED = (Scene, Model, nn.Module)
+"""What a question may be given in place of a name."""
+
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -293,7 +311,7 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
         @wraps(function)
         def asked(*args: Any, **given: Any) -> Any:
             try:
-                signature.bind(*args, **given)
+                bound = signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
             kept = ("scene", "model", "beside", "progress", "metrics")
@@ -306,8 +324,14 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                     if instances_in(plain[key]):
                         if only_here(plain[key]):
                             check_not_spread(plain)
-                        stack.enter_context(lending(plain[key]))
+                        stack.enter_context(lending(CONTROL, {one.name: one for one in instances_in(plain[key])}))
                         plain[key] = settings_of(plain[key])
+                if "object" in own.parameters and "scene" not in own.parameters:
+                    loaded = {name: one for name, one in bound.arguments.items() if isinstance(one, LOADED)}
+                    if loaded:
+                        check_not_spread(plain)
+                        args, plain = (), {**dict(zip(own.parameters, args, strict=False)), **plain}
+                        plain |= _named(loaded, plain, stack)
                 return function(*args, **plain)
 
         text = inspect.cleandoc(function.__doc__ or "")
@@ -322,4 +346,20 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
 def configured(config: type[Made], **given: object) -> Made:
     """Return a configuration of settings as Python has them; None is one that was not given."""
     made = config(**{name: value for name, value in given.items() if value is not None})
-    return made.with_only_here([f"the control {name}" for name in only_here(lent_controls())])
+    parts = [f"the model {model_name(one)}" for one in all_lent(MODEL) if exists_here(one)]
+    parts += ["the scene"] if any(one.only_here for one in all_lent(SCENE)) else []
+    return made.with_only_here([*parts, *(f"the control {name}" for name in only_here(all_lent(CONTROL)))])
+
+
+def _named(loaded: Mapping[str, Any], given: Mapping[str, Any], stack: ExitStack) -> dict[str, Any]:
+    """Lend a scene and a model that a question takes by name, and return the settings that name them."""
+    named: dict[str, Any] = {}
+    for one in loaded.values():
+        if isinstance(one, Scene):
+            check_not_of_scene({name: value for name, value in given.items() if name != "object"})
+            named |= {name: value for name, value in scene_as_settings(one).items() if value is not None}
+            stack.enter_context(lending(SCENE, {named["object"]: one}))
+        else:
+            named["model"] = model_name(one)
+            stack.enter_context(lending(MODEL, {named["model"]: one}))
+    return named

@@ -14,8 +14,10 @@ from advsearch.api.watching import Watched, told
 from advsearch.config import PlanConfig
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
+from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
+from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels
@@ -43,8 +45,8 @@ PlannedRow = CosineRow | PathLength | GainRow | TexelRow
 
 @asks(PlanConfig, PlanKeywords)
 def plan(
-    object: str | Path = "mug",
-    model: str | Path = "reference",
+    object: Scene | str | Path = "mug",
+    model: AnyModel = "reference",
     *,
     progress: Watched = None,
     **settings: Unpack[PlanKeywords],
@@ -54,8 +56,8 @@ def plan(
     All other arguments are the settings of `advsearch plan`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: the name of an object, or a file of one.
-        model: the network under test, as `advsearch plan` takes it.
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
         progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:

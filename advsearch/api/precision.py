@@ -22,8 +22,10 @@ from advsearch.attacks import Policy, make_policy
 from advsearch.cluster.executor import Call, Executor
 from advsearch.config import PrecisionConfig
 from advsearch.engine.gradients import Loss, inside, smooth_loss
+from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
+from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
@@ -69,8 +71,8 @@ IMAGE = "image"
 
 @asks(PrecisionConfig, PrecisionKeywords)
 def precision(
-    object: str | Path = "mug",
-    model: str | Path = "reference",
+    object: Scene | str | Path = "mug",
+    model: AnyModel = "reference",
     *,
     progress: Watched = None,
     **settings: Unpack[PrecisionKeywords],
@@ -80,8 +82,8 @@ def precision(
     All other arguments are the settings of `advsearch precision`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: the name of an object, or a file of one.
-        model: the network under test, as `advsearch precision` takes it.
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
         progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:

@@ -17,7 +17,9 @@ from advsearch.api.watching import Watched, told
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
+from advsearch.engine.loading import Scene
 from advsearch.engine.memory import Memory
+from advsearch.engine.naming import AnyModel
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.verifier import Verifier
@@ -59,8 +61,8 @@ class Varied:
 
 @asks(RegionConfig, RegionKeywords)
 def region(
-    object: str | Path,
-    model: str | Path = "reference",
+    object: Scene | str | Path,
+    model: AnyModel = "reference",
     *,
     progress: Watched = None,
     **settings: Unpack[RegionKeywords],
@@ -70,8 +72,8 @@ def region(
     All other arguments are the settings of `advsearch region`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: the name of an object, or a file of one.
-        model: the network under test, as `advsearch region` takes it.
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
         progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:

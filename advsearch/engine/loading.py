@@ -8,7 +8,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +45,9 @@ Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 
 Texture = str | Path | npt.ArrayLike | Tensor
 """A picture to paint an object with, see `load_scene`."""
+
+CONTROL, SCENE, MODEL = "control", "scene", "model"
+"""Kinds of things that may stand for a name (`lent`)."""
 
 DEFAULT_RESOLUTION = 128
 
@@ -216,6 +219,18 @@ def _texels(texture: Texture) -> Floats:
     return np.ascontiguousarray(texels)
 
 
+def scene_as_settings(scene: Scene) -> dict[str, Any]:
+    """Return the settings that say what a scene is, as far as settings can."""
+    described = scene.description
+    return {
+        "object": described.object_name,
+        "environment": described.environment_name,
+        "up": described.up,
+        "camera": named_camera(described),
+        "set": described.given_values,
+    }
+
+
 def named_camera(description: SceneDescription) -> str | None:
     """Return the camera of a scene file in use, as `load_scene` takes it; None for the one around the object."""
     return None if description.camera == ORBIT_CAMERA else description.camera
@@ -304,7 +319,7 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
         if len(set(names)) != len(names):
             raise InputError(f"controls: every instance needs a name of its own, got {', '.join(names)}")
         return ready + as_controls({one: {} for one in names})
-    return tuple(lent_control(name) or make_control(name, given) for name, given in gathered(controls).items())
+    return tuple(lent(CONTROL, name) or make_control(name, given) for name, given in gathered(controls).items())
 
 
 def instances_in(controls: object) -> list[Control]:
@@ -313,23 +328,28 @@ def instances_in(controls: object) -> list[Control]:
     return [one for one in listed if isinstance(one, Control)]
 
 
-_LENT: ContextVar[Mapping[str, Control]] = ContextVar("lent", default=MappingProxyType({}))
+_LENT: ContextVar[Mapping[tuple[str, str], Any]] = ContextVar("lent", default=MappingProxyType({}))
 
 
-def lent_control(name: str) -> Control | None:
-    """Return the instance that stands for the name of a control, if one does."""
-    return _LENT.get().get(name)
+def lent(kind: str, name: str) -> Any:
+    """Return what stands for a name where only names are told; None if nothing does.
+
+    Args:
+        kind: `CONTROL`, `SCENE` or `MODEL`.
+        name: as settings have it.
+    """
+    return _LENT.get().get((kind, name))
 
 
-def lent_controls() -> list[Control]:
-    """Return all of them."""
-    return list(_LENT.get().values())
+def all_lent(kind: str) -> list[Any]:
+    """Return everything of a kind that stands for a name."""
+    return [one for (of, _), one in _LENT.get().items() if of == kind]
 
 
 @contextmanager
-def lending(controls: Controls) -> Iterator[None]:
-    """Let the instances among controls be what their names stand for inside the block, where only names are told."""
-    token = _LENT.set({**_LENT.get(), **{one.name: one for one in instances_in(controls)}})
+def lending(kind: str, things: Mapping[str, Any]) -> Iterator[None]:
+    """Let things be what their names stand for inside the block, where only names are told; see `lent`."""
+    token = _LENT.set({**_LENT.get(), **{(kind, name): one for name, one in things.items()}})
     try:
         yield
     finally:

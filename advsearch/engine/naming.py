@@ -12,6 +12,7 @@ from torch import nn
 from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS
+from advsearch.engine.loading import MODEL, lent
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.loading import named_code
@@ -59,7 +60,9 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
     threads.configure(config.used_threads)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(load_model(one, labels=config.labels, prompt=config.prompt, task=task) for one in models)
+        loaded = tuple(
+            load_model(lent(MODEL, one) or one, labels=config.labels, prompt=config.prompt, task=task) for one in models
+        )
     sentences = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
     for one in caught:
         if not issubclass(one.category, ModelWarning):
