@@ -13,7 +13,6 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.keywords import AttackKeywords, asks
-from advsearch.api.watching import Watched, told
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.attacks.policies import POLICIES
@@ -69,7 +68,7 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.ensemble import together
 from advsearch.options import as_setting
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.directory import only_here as only_python_has

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import CheckKeywords, asks, configured
-from advsearch.api.watching import Watched, told
 from advsearch.config import CheckConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.gradients import (
@@ -45,7 +44,7 @@ from advsearch.engine.planning import (
 )
 from advsearch.engine.problem import Problem
 from advsearch.engine.run_settings import RunSettings
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.check import (
     WHOLE,

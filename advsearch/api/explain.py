@@ -20,7 +20,6 @@ from advsearch import seeds
 from advsearch.api.keywords import ExplainKeywords, asks, configured
 from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
-from advsearch.api.watching import Watched, told
 from advsearch.attacks import clopper_pearson
 from advsearch.config import ExplainConfig, SweepConfig
 from advsearch.config.explain import FEWEST_ROWS
@@ -35,7 +34,7 @@ from advsearch.explanations.renders import along, inside, lies_inside
 from advsearch.explanations.rules import CHANCE, Conditions, CountedRule, RuleCondition, covered, find_rules
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.recipes.table import Answered, rows_of
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, find_run
 from advsearch.runs.results.base import INTERRUPTED

@@ -15,7 +15,6 @@ from advsearch import seeds
 from advsearch.api.attack import LOADING, attack_once, check_from_config, executor_for, problem_from_config
 from advsearch.api.keywords import GapKeywords, asks, configured
 from advsearch.api.parts import SETTLED, StudyAttack, chains_of, share
-from advsearch.api.watching import Watched, told
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cluster.executor import Call
@@ -29,7 +28,7 @@ from advsearch.engine.transfer import Transfer
 from advsearch.engine.transport import CleanMatrix
 from advsearch.files import JsonObject
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.report.drawing import Figures
 from advsearch.report.studies import curve_figure, gap_figure, matrix_figure
 from advsearch.report.tables import CurveTable, GapTable

@@ -29,7 +29,6 @@ from advsearch.api.harden_scenes import (
     splits_of,
 )
 from advsearch.api.keywords import HardenKeywords, asks, configured
-from advsearch.api.watching import Watched, told
 from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.config import HardenConfig
@@ -46,7 +45,7 @@ from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
 from advsearch.models.imported import split_weights
 from advsearch.models.trainable import Trainable, trainable
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.report.hardening import hardened_figure
 from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes

@@ -278,6 +278,25 @@ class StabilityKeywords(RunKeywords, total=False):
 LOADED = (Scene, Model, nn.Module)
 """What a question may be given in place of a name."""
 
+
+class _Signature(inspect.Signature):
+    """A signature with all settings, for editors, which `help` writes without them: it lists them below.
+
+    Attributes:
+        short: the same with `**settings` in their place.
+    """
+
+    __slots__ = ("short",)
+    short: inspect.Signature
+
+    def __str__(self) -> str:
+        return str(self.short) if hasattr(self, "short") else super().__str__()
+
+    def format(self, **options: Any) -> str:
+        """See `inspect.Signature.format`, of Python 3.13."""
+        return str(getattr(self, "short", super()).format(**options))
+
+
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -306,7 +325,8 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                 continue
             added.append(inspect.Parameter(name, ONLY_BY_NAME, default=one.default, annotation=hints[name]))
             lines.append(textwrap.fill(f"{name}: {one.text}", 110, subsequent_indent="    "))
-        signature = own.replace(parameters=[*plain, *added])
+        signature = _Signature([*plain, *added], return_annotation=own.return_annotation)
+        signature.short = own
 
         @wraps(function)
         def asked(*args: Any, **given: Any) -> Any:

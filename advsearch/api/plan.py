@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import PlanKeywords, asks, configured
-from advsearch.api.watching import Watched, told
 from advsearch.config import PlanConfig
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
@@ -21,7 +20,7 @@ from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Formation

@@ -17,7 +17,6 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, executor_for, problem_from_config
 from advsearch.api.keywords import PrecisionKeywords, asks, configured
-from advsearch.api.watching import Watched, told
 from advsearch.attacks import Policy, make_policy
 from advsearch.cluster.executor import Call, Executor
 from advsearch.config import PrecisionConfig
@@ -39,7 +38,7 @@ from advsearch.evaluation.precision.report import MeasuredLine, Section, report_
 from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
 from advsearch.evaluation.precision.sharing import ReferencePart, shared_parts
 from advsearch.files import JsonObject
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes, write_text

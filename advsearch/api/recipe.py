@@ -17,14 +17,13 @@ from advsearch.api.keywords import RecipeKeywords, asks, configured
 from advsearch.api.photos import Photographs, photographs_in
 from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
-from advsearch.api.watching import Watched, told
 from advsearch.config import AttackConfig, RecipeConfig, SweepConfig
 from advsearch.config.named import name_in
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.recipes.columns import ANY, check_figures
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options

@@ -13,7 +13,6 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import RegionKeywords, asks, configured
-from advsearch.api.watching import Watched, told
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
@@ -25,7 +24,7 @@ from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.verifier import Verifier
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.report.studies import map_figure
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run

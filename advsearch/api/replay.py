@@ -14,7 +14,6 @@ import torch
 from advsearch import seeds
 from advsearch.api.attack import LOADING, asked_in, problem_asked
 from advsearch.api.keywords import ReplayKeywords, asks, configured
-from advsearch.api.watching import Watched, told
 from advsearch.config import ReplayConfig
 from advsearch.engine.naming import different
 from advsearch.engine.outcome import Asked, AttackResult
@@ -24,7 +23,7 @@ from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.engine.rows import control_group, verified_rate
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.results.attack import AttackSummary

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.api.keywords import StabilityKeywords, asks, configured
-from advsearch.api.watching import Watched, told
 from advsearch.config import StabilityConfig
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
 from advsearch.evaluation.stability.suite import chosen, run_cases
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.stability import CaseRow, StabilityResult
 

@@ -12,7 +12,6 @@ import torch
 
 from advsearch.api.attack import LOADING, is_named
 from advsearch.api.keywords import SweepKeywords, asks
-from advsearch.api.watching import Watched, told
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, SweepConfig
@@ -45,7 +44,7 @@ from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, told
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished

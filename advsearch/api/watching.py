@@ -8,17 +8,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import IO, TYPE_CHECKING
+from functools import wraps
+from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from advsearch.errors import InputError
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
     from rich.progress import TaskID
 
-Watched = Progress | bool | None
-"""Who is told how far a question is: True shows a bar, False and NullProgress nothing, None a bar on a terminal."""
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 PATIENCE = 2.0
 """Seconds after which a stage is announced where there is no terminal; a shorter one is not worth a line."""
@@ -61,9 +61,15 @@ def watched(asked: Watched) -> Iterator[Progress]:
         yield NullProgress()
 
 
-def told(watched: Watched) -> Progress:
-    """Return who is told, of a call that `watched` has answered: the progress itself."""
-    return NullProgress() if watched is None or isinstance(watched, bool) else watched
+def shows_progress(function: Function) -> Function:
+    """Let a function with a keyword `progress` be called with what `watched` takes."""
+
+    @wraps(function)
+    def shown(*args: Any, progress: Watched = None, **named: Any) -> Any:
+        with watched(progress) as watcher:
+            return function(*args, progress=watcher, **named)
+
+    return shown  # type: ignore[return-value]
 
 
 def in_notebook() -> bool:

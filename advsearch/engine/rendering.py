@@ -20,7 +20,7 @@ from advsearch.engine.loading import Controls, Scene, Texture, as_controls, fram
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
 from advsearch.models.switches import plainly
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import Watched, told
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked
 from advsearch.report.phrases import seen_text
@@ -216,7 +216,7 @@ def render(
     seed: int = 0,
     aov: bool = False,
     at: Tensor | None = None,
-    progress: Progress | None = None,
+    progress: Watched = None,
 ) -> Rendering:
     """Render a scene and ask the model what it sees.
 
@@ -236,7 +236,7 @@ def render(
         seed: root of the noise.
         aov: keep what is seen in each pixel, for `Rendering.save_aov`.
         at: (d,) in [0, 1], the configuration of `controls` in place of their start: `result.u`, say.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, a value is out of range, or the scene cannot take a
@@ -251,7 +251,7 @@ def render(
     if around is not None and any(_turns(one) for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
     size = as_python(resolution) or (model.input_size[0], model.input_size[1])
-    progress = progress or NullProgress()
+    progress = told(progress)
     progress.stage("rendering", around or 1)
     formation = None
     views = []
