@@ -287,14 +287,14 @@ class _Signature(inspect.Signature):
     """
 
     __slots__ = ("short",)
-    short: inspect.Signature
+    short: Any
 
     def __str__(self) -> str:
         return str(self.short) if hasattr(self, "short") else super().__str__()
 
     def format(self, **options: Any) -> str:
         """See `inspect.Signature.format`, of Python 3.13."""
-        return str(getattr(self, "short", super()).format(**options))
+        return str(self.short.format(**options))
 
 
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY

@@ -184,14 +184,12 @@ class NotebookProgress:
     """
 
     def __init__(self) -> None:
-        from IPython.display import display
-
         self._name, self._info, self._messages = "", "", list[str]()
         self._total: int | None = None
         self._at_most, self._done = False, 0
         self._begun = self._drawn = time.monotonic()
         self._ended = False
-        self._handle = display(self, display_id=True)
+        self._handle = sys.modules["IPython"].display.display(self, display_id=True)
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
         """See `Progress.stage`."""
