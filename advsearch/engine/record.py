@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from advsearch.engine.rows import judged, trial_row
 from advsearch.engine.transport import Predictor
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import Row
+from advsearch.runs.store import Row, Told
 from advsearch.tasks import Judgement
 
 MEASURED = ("centre", "region", "map")
@@ -166,7 +167,8 @@ class Recorder:
             phase=record.phase,
             machine=self._machine(),
         )
-        self._keep(row if evaluation.judgement is None else judged(row, evaluation.judgement))
+        row = row if evaluation.judgement is None else judged(row, evaluation.judgement)
+        self._keep(row, lambda: self._memory.told(kind, record.index, u, evaluation))
 
     def trial(
         self,
@@ -199,12 +201,12 @@ class Recorder:
         made = self._machine()
         self._keep(trial_row(kind, number, seed, spp, trial, told, sought=kind not in MEASURED, machine=made))
 
-    def _keep(self, row: Row) -> None:
-        """Store a row, or hold it where there is no store."""
+    def _keep(self, row: Row, told: Callable[[], Told] | None = None) -> None:
+        """Store a row, and what its evaluation told a search; hold the row where there is no store."""
         if self.run is None:
             self.rows.append(replace(row, id=len(self.rows) + 1, time=time.time()))
         else:
-            self.run.record(row)
+            self.run.record(row, told=None if told is None else told())
 
     def _machine(self) -> str | None:
         """The machine on which the picture of this row was made, if that is not like this one."""
