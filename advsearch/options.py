@@ -31,12 +31,11 @@ def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     """
     found, ranges = dict[str, object](), dict[str, object]()
     for name, given in controls.items():
-        _, dot, parameter = str(name).partition(".")
-        if dot and parameter and ":" not in parameter and not (given is None or isinstance(given, Mapping)):
-            given = {parameter: given}  # {"pose.yaw": [0, 90]}
         kind, colon, key = str(name).partition(":")
         if kind != BY_KEY or not colon:
-            found[name] = given
+            _, dot, parameter = str(name).partition(".")
+            alone = dot and ":" not in name and not (given is None or isinstance(given, Mapping))
+            found[name] = {parameter: given} if alone else given
         elif not key or given is None or given in ({}, ""):
             raise InputError(f"`controls` {name}: expected a range, as in {BY_KEY}:{key or 'KEY'}=[0.2, 0.8]")
         else:

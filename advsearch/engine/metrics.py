@@ -50,7 +50,7 @@ def _text(metric: Metric) -> str:
     found: Any = sys.modules.get(str(module))
     for part in str(name).split("."):
         found = getattr(found, part, None)
-    return f"{module}:{name}" if found is metric else str(name or type(metric).__name__)
+    return f"{module}:{name}" if found is metric else str(getattr(metric, "__name__", type(metric).__name__))
 
 
 def only_here(settings: Mapping[str, str]) -> list[str]:

@@ -95,8 +95,9 @@ def to_pandas(rows: Iterable[Row]) -> Any:
     pandas, listed = _pandas(), list(rows)
     names = {one: one.partition(" [")[0] for one in columns(listed)}
     units = {plain: one.removeprefix(f"{plain} [").removesuffix("]") for one, plain in names.items() if plain != one}
-    frame = pandas.DataFrame([record(row) for row in listed], columns=list(names)).rename(columns=names)
-    frame.attrs["units"] = units
+    records = [{names[name]: value for name, value in record(row).items()} for row in listed]
+    frame = pandas.DataFrame(records, columns=list(names.values()))
+    frame.attrs = {"units": units}
     return frame
 
 
