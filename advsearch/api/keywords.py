@@ -15,6 +15,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar
 
+import numpy as np
 from torch import nn
 
 from advsearch.api.watching import watched
@@ -60,7 +61,7 @@ class PictureKeywords(TypedDict, total=False):
     resolution: int | str | tuple[int, int] | None
     labels: Path | Names | None
     prompt: Names | None
-    label: int | Names | None
+    label: int | np.integer[Any] | Names | None
     texture_resolution: int | None
     denoise: Literal["oidn", "none"]
     pixel_sampler: Literal["independent", "multijitter"]
