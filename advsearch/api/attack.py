@@ -26,6 +26,7 @@ from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.ahead import Ahead, seen_by
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
+from advsearch.engine.attack_result import Asked, AttackResult
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import (
@@ -56,7 +57,7 @@ from advsearch.engine.naming import (
     several,
 )
 from advsearch.engine.objective import Wanted, objective_for, task_for
-from advsearch.engine.outcome import Asked, AttackResult, Question, summarise
+from advsearch.engine.outcome import Question, summarise
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.api.attack import asked_in
-from advsearch.engine.outcome import AttackResult
+from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.files import read_bytes
 from advsearch.report.tables import CurveTable, GapTable

@@ -15,8 +15,8 @@ from advsearch import seeds
 from advsearch.api.attack import LOADING, asked_in, problem_asked
 from advsearch.api.keywords import ReplayKeywords, asks, configured
 from advsearch.config import ReplayConfig
+from advsearch.engine.attack_result import Asked, AttackResult
 from advsearch.engine.naming import different
-from advsearch.engine.outcome import Asked, AttackResult
 from advsearch.engine.problem import Problem
 from advsearch.engine.replaying import OWN_LIGHT, Way, ways_of
 from advsearch.engine.retrial import RetrialCondition, Retrials

@@ -17,6 +17,7 @@ from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
 from advsearch.engine.answers import one_label_for_several, shown
+from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.budget import verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, only_here, settings_of
@@ -33,7 +34,6 @@ from advsearch.engine.naming import (
     scene_settings,
     several,
 )
-from advsearch.engine.outcome import AttackResult
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.api.watching import BarProgress, LineProgress, NotebookProgress, watched
 from advsearch.controls import PoseControl
-from advsearch.engine.outcome import AttackResult
+from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import NullProgress
