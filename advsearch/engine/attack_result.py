@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypedDict
@@ -107,7 +107,7 @@ class AttackResult:
         model: AnyModel | None = None,
         *,
         scene: Scene | str | Path | None = None,
-        camera: str | None = None,
+        camera: str | Mapping[str, float] | None = None,
         settings: Given | None = None,
         **options: Unpack[RenderKeywords],
     ) -> Rendering:
@@ -118,7 +118,7 @@ class AttackResult:
         Args:
             model: None for the attack's own.
             scene: another one with the same object; None for the attack's own.
-            camera: of the scene's cameras, as for `load_scene`.
+            camera: where it is seen from, ``{"azimuth": 130.0}``; or the name of one of the scene's cameras.
             settings: parameters of the scene to fix to other values, e.g. ``{"camera.azimuth": 130.0}``.
             **options: `resolution`, `spp`, `denoise`, `sampler`, `seed`, `around` and `aov`, as for `render`; by
                 default as in the attack.
@@ -134,6 +134,8 @@ class AttackResult:
         asked = self.asked()
         config = asked.config
         shown = asked.scene if scene is None else scene if isinstance(scene, Scene) else load_scene(scene)
+        if isinstance(camera, Mapping):
+            settings, camera = {**(settings or {}), **{f"camera.{name}": one for name, one in camera.items()}}, None
         if twice := sorted({*(settings or {})} & {*(self.summary.configuration or {})}):
             raise InputError(f"settings: the answer says what {twice[0]} is; leave it out")
         shown = shown.with_settings(settings) if settings else shown

@@ -6,7 +6,7 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from torch import Tensor
 
@@ -56,9 +56,6 @@ from advsearch.runs.results.base import Formation, MovedValue, VariedValue
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
 from advsearch.viewer.attack_page import write_report
-
-if TYPE_CHECKING:
-    pass
 
 T = TypeVar("T")
 

@@ -148,11 +148,22 @@ def test_an_answer_is_rendered_under_another_view(attacked: AttackResult, tmp_pa
     assert elsewhere.scene.environment_name == "noon" and elsewhere.views[0].picture.shape == (24, 24, 3)
     clean = advsearch.render("mug", Bright(), **plain)
     assert (clean.views[0].picture - same.views[0].picture).abs().max() > 4.0 / 255.0
+    above = attacked.render(camera={"elevation": 80.0}, spp=64).views[0].picture
+    assert (above - same.views[0].picture).abs().mean() > 0.01
     with pytest.raises(UnknownNameError, match="camera of the scene"):
         attacked.render(camera="none")
     other = pickle.loads(pickle.dumps(attacked))
     with pytest.raises(InputError, match=r"load_run\(FOLDER\) has it"):
         other.render()
+
+
+def test_an_answer_of_another_session_is_rendered_with_what_its_run_names(tmp_path: Path) -> None:
+    asked: dict[str, Any] = {**FAST, "resolution": 32, "steps": 1}
+    found = advsearch.attack("mug", controls="pose.yaw", policy="random", run=tmp_path / "run", **asked)
+    loaded = advsearch.load_run(tmp_path / "run")
+    assert isinstance(loaded, AttackResult)
+    one, other = (result.render(spp=4) for result in (found, loaded))
+    assert torch.equal(one.views[0].picture, other.views[0].picture) and one.model == other.model == "reference"
 
 
 def test_what_an_answer_says_is_not_set_beside_it(scene: advsearch.Scene, model: advsearch.Model) -> None:
