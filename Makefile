@@ -16,7 +16,7 @@ SOURCES := advsearch scenes tests benchmarks docs tools
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-quick test-slow fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
+.PHONY: help setup attack test test-quick test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -39,6 +39,9 @@ test-quick: $(STAMP) ## run the quick tests of every room
 
 test-slow: $(STAMP) ## run the tests that take minutes
 	@$(BIN)/python -m pytest -m slow $(ARGS)
+
+test-zoo: $(STAMP) ## run the tests of torchvision's, timm's and transformers' networks with these, in build/zoo
+	@bash tools/test_zoo.sh $(BIN)/python build/zoo $(ARGS)
 
 fuzz: $(STAMP) ## load 400 hostile files, each in bounds of time and memory; ARGS="--seed 1" makes others
 	@PYTHONPATH=tests $(BIN)/python -m fuzz $(ARGS)

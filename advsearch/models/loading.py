@@ -209,7 +209,10 @@ def _described(spec: object) -> str:
 
 def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
     """Return the source's own preprocessing with the caller's options on top."""
-    made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE)
+    made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE, processor=found.processor)
+    instead = [key for key in ("mean", "std", "value_range", "channels") if found.processor and key in given]
+    if instead:
+        raise InputError(f"{instead[0]}: model {found.name} has a processor that does all of this; leave it out")
     own = {"mean": found.mean, "std": found.std, **pre.parse_normalisation(given.get("mean"), given.get("std"))}
     made = dataclasses.replace(made, mean=own["mean"] or made.mean, std=own["std"] or made.std)
     made = dataclasses.replace(made, layout=found.layout or made.layout, channels=found.channels or made.channels)

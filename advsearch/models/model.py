@@ -158,7 +158,8 @@ def read_by(read: Read, answer: Any, count: int, name: str) -> Any:
         output = read(answer, count)
     except ValueError as error:
         meant, own = _task_of(answer), getattr(getattr(read, "__self__", None), "name", None)
-        advice = _other_task(meant) if meant and meant != own else "wrap the network, or ask for another task"
+        other = _other_task(meant) if meant and meant != own else "wrap the network, or ask for another task"
+        advice = _no_scores(answer) or other
         raise ModelError(f"model {name}: {error}, got {described(answer)}; {advice}") from None
     if len(output) != count:
         raise ModelError(f"model {name}: expected an output for each of {count} images, got {len(output)}")
@@ -199,6 +200,8 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
     """
     tensor = _tensor_in(output)
     expected = f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
+    if advice := _no_scores(output):
+        raise ModelError(f"{expected}, got {described(tensor if tensor is not None else output)}; {advice}")
     meant = _task_of(output)
     if meant in ("detection", "segmentation") and (tensor is None or tensor.dim() != 4):
         raise ModelError(f"{expected}, got {described(output)}; {_other_task(meant)}")
@@ -222,6 +225,18 @@ def _tensor_in(output: Any) -> Tensor | None:
     return output if isinstance(output, Tensor) else None
 
 
+def _no_scores(answer: Any) -> str:
+    """What to do with an answer that has no scores: the classes that it chose, or losses; "" of any other."""
+    parts = list(answer.values()) if isinstance(answer, Mapping) else [answer]
+    if parts and all(isinstance(one, Tensor) and one.ndim == 0 for one in parts):
+        return "one number for all pictures is what a loss is: give the network as it answers outside of training"
+    tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
+    listed = isinstance(answer, (list, tuple))  # whose first part may be the labels of boxes
+    if tensor is None or listed or tensor.is_floating_point() or tensor.ndim not in (1, 3):
+        return ""
+    return f"these are the classes that it chose ({tensor.dtype}): return its scores, as they are before the argmax"
+
+
 def _task_of(answer: Any) -> str | None:
     """Return the task whose networks answer like that: boxes, a score for each pixel, or rows of scores; else None."""
     if _has_boxes(answer):
@@ -237,10 +252,11 @@ def _task_of(answer: Any) -> str | None:
 
 
 def _has_boxes(output: Any) -> bool:
-    """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings with "boxes"."""
+    """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings or objects with "boxes"."""
     first = output[0] if isinstance(output, (tuple, list)) and output else output
-    if isinstance(first, Mapping):
-        return "boxes" in first or "pred_boxes" in first
+    names = first if isinstance(first, Mapping) else dir(first)
+    if not isinstance(first, Tensor) and ("boxes" in names or "pred_boxes" in names):
+        return True
     several = isinstance(output, (tuple, list)) and len(output) > 1
     return several and isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4
 

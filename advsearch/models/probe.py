@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import re
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from advsearch import files
 from advsearch.errors import ModelError
@@ -175,11 +177,42 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
     except Exception as error:  # any network may raise anything
         height, width = model.input_size
         preprocessing = model.preprocessing
+        if why := _unlike_pictures(model.module, str(error)):
+            raise ModelError(f"model {model.name}: {why} ({first_line(error)})") from error
         raise ModelError(
             f"model {model.name}: cannot be run on a {preprocessing.channels} image of {height} x {width} pixels in "
             f"layout {preprocessing.layout} ({first_line(error)}). Give the `input_size` and "
             "`layout` that it was made for"
         ) from error
+
+
+TRUTHS = {"target", "targets", "label", "labels", "annotations", "ground_truth"}
+"""What a network in its form for training calls the right answers."""
+
+
+def _unlike_pictures(network: object, error: str) -> str:
+    """What a network that raised an error wants beside pictures or in place of them; "" where that does not show."""
+    if not isinstance(network, nn.Module):
+        return ""
+    try:
+        taken = list(inspect.signature(network.forward).parameters.values())[1:]
+    except (TypeError, ValueError):  # it is not written in Python
+        taken = []
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    needed = {one.name for one in taken if one.kind not in variable and one.default is inspect.Parameter.empty}
+    missed = TRUTHS & set(re.findall(r"\w+", error))
+    more = [one.name for one in taken if one.name in needed | missed]
+    if more:
+        return (
+            f"wants {' and '.join(more)} beside pictures; wrap it in an nn.Module that is called with pictures alone, "
+            "as it is used outside of training"
+        )
+    if any(isinstance(one, nn.Conv3d) for one in network.modules()):
+        return (
+            "is made for videos or volumes (it has an nn.Conv3d), and pictures (N, 3, H, W) are what is given; wrap it "
+            "in an nn.Module that makes one of each picture"
+        )
+    return ""
 
 
 def _probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:

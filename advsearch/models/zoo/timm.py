@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from advsearch.errors import ModelError, UnknownNameError
 from advsearch.models.imported import near_names, split_weights
 from advsearch.models.source import Source, load_weights, source_of
 from advsearch.models.zoo.library import library, reading
+from advsearch.models.zoo.loaded import Loaded
 
 
 def load(spec: str) -> Source:
@@ -56,12 +59,26 @@ def of_network(network: nn.Module) -> Source | None:
     return _source(timm, network, type(network).__name__)
 
 
-def _source(timm: Any, module: Any, name: str) -> Source:
+def of_wrapped(loaded: Loaded, labels: tuple[str, ...]) -> Source:
+    """Return the source of a network of timm inside one of transformers, whose ``config`` may tell more than timm.
+
+    Args:
+        loaded: of a `TimmWrapperForImageClassification`.
+        labels: that transformers knows; none where it only numbers them.
+    """
+    timm = library("timm", loaded.spec, "timm")
+    network: Any = loaded.network
+    source = _source(timm, network.timm_model, loaded.name, getattr(network.config, "pretrained_cfg", None))
+    return replace(source, labels=labels or source.labels)
+
+
+def _source(timm: Any, module: Any, name: str, told: Mapping[str, Any] | None = None) -> Source:
+    """Return the source of a network; `told` is what stands for its ``pretrained_cfg``."""
     if module.num_classes == 0:
         raise ModelError(
             f"model {name}: has no classes (num_classes is 0): it answers with features. Give a network with a head"
         )
-    asked = timm.data.resolve_model_data_config(module)
+    asked = timm.data.resolve_model_data_config(module, **({"pretrained_cfg": dict(told)} if told else {}))
     return source_of(
         module,
         name,

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from advsearch.errors import ModelError
+from advsearch.errors import ModelError, resembling
+from advsearch.models.probe import first_line
 from advsearch.models.source import Source
 from advsearch.models.zoo import timm, zero_shot
 from advsearch.models.zoo.library import library, reading
@@ -53,7 +54,7 @@ def load(spec: str) -> Source:
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
     image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
-    alone. A repository of timm goes to timm.
+    alone. A repository that timm has saved goes to timm.
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
@@ -66,15 +67,16 @@ def load(spec: str) -> Source:
     transformers = library("transformers", spec, "hf")
     if Path(name).is_dir():
         name = str(Path(name).resolve())
+    elif Path(name).is_file():
+        raise ModelError(f"model {spec}: is a file; give the folder in which it is with its config.json")
     elif name.startswith((".", "/", "~")) or name.count("/") > 1:
-        raise ModelError(f"model {spec}: no such folder; a repository is written hf:OWNER/NAME")
+        raise ModelError(f"model {spec}: no such folder{_near_folders(name)}; a repository is written hf:OWNER/NAME")
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
     where = {"revision": revision} if revision else {}
     with reading(spec, ADVICE):
-        _check_not_open_clips(transformers, name, spec, where)
-        told, _ = transformers.PretrainedConfig.get_config_dict(name, **where)
-        if told.get("model_type") == "timm_wrapper":
+        told = _config(transformers, name, spec, where)
+        if told.get("model_type") == "timm_wrapper" and "architectures" not in told:  # which timm itself has saved
             return timm.load_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
@@ -132,14 +134,36 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
     )
 
 
-def _check_not_open_clips(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> None:
-    """Raise a ModelError for a repository that has the files of open_clip and none of transformers."""
+def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what is in the config.json of a repository or a folder.
+
+    Raises:
+        ModelError: it is neither there nor to be had, or it has the files of open_clip and none of transformers.
+    """
     has = partial(transformers.utils.cached_file, name, _raise_exceptions_for_missing_entries=False, **where)
-    if not has("config.json") and has("open_clip_config.json"):
+    try:
+        if not has("config.json") and has("open_clip_config.json"):
+            raise ModelError(
+                f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
+                "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
+            )
+        told: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(name, **where)[0]
+        return told
+    except OSError as error:
+        if Path(name).is_dir():
+            raise
         raise ModelError(
-            f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
-            "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
-        )
+            f"model {spec}: {name} is no folder here{_near_folders(name)}, and no repository of that name is in the "
+            f"cache or can be had ({first_line(error)})"
+        ) from error
+
+
+def _near_folders(name: str) -> str:
+    """Return the question whether a folder with nearly that name is meant; "" if there is none."""
+    place = Path(name).expanduser()
+    there = [one.name for one in place.parent.iterdir() if one.is_dir()] if place.parent.is_dir() else []
+    near = [f"'hf:{place.parent / one}'" for one in resembling(place.name, there)[:3]]
+    return f" (did you mean {' or '.join(near)}?)" if near else ""
 
 
 def _check_whole(told: Any, spec: str) -> None:
@@ -207,6 +231,11 @@ def _with_names(make: Callable[[Any], nn.Module]) -> Callable[[Loaded], Source]:
 
 
 KINDS = (
+    Kind(
+        _called("TimmWrapperForImageClassification"),
+        "AutoModelForImageClassification",
+        lambda loaded: timm.of_wrapped(loaded, names_of(loaded.network.config)),
+    ),
     Kind(
         _called("ForImageClassification"),
         "AutoModelForImageClassification",
