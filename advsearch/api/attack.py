@@ -26,7 +26,7 @@ from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.ahead import Ahead, seen_by
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
-from advsearch.engine.attack_result import Asked, AttackResult
+from advsearch.engine.attack_result import AttackParts, AttackResult
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import (
@@ -69,7 +69,7 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.ensemble import together
 from advsearch.options import as_setting
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.directory import only_here as only_python_has
@@ -186,8 +186,8 @@ def attack(
         measured = load_metrics(config.metrics, metrics)
         job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
         if folder is None:
-            return _carry_out(job, told(progress))
-        return _go_on(job, folder, told(progress))
+            return _carry_out(job, watcher(progress))
+        return _go_on(job, folder, watcher(progress))
 
 
 def attack_from_config(
@@ -245,7 +245,7 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
 
-def asked_in(run: Path) -> Asked:
+def parts_in(run: Path) -> AttackParts:
     """Find and load everything that the run of an attack was asked with, as its answer is judged.
 
     Raises:
@@ -256,17 +256,17 @@ def asked_in(run: Path) -> Asked:
     return _job(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
 
 
-def problem_asked(asked: Asked, **changes: object) -> tuple[Problem, list[str]]:
+def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, list[str]]:
     """Return the problem that an attack was asked with, and warnings on the way.
 
     Args:
-        asked: as a result has it.
+        parts: as a result has them.
         **changes: settings that are different; of another `model`, its name.
     """
-    assert isinstance(asked, _Job)
-    config = asked.config.model_copy(update=changes)
-    model = _model(config.model, config, asked.task) if "model" in changes else (asked.loaded[0], [*asked.loaded[1]])
-    job = replace(asked, config=config, loaded=model)
+    assert isinstance(parts, _Job)
+    config = parts.config.model_copy(update=changes)
+    model = _model(config.model, config, parts.task) if "model" in changes else (parts.loaded[0], [*parts.loaded[1]])
+    job = replace(parts, config=config, loaded=model)
     problem = _problem(job)
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
@@ -566,8 +566,8 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
             spent = (budget, policy, recorder, memory, stages, preparation_of(job.config))
             findings = Attack(problem, *spent, clean=job.clean).carry_out()
         found = summarise(_question(job), problem, findings, recorder, stages, warnings)
-        asked = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
-        return replace(found, asked=lambda: asked)
+        parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
+        return replace(found, parts=lambda: parts)
 
 
 def announced_of(settings: JsonObject) -> Call:

@@ -44,7 +44,7 @@ from advsearch.engine.planning import (
 )
 from advsearch.engine.problem import Problem
 from advsearch.engine.run_settings import RunSettings
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.check import (
     WHOLE,
@@ -102,7 +102,7 @@ def check(
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(CheckConfig, object=object, model=model, **settings)
-    return check_from_config(config, progress=told(progress))
+    return check_from_config(config, progress=watcher(progress))
 
 
 def check_from_config(

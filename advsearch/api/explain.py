@@ -34,7 +34,7 @@ from advsearch.explanations.renders import along, inside, lies_inside
 from advsearch.explanations.rules import CHANCE, Conditions, CountedRule, RuleCondition, covered, find_rules
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.recipes.table import Answered, rows_of
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, find_run
 from advsearch.runs.results.base import INTERRUPTED
@@ -80,7 +80,7 @@ def explain(
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=told(progress))
+    return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=watcher(progress))
 
 
 def explain_from_config(

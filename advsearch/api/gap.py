@@ -28,7 +28,7 @@ from advsearch.engine.transfer import Transfer
 from advsearch.engine.transport import CleanMatrix
 from advsearch.files import JsonObject
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.drawing import Figures
 from advsearch.report.studies import curve_figure, gap_figure, matrix_figure
 from advsearch.report.tables import CurveTable, GapTable
@@ -70,7 +70,7 @@ def gap(
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(GapConfig, object=object, model=model, **settings)
-    return gap_from_config(config, progress=told(progress))
+    return gap_from_config(config, progress=watcher(progress))
 
 
 def curve_from_config(

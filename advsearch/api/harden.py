@@ -45,7 +45,7 @@ from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
 from advsearch.models.imported import split_weights
 from advsearch.models.trainable import Trainable, trainable
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.hardening import hardened_figure
 from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes
@@ -100,7 +100,7 @@ def harden(
     config = configured(HardenConfig, model=model_name(model), **settings)
     path = run_path(config.run) if resume and config.run is not None else None
     resumed = path if path is not None and is_run(path) else None
-    return _carry_out(config, model, optimiser, beside, told(progress), resumed)
+    return _carry_out(config, model, optimiser, beside, watcher(progress), resumed)
 
 
 def harden_from_config(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.api.attack import asked_in
+from advsearch.api.attack import parts_in
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.files import read_bytes
@@ -64,7 +64,7 @@ def _attack(path: Path, summary: AttackSummary) -> AttackResult:
         adversarial=adversarial,
         artifacts={one.stem: _layer(one) for one in sorted((path / ARTIFACTS).glob("*.exr"))},
         search=None,
-        asked=cache(partial(asked_in, path)),
+        parts=cache(partial(parts_in, path)),
     )
 
 

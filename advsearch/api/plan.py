@@ -20,7 +20,7 @@ from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Formation
@@ -63,7 +63,7 @@ def plan(
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(PlanConfig, object=object, model=model, **settings)
-    return plan_from_config(config, progress=told(progress))
+    return plan_from_config(config, progress=watcher(progress))
 
 
 def plan_from_config(

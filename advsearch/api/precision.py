@@ -38,7 +38,7 @@ from advsearch.evaluation.precision.report import MeasuredLine, Section, report_
 from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
 from advsearch.evaluation.precision.sharing import ReferencePart, shared_parts
 from advsearch.files import JsonObject
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes, write_text
@@ -89,7 +89,7 @@ def precision(
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(PrecisionConfig, object=object, model=model, **settings)
-    return precision_from_config(config, progress=told(progress))
+    return precision_from_config(config, progress=watcher(progress))
 
 
 def precision_from_config(

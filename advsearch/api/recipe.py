@@ -23,7 +23,7 @@ from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.recipes.columns import ANY, check_figures
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
@@ -69,7 +69,7 @@ def recipe(recipe: str | Path, *, progress: Watched = None, **settings: Unpack[R
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=told(progress))
+    return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=watcher(progress))
 
 
 def recipe_from_config(

@@ -24,7 +24,7 @@ from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.verifier import Verifier
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.studies import map_figure
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
@@ -79,7 +79,7 @@ def region(
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(RegionConfig, object=object, model=model, **settings)
-    return region_from_config(config, progress=told(progress))
+    return region_from_config(config, progress=watcher(progress))
 
 
 def region_from_config(

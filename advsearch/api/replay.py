@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, asked_in, problem_asked
+from advsearch.api.attack import LOADING, parts_in, problem_of_parts
 from advsearch.api.keywords import ReplayKeywords, asks, configured
 from advsearch.config import ReplayConfig
-from advsearch.engine.attack_result import Asked, AttackResult
+from advsearch.engine.attack_result import AttackParts, AttackResult
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.replaying import OWN_LIGHT, Way, ways_of
@@ -23,7 +23,7 @@ from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.engine.rows import control_group, verified_rate
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.results.attack import AttackSummary
@@ -53,11 +53,13 @@ def replay(
         InputError: anything that the caller can put right; nothing is written then.
     """
     if not isinstance(answer, AttackResult):
-        return replay_from_config(configured(ReplayConfig, answer=answer, **settings), progress=told(progress))
+        return replay_from_config(configured(ReplayConfig, answer=answer, **settings), progress=watcher(progress))
     if answer.run is None:
         raise InputError("answer: expected an attack that was kept, got one that was not; give it a `run`")
     config = configured(ReplayConfig, answer=answer.run, **settings).with_only_here(only_here(answer.run))
-    return replay_from_config(config, progress=told(progress), asked=None if answer.asked is None else answer.asked())
+    return replay_from_config(
+        config, progress=watcher(progress), parts=None if answer.parts is None else answer.parts()
+    )
 
 
 def replay_from_config(
@@ -65,7 +67,7 @@ def replay_from_config(
     *,
     progress: Progress | None = None,
     resumed: Path | None = None,
-    asked: Asked | None = None,
+    parts: AttackParts | None = None,
 ) -> ReplayResult:
     """Render an answer again as a configuration describes; every trial is stored at once, and a run goes on with the
     next.
@@ -74,7 +76,7 @@ def replay_from_config(
         config: what.
         progress: told how far it is.
         resumed: the folder of a run to go on with.
-        asked: what the attack was asked with; None loads what its run names.
+        parts: what the attack was asked with; None loads what its run names.
 
     Raises:
         InputError: the run has no answer, or its scene is another one now.
@@ -87,13 +89,13 @@ def replay_from_config(
     if summary.adversarial is None:
         raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to render again")
     different((OWN_MODEL, *config.models), "model")
-    asked = asked or asked_in(folder)
+    parts = parts or parts_in(folder)
     threads = {} if config.threads is None else {"threads": config.threads}
-    again = partial(problem_asked, asked, **threads)
+    again = partial(problem_of_parts, parts, **threads)
     problem, warnings = again()
     u = kept_answer(folder, problem)
     ways = [*_ways(config, again, problem, summary), *_models(config, again, problem, summary)]
-    ending, seed = "done", seeds.stream(asked.config.seed, "replay")
+    ending, seed = "done", seeds.stream(parts.config.seed, "replay")
     with RunDirectory.of(config, resumed) as run:
         table = _Table(ways, u, config.trials, seed, run, progress)
         try:
@@ -116,7 +118,7 @@ def replay_from_config(
             renders=table.renders,
             warnings=warnings,
             seconds={"total": time.perf_counter() - begun},
-            seed=asked.config.seed,
+            seed=parts.config.seed,
             command_line=config.command_line(),
         )
         run.write_summary(result)
@@ -189,7 +191,7 @@ def _batches(ways: Sequence[Way]) -> list[list[int]]:
 
 
 Again = Callable[..., tuple[Problem, list[str]]]
-"""The problem of the run with some settings changed, and warnings; see `problem_asked`."""
+"""The problem of the run with some settings changed, and warnings; see `problem_of_parts`."""
 
 OWN_MODEL = "the run's own"
 """What no other model is called."""

@@ -12,7 +12,7 @@ from advsearch.config import StabilityConfig
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
 from advsearch.evaluation.stability.suite import chosen, run_cases
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.stability import CaseRow, StabilityResult
 
@@ -32,7 +32,7 @@ def stability(*, progress: Watched = None, **settings: Unpack[StabilityKeywords]
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return stability_from_config(configured(StabilityConfig, **settings), progress=told(progress))
+    return stability_from_config(configured(StabilityConfig, **settings), progress=watcher(progress))
 
 
 def stability_from_config(

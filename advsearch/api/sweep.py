@@ -44,7 +44,7 @@ from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting
-from advsearch.progress import NullProgress, Progress, Watched, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
@@ -151,7 +151,7 @@ def sweep(
         raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
-    progress = told(progress)
+    progress = watcher(progress)
     if loaded or only_here(controls) or not all(isinstance(one, (str, Path)) for one in networks):
         check_not_spread(options)
     resumed = _stopped(config)

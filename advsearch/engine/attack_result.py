@@ -45,7 +45,7 @@ class RenderKeywords(TypedDict, total=False):
     aov: bool
 
 
-class Asked(Protocol):
+class AttackParts(Protocol):
     """What an attack was asked with, found and loaded."""
 
     @property
@@ -83,7 +83,7 @@ class AttackResult:
         artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w, 3) sRGB in [0, 1].
         search: the search's own log and claim; None where nothing was searched, and of a run that was loaded.
         in_memory: the rows, where there is no run directory.
-        asked: returns what the attack was asked with; None of a result that came from another process.
+        parts: returns what the attack was asked with; None of a result that came from another process.
     """
 
     summary: AttackSummary
@@ -94,7 +94,7 @@ class AttackResult:
     artifacts: dict[str, Tensor]
     search: SearchResult | None
     in_memory: tuple[store.Row, ...] = ()
-    asked: Callable[[], Asked] | None = None
+    parts: Callable[[], AttackParts] | None = None
 
     @property
     def found(self) -> bool:
@@ -126,14 +126,14 @@ class AttackResult:
         Raises:
             InputError: the answer sets one of `settings` itself, or has other numbers than the scene takes.
         """
-        if self.asked is None:
+        if self.parts is None:
             raise InputError(
                 "render: expected a result of this session, got one from another process; load_run(FOLDER) has it "
                 "with all that it needs"
             )
-        asked = self.asked()
-        config = asked.config
-        shown = asked.scene if scene is None else scene if isinstance(scene, Scene) else load_scene(scene)
+        parts = self.parts()
+        config = parts.config
+        shown = parts.scene if scene is None else scene if isinstance(scene, Scene) else load_scene(scene)
         if isinstance(camera, Mapping):
             settings, camera = {**(settings or {}), **{f"camera.{name}": one for name, one in camera.items()}}, None
         if twice := sorted({*(settings or {})} & {*(self.summary.configuration or {})}):
@@ -148,17 +148,17 @@ class AttackResult:
         }
         return render(
             shown,
-            asked.loaded[0] if model is None else model,
-            task=asked.task,
+            parts.loaded[0] if model is None else model,
+            task=parts.task,
             label=config.label,
-            controls=asked.controls,
+            controls=parts.controls,
             at=self.u,
             **{**own, **options},
         )
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: not what only this session has."""
-        return {**vars(self), "asked": None}
+        return {**vars(self), "parts": None}
 
     def rows(self, kind: str | None = None) -> Iterator[store.Row]:
         """Yield every evaluated configuration, or those of one kind ("search", "verification", ...), in order."""

@@ -20,7 +20,7 @@ from advsearch.engine.loading import Controls, Scene, Texture, as_controls, fram
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
 from advsearch.models.switches import plainly
-from advsearch.progress import Watched, told
+from advsearch.progress import Watched, watcher
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked
 from advsearch.report.phrases import seen_text
@@ -251,7 +251,7 @@ def render(
     if around is not None and any(_turns(one) for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
     size = as_python(resolution) or (model.input_size[0], model.input_size[1])
-    progress = told(progress)
+    progress = watcher(progress)
     progress.stage("rendering", around or 1)
     formation = None
     views = []
