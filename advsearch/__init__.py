@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from advsearch import losses as losses
     from advsearch.api.attack import attack as attack
     from advsearch.api.check import check as check
     from advsearch.api.explain import explain as explain
@@ -64,14 +65,17 @@ _HOMES = {
 }
 """The public names, and the module of each."""
 
-__all__ = list(_HOMES)
+_MODULES = ("losses",)
+"""Public modules."""
+
+__all__ = [*_HOMES, *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
     """Import the interface on first use (PEP 562)."""
-    if name in _HOMES:
+    if name in __all__:
         import_module("advsearch.api")  # sets the threads before torch is imported
-        return getattr(import_module(_HOMES[name]), name)
+        return import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

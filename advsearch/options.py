@@ -110,3 +110,8 @@ def as_setting(entry: Any) -> str | dict[str, JsonValue]:
         if plain and value != default_of(declared):
             given[option] = value
     return {"name": name, **given} if given else name
+
+
+def told(given: object) -> str:
+    """Return in words what was given in the place of an instance; of a class, what makes one of it."""
+    return f"the class {given.__name__}; write {given.__name__}()" if isinstance(given, type) else f"{given!r:.80}"

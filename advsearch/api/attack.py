@@ -14,7 +14,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Policy, make_policy
-from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
@@ -68,7 +68,7 @@ from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.ensemble import together
-from advsearch.options import as_setting
+from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
@@ -81,6 +81,7 @@ from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
+from advsearch.tasks.own import OwnTask, function_of
 from advsearch.tasks.together import Together
 
 if TYPE_CHECKING:
@@ -116,12 +117,14 @@ def attack(
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes; with `ensemble`, several.
         object: the node or shape that is the object, where `scene` is a file or dictionary that holds several.
-        task: what judges the model's output: a name, a mapping with a `name` and options, or an instance.
+        task: what judges the model's output: a name, a mapping with a `name` and options, an instance, or a function
+            (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
         controls: what may vary: names, instances, or a mapping from names to settings.
         objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
-            images (N, H, W, 3), truth, or the target where there is one) that returns (N,) values, which are maximised;
-            in classification the output is logits (N, C) and the truth the indices of the right answers. None takes the
-            task's own.
+            images (N, H, W, 3), truth, or the target where there is one) or of (output, labels) that returns (N,)
+            values, which are maximised; in classification the output is logits (N, C) and the truth the index of the
+            right answer, (N,), or a tuple of several. It may ask for more by the names of further parameters: `u`,
+            `texture`, `inputs`, `configuration` (docs/own-loss.md). None takes the task's own.
         policy: a name, a mapping with a `name` and options, or an instance.
         over: controls that vary by chance: the answer has to hold for all of their values.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
@@ -135,12 +138,13 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
+    task = make_task(task) if callable(task) else task
     loaded_already = not all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
-    if loaded_already or callable(objective) or only_here(controls) or only_here(over):
+    if loaded_already or callable(objective) or only_here(controls) or only_here(over) or isinstance(task, OwnTask):
         check_not_spread(options)
     if not isinstance(policy, (str, Mapping, Policy)):
         raise InputError(
-            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {policy!r}"
+            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
         )
     scene = _scene(scene, object, settings)
     described = {
@@ -495,6 +499,8 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
         aovs=aovs_of(config.aov),
         metrics=job.metrics,
     )
+    for name in asked_by(job.objective):
+        problem.asked(problem.whole(problem.domain.start))(name)  # refuses what is not there
     problem.draws = search_size(config, problem)[1]
     return problem
 
@@ -553,7 +559,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
         if kept is not None:
             functions = {f"metric {name}": one for name, one in job.metrics.items()}
             objective = {"objective": job.objective} if callable(job.objective) else {}
-            check_made_of(kept, [job.loaded[0]], {**functions, **objective})
+            check_made_of(kept, [job.loaded[0]], {**functions, **objective, "task": function_of(job.task)})
         memory = Memory(kept)
         with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
             recorder = Recorder(kept, problem, memory, Ahead(executor))

@@ -54,6 +54,7 @@ from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES, split_names
 from advsearch.tasks import AnyTask, Task, make_task
+from advsearch.tasks.own import OwnTask, function_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -94,7 +95,8 @@ def sweep(
         scene: from `load_scene`, or what that takes; or several. None takes that of `answer_of`.
         model: from `load_model`, or what that takes; or several, which are shown the same pictures. None takes that of
             `answer_of`, and the reference model without.
-        task: what judges the models' outputs: a name, a mapping with a `name` and options, or an instance.
+        task: what judges the models' outputs: a name, a mapping with a `name` and options, an instance, or a function
+            (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
         grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
         samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
         controls: what is drawn by chance, as for `attack`.
@@ -119,6 +121,7 @@ def sweep(
     networks = _several(brought.get("model", "reference") if model is None else model)
     controls = controls or brought.get("controls", ())
     task = brought.get("task", task) if task == "classification" else task
+    task = make_task(task) if callable(task) else task
     names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
     if names and len(names) < len(scenes):
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
@@ -152,7 +155,8 @@ def sweep(
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
     progress = watcher(progress)
-    if loaded or only_here(controls) or not all(isinstance(one, (str, Path)) for one in networks):
+    told = all(isinstance(one, (str, Path)) for one in networks) and not isinstance(task, OwnTask)
+    if loaded or only_here(controls) or not told:
         check_not_spread(options)
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
@@ -367,7 +371,8 @@ def _stopped(config: SweepConfig) -> Path | None:
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
     with RunDirectory.of(config, resumed) as run, _executor(config, progress) as executor:
-        check_made_of(run, job.models, {f"metric {name}": one for name, one in job.metrics.items()})
+        functions = {f"metric {name}": one for name, one in job.metrics.items()}
+        check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
         return carry_out(job, run, progress, executor)
 
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from advsearch.settings import parse_assignment
+
+FOLDERS = ("references",)
+"""Options that are a folder. It is kept by its absolute path, so that a run may go on from anywhere."""
 
 
 def read_named(value: Any, setting: str, otherwise: str) -> Any:
@@ -22,6 +27,10 @@ def read_named(value: Any, setting: str, otherwise: str) -> Any:
     if not isinstance(value, Mapping):
         return value
     options = {option: given for option, given in value.items() if option != "name"}
+    for option in FOLDERS:
+        given = options.get(option)
+        if isinstance(given, (str, os.PathLike)) and given:
+            options[option] = str(Path(given).expanduser().absolute())
     name = value.get("name", otherwise)
     return {"name": name, **options} if options else name
 

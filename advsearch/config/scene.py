@@ -119,9 +119,10 @@ class SceneConfig(Config):
     prompt: str | None = setting(
         None,
         "model",
-        "the text that a model such as CLIP compares pictures with, for each of labels; several are averaged",
-        "a text with {} where the name goes, several with | between them",
-        otherwise="a photo of a {}",
+        "the text that a model is given beside a picture: what one such as CLIP compares it with, for each of labels, "
+        "or what one such as LLaVA is asked",
+        "a text, for CLIP with {} where the name goes, or several with | between them",
+        otherwise="a photo of a {}, or What is this?",
         metavar="TEXT",
     )
     task: str | dict[str, JsonValue] = setting(
@@ -273,11 +274,11 @@ class SceneConfig(Config):
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
-        """Accept several in a list; each says where the name goes."""
+        """Accept several in a list."""
         several = isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value)
         text = " | ".join(value) if several else value
-        if isinstance(text, str) and not all("{}" in one for one in text.split("|")):
-            raise ValueError("no place for a name")
+        if isinstance(text, str) and not all(one.strip() for one in text.split("|")):
+            raise ValueError("no text")
         return text
 
     @field_validator("task", mode="before")

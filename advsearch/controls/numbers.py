@@ -292,6 +292,10 @@ class BoundNumbers(BoundControl):
         """Return every parameter's value at a slice of u, fixed ones too."""
         return {slot.parameter.name: slot.value(u) for slot in self.slots}
 
+    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
+        named = {slot.parameter.name for slot in self.slots if slot.parameter.options}
+        return {name: value for name, value in self.values(u).items() if name not in named}
+
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return self.control.scene_inputs(self.scene, self.values(u), so_far)
 

@@ -119,6 +119,16 @@ class Space:
                 found.update(control.describe(*arguments))
         return found
 
+    def printed(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the searched colours that a printer would print, by control; see `BoundControl.printed`."""
+        found = {control.name: control.printed(part) for control, part in self.slices(u)}
+        return {name: colors for name, colors in found.items() if colors is not None}
+
+    def numbers(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the numbers of a configuration by parameter ("pose.yaw"); see `BoundControl.numbers`."""
+        each = ((control.name, control.numbers(part)) for control, part in self.slices(u))
+        return {f"{name}.{one}": value for name, numbers in each for one, value in numbers.items()}
+
     def holding(self, u: Tensor) -> Space:
         """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
 
@@ -180,6 +190,9 @@ class _Held(BoundControl):
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         return self._control.describe(self._at, so_far)
+
+    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
+        return self._control.numbers(self._at)
 
 
 def file_name(name: str) -> str:

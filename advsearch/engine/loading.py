@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -18,6 +18,7 @@ from advsearch.controls import CONTROLS, Control, Space, gathered, make_control,
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.switches import plainly
+from advsearch.options import told
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
 from advsearch.scene.description import (
@@ -289,7 +290,7 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
     if isinstance(controls, Mapping):
         return {name: dict(given) for name, given in settings_by_name(controls).items()}
     several = [controls] if isinstance(controls, Control) else controls
-    several = [part.strip() for part in several.split(",")] if isinstance(several, str) else list(several)
+    several = [part.strip() for part in several.split(",")] if isinstance(several, str) else several
     as_controls(several)
     return {
         one.name if isinstance(one, Control) else one: one.settings() if isinstance(one, Control) else {}
@@ -310,8 +311,10 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
     if isinstance(controls, Control):
         controls = [controls]
     if not isinstance(controls, Mapping):
-        if not all(isinstance(one, (str, Control)) for one in controls):
-            raise InputError(f"controls: expected names or Control instances, got {controls!r}")
+        listed = list(controls) if isinstance(controls, Iterable) else [controls]
+        for one in listed:
+            if not isinstance(one, (str, Control)):
+                raise InputError(f"controls: expected names or Control instances, got {told(one)}")
         ready = tuple(one for one in controls if isinstance(one, Control))
         if ready and len(ready) == len(controls):
             return ready

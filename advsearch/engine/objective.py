@@ -10,6 +10,7 @@ from torch import Tensor
 
 from advsearch.attacks import Objective, get_objective
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
+from advsearch.attacks.own_objective import More, nothing_more
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.ensemble import Ensemble, Outputs, of_each
@@ -62,11 +63,11 @@ def objective_for(
         return of_ensemble([get_objective(wanted, one) for one in task.tasks], ensemble or "mean"), ""
     if not of_features:
         return get_objective(wanted, task), ""
-    features = features_of(model)
+    features = features_of(model) if task.reads_logits else None  # otherwise they are what the model answers with
     with torch.no_grad():
         clean = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
-    note = "" if features.penultimate else features.source
-    return get_objective(wanted, task, features=features, clean=clean), note
+    note = "" if features is None or features.penultimate else features.source
+    return get_objective(wanted, task, features=features or model, clean=clean), note
 
 
 def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
@@ -80,9 +81,11 @@ def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
         way: "mean" or "worst".
     """
 
-    def objective(output: Sequence[Outputs], images: Tensor, truth: tuple[Any, ...]) -> Tensor:
+    def objective(
+        output: Sequence[Outputs], images: Tensor, truth: tuple[Any, ...], more: More = nothing_more, /
+    ) -> Tensor:
         each = zip(objectives, of_each(output), truth, strict=True)
-        values = torch.stack([one(own, images, right) for one, own, right in each])
+        values = torch.stack([one(own, images, right, more) for one, own, right in each])
         return values.mean(dim=0) if way == "mean" else values.amin(dim=0)
 
     return objective

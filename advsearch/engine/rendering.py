@@ -223,7 +223,7 @@ def render(
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
-        task: what says the model's answers: a name, a mapping with a `name` and options, or an instance.
+        task: what says the model's answers: a name, a mapping with a `name` and options, an instance, or a function.
         label: the right answers, for a task that draws what is true; None for the object's own.
         controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
             a range stays where a search would start.

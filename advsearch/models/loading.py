@@ -120,13 +120,16 @@ def _loaded(
 ) -> Model:
     read = read or (task and task.reader)
     names, origin = None if labels is None else read_labels(labels), labels_origin(labels)
+    if names is not None and task and task.names_from:
+        raise InputError(f"labels: the names of task {task.name} are those of {task.names_from}; leave `labels` out")
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
     found = _find(spec)
     switches = turned_by_code()
     if prompts is not None and not (isinstance(found, Source) and found.reads_text):
         raise InputError(f"prompt: model {found.name} has classes of its own and reads no text; leave `prompt` out")
     if isinstance(found, Source) and found.finish is not None:
-        found = found.finish(Purpose(task.name if task else "classification", names, prompts))
+        purpose = Purpose(task.name if task else "classification", names, prompts, getattr(task, "tokens", 16))
+        found = found.finish(purpose)
     if isinstance(found, Source) and isinstance(found.module, nn.Module):
         called_under(found.module, switches)
     if isinstance(found, Model):

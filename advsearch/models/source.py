@@ -32,11 +32,13 @@ class Purpose:
         task: by name.
         names: of the classes, as the user gave them; None if they did not.
         prompts: the texts that the user gave; None if they gave none.
+        tokens: the most that a free answer has.
     """
 
     task: str = "classification"
     names: tuple[str, ...] | None = None
     prompts: tuple[str, ...] | None = None
+    tokens: int = 16
 
     def named(self, model: str, what: str) -> tuple[str, ...]:
         """Return the names, for a network that has no classes of its own.

@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any, Protocol
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from PIL import Image
 from torch import Tensor
@@ -36,6 +38,9 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536
+
+Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]
+"""A point of the unit box."""
 
 Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 """From scene inputs, seed and samples a pixel to linear radiance (H, W, 3)."""
@@ -136,22 +141,25 @@ class Renderer:
         other._source = source
         return other
 
-    def __call__(self, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
-        """Render a configuration as the model would see it.
+    def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
+        """Render a configuration as the model would see it, or several.
 
         Args:
-            u: (d,) float in [0, 1].
+            u: (d,) in [0, 1], a tensor or an array; or (N, d), rendered one after the other with the same seed.
             seed: number of the noise; the same seed gives the same bytes.
             spp: independent samples a pixel, 1 to 65,536.
 
         Returns:
-            (H, W, 3) float32, display-referred sRGB in [0, 1]; differentiable with respect to u, in
+            (H, W, 3) float32, display-referred sRGB in [0, 1], or (N, H, W, 3); differentiable with respect to u, in
             `torch.inference_mode` too (not in `torch.no_grad`).
 
         Raises:
             InputError: u has another shape, or values outside [0, 1], or spp is out of range; or u requires a
                 gradient and was made in `torch.inference_mode`.
         """
+        u = _tensor(u)
+        if u.ndim == 2 and len(u):
+            return torch.stack([self(one, seed, spp) for one in u])
         self._check(u, spp)
         with _outside_inference(u) as u:
             image = self._picture(u, seed, spp)
@@ -160,30 +168,30 @@ class Renderer:
                 return result
             return image
 
-    def radiance(self, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
+    def radiance(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render linear radiance, denoised if the formation says so; arguments as for a call; (H, W, 3) float32.
 
         Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not.
         """
-        self._check(u, spp)
+        u = self._check(_tensor(u), spp)
         with _outside_inference(u) as u:
             return self._radiance(self._through(u), seed, spp)
 
-    def mask(self, u: Tensor) -> Tensor:
+    def mask(self, u: Configuration) -> Tensor:
         """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.
 
         It is asked for at the middle of each pixel. What controls do to the finished picture moves nothing in it.
         """
         return self.surfaces(u).seen(OBJECT)
 
-    def surfaces(self, u: Tensor, fineness: int = 1) -> Surfaces:
+    def surfaces(self, u: Configuration, fineness: int = 1) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; as of `mask`.
 
         Args:
             u: (d,) in [0, 1].
             fineness: into how many parts each side of a pixel is cut, to be looked at each.
         """
-        self._check(u, 1)
+        u = self._check(_tensor(u), 1)
         with torch.no_grad():
             inputs = self._assembled(u)
         return self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE}, fineness)
@@ -222,7 +230,7 @@ class Renderer:
                     central(lambda at: loss(self._picture(at, noise, count)), group, u.detach(), derivative)
         return value.detach(), derivative
 
-    def _check(self, u: Tensor, spp: int) -> None:
+    def _check(self, u: Tensor, spp: int) -> Tensor:
         if u.shape != self.start.shape:
             raise InputError(f"render: expected u of shape {tuple(self.start.shape)}, got {tuple(u.shape)}")
         if not 1 <= spp <= MAX_SPP:
@@ -230,6 +238,7 @@ class Renderer:
         low, high = torch.aminmax(u.detach()) if u.numel() else (u.sum(), u.sum())
         if not bool((low >= 0.0) & (high <= 1.0)):
             raise InputError("render: expected every entry of u in [0, 1]; project u before you render it")
+        return u
 
     # ---- from u to the picture --------------------------------------------------------------------------------------
 
@@ -390,6 +399,14 @@ class Renderer:
                     if reached is not None and bool(reached[group.coordinates].any()):
                         routes[group.name].add(name)
         return {name: frozenset(found) for name, found in routes.items()}
+
+
+def _tensor(u: Configuration) -> Tensor:
+    """u as float32, with its graph if it has one."""
+    try:
+        return torch.as_tensor(u, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"render: expected u as a tensor or an array of numbers, got {type(u).__name__}") from None
 
 
 @contextmanager

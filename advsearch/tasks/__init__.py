@@ -3,31 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
-from advsearch.errors import UnknownNameError
-from advsearch.options import check_options
+from torch import Tensor
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import check_options, told
 from advsearch.registry import Registry
+from advsearch.tasks.answers import FreeAnswer
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.detection import Detection
+from advsearch.tasks.own import own_task
 from advsearch.tasks.segmentation import Segmentation
+from advsearch.tasks.similarity import Similarity
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation)},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation, Similarity, FreeAnswer)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
 """Every task that has a name."""
 
 
-AnyTask = str | Mapping[str, object] | Task
-"""A task: its name, a mapping with its `name` and options, or the task itself."""
+AnyTask = str | Mapping[str, object] | Task | Callable[[Any, Facts], Tensor]
+"""A task: its name, a mapping with its `name` and options, the task itself, or a function `judge(output, truth)`."""
 
 
 def make_task(task: AnyTask) -> Task:
-    """Return the task of that name, of that `name` with these options, which are its dataclass's fields, or the task
-    itself.
+    """Return the task of that name, of that `name` with these options, which are its dataclass's fields, the task
+    itself, or that of a function (`advsearch.tasks.own.own_task`).
 
     Raises:
         UnknownNameError: no such task, or it has no such option.
@@ -35,6 +41,10 @@ def make_task(task: AnyTask) -> Task:
     """
     if isinstance(task, Task):
         return task
+    if callable(task) and not isinstance(task, type):
+        return own_task(task)
+    if not isinstance(task, (str, Mapping)):
+        raise InputError(f"task: expected a name, a mapping with a `name`, a Task or a function, got {told(task)}")
     given = {"name": task} if isinstance(task, str) else task
     name, options = str(given.get("name", Classification.name)), {key: given[key] for key in given if key != "name"}
     if name not in TASKS:
@@ -51,10 +61,12 @@ __all__ = [
     "Classification",
     "Detection",
     "Facts",
+    "FreeAnswer",
     "Judgement",
     "Mark",
     "Segmentation",
     "Sight",
+    "Similarity",
     "Task",
     "make_task",
 ]

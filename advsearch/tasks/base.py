@@ -216,12 +216,14 @@ class Task(ABC):
         objective: name of the objective where none is asked for; "score" is the task's own score.
         reads_logits: whether its models answer with logits (N, classes). Then their answers are checked as such, and
             the objectives of classification take them.
+        names_from: where its names come from, if neither from the model nor from the setting `labels`.
         varies: whether the truth depends on the configuration; it is asked for at each one then.
     """
 
     name: ClassVar[str]
     objective: ClassVar[str] = "score"
     reads_logits: ClassVar[bool] = False
+    names_from: ClassVar[str] = ""
     varies: ClassVar[bool] = False
 
     minimise: bool = field(default=False, metadata=FROM_RUN)

@@ -48,7 +48,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         "or package.module:callable",
     ),
     "labels": (["tench, Tinca tinca", "goldfish"], "expected a JSON or text file, imagenet, "),
-    "prompt": ("a photo of a {} | a photo", "expected a text with {} where the name goes, several with | between them"),
+    "prompt": ("a photo of a {} | ", "expected a text, for CLIP with {} where the name goes, or several with |"),
     "task": ("  ", "expected the name of a task, or NAME={OPTION: VALUE}, got '  '"),
     "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
     "controls": (

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from advsearch.errors import InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.zoo import timm as timm_networks
-from advsearch.tasks import Detection
+from advsearch.tasks import Detection, Similarity
 from advsearch.tasks.detection import Place
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
@@ -334,8 +334,14 @@ class OfTimm(nn.Module):
         self.num_classes, self.pretrained_cfg = classes, {"label_names": list(NAMES)}
         self.head = nn.Linear(3, max(classes, 8))
 
+    def forward_features(self, x: Tensor) -> Tensor:
+        return x.mean(dim=(2, 3))
+
+    def forward_head(self, x: Tensor, pre_logits: bool = False) -> Tensor:
+        return x if pre_logits else self.head(x)
+
     def forward(self, x: Tensor) -> Tensor:
-        answer: Tensor = self.head(x.mean(dim=(2, 3)))
+        answer = self.forward_head(self.forward_features(x))
         return answer[:, : self.num_classes] if self.num_classes else answer
 
 
@@ -365,6 +371,10 @@ def test_a_repository_of_timm_goes_to_timm(tmp_path: Path, timm: list[str]) -> N
 def test_a_network_of_timm_from_python_brings_its_own(timm: list[str]) -> None:
     model = load_model(OfTimm())
     assert (model.labels, model.preprocessing.mean, model.input_size) == (NAMES, (0.4,) * 3, (SIDE, SIDE))
-    with pytest.raises(ModelError, match=r"OfTimm: has no classes \(num_classes is 0\): it answers with features"):
+    with pytest.raises(ModelError, match=r"is a network without a head \(num_classes is 0\), .* use `task=similarity`"):
         load_model(OfTimm(0))
+    assert load_model(OfTimm(0), task=Similarity())(PICTURES).shape == (2, 8)
+    before = load_model(OfTimm(), task=Similarity())
+    assert before.labels == ()
+    torch.testing.assert_close(before(PICTURES), (PICTURES.mean(dim=(1, 2)) - 0.4) / 0.2)
     assert timm == [] and timm_networks.of_network(nn.Linear(3, 3)) is None

@@ -11,16 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.errors import ModelError, resembling
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
-from advsearch.models.zoo import timm, zero_shot
+from advsearch.models.zoo import features, language, open_vocabulary, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
-from advsearch.models.zoo.loaded import Loaded
+from advsearch.models.zoo.loaded import Loaded, in_pixels
+from advsearch.models.zoo.memory import check_fits
 from advsearch.models.zoo.processors import processor_of
 
 
@@ -31,7 +31,7 @@ class Kind:
     Args:
         ours: whether a network is of it, by the name of its architecture (``DeiTForImageClassificationWithTeacher``)
             and the network or its class.
-        loader: the class of transformers that builds it.
+        loader: the class of transformers that builds it; "" for the architecture itself.
         source: makes the model's source of it.
     """
 
@@ -50,7 +50,7 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `KINDS`.
 
-    One that compares pictures with texts gets its classes from its user (`zero_shot`).
+    One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`, `language`).
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
     image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
@@ -58,7 +58,7 @@ def load(spec: str) -> Source:
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
-            kind, or its processor does what `advsearch.models.preprocessing` can't.
+            kind or larger than the memory, or its processor does what `advsearch.models.preprocessing` can't.
 
     Warns:
         ModelWarning: it has no image processor.
@@ -81,10 +81,11 @@ def load(spec: str) -> Source:
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
-        network, found = getattr(transformers, kind.loader).from_pretrained(
+        check_fits(transformers, name, where, spec)
+        network, found = getattr(transformers, kind.loader or architecture).from_pretrained(
             name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
         )
-        _check_whole(found, spec)
+        _check_whole(network, found, spec)
         processor = processor_of(transformers, name, where)
     part = partial(_part, transformers, spec, name, where)
     return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part))
@@ -129,8 +130,9 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForSemanticSegmentation or ForObjectDetection in it, or one that compares pictures with texts, as CLIPModel. "
-        "Wrap another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
+        "ForSemanticSegmentation or ForObjectDetection in it, one that compares pictures with texts, as CLIPModel, "
+        "one that goes on in words, as LlavaForConditionalGeneration, or one that has features, as Dinov2Model. Wrap "
+        "another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
     )
 
 
@@ -166,10 +168,15 @@ def _near_folders(name: str) -> str:
     return f" (did you mean {' or '.join(near)}?)" if near else ""
 
 
-def _check_whole(told: Any, spec: str) -> None:
-    """Raise a ModelError where weights are not in the file: they would be random, and others at each load."""
+def _check_whole(network: Any, told: Any, spec: str) -> None:
+    """Raise a ModelError where weights are not in the file: they would be random, and others at each load.
+
+    A pooler that was never trained is left out: what it would read is the first token, and that is taken then.
+    """
     lacking = sorted({*told.get("missing_keys", ()), *(key for key, *_ in told.get("mismatched_keys", ()))})
-    if lacking:
+    if lacking and getattr(network, "pooler", None) and all(str(one).startswith("pooler.") for one in lacking):
+        network.pooler = None
+    elif lacking:
         shown = ", ".join(map(str, lacking[:3])) + (", ..." if len(lacking) > 3 else "")
         raise ModelError(
             f"model {spec}: its files lack {len(lacking)} of the network's weights ({shown}), which would be random. "
@@ -216,10 +223,7 @@ class _Detector(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         answer = self.network(pixel_values=images)
-        height, width = images.shape[2:]
-        middle, size = answer.pred_boxes.split(2, dim=-1)
-        corners = torch.cat([middle - size / 2, middle + size / 2], dim=-1)
-        boxes = corners * corners.new_tensor([width, height, width, height])
+        boxes = in_pixels(answer.pred_boxes, images)
         if answer.logits.shape[-1] > self.classes:
             return boxes, answer.logits.softmax(dim=-1)[..., :-1]
         return boxes, answer.logits.sigmoid()
@@ -239,7 +243,7 @@ KINDS = (
     Kind(
         _called("ForImageClassification"),
         "AutoModelForImageClassification",
-        _with_names(_Classifier),
+        features.also(_with_names(_Classifier)),
     ),
     Kind(
         _called("ForSemanticSegmentation"),
@@ -247,10 +251,21 @@ KINDS = (
         _with_names(_Segmenter),
     ),
     Kind(
+        lambda architecture, network: open_vocabulary.finds(architecture),
+        "AutoModelForZeroShotObjectDetection",
+        open_vocabulary.source,
+    ),
+    Kind(
         _called("ForObjectDetection"),
         "AutoModelForObjectDetection",
         _with_names(_Detector),
     ),
-    Kind(lambda architecture, network: zero_shot.compares(network), "AutoModel", zero_shot.source),
+    Kind(language.speaks, "AutoModelForImageTextToText", language.source),
+    Kind(
+        lambda architecture, network: zero_shot.compares(network),
+        "AutoModel",
+        features.also(zero_shot.source, reads_text=True),
+    ),
+    Kind(features.answers_with_features, "", features.source),
 )
 """Every kind that is read, the particular ones first."""
