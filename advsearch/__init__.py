@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from advsearch.api.explain import explain as explain
     from advsearch.api.gap import gap as gap
     from advsearch.api.harden import harden as harden
+    from advsearch.api.load_run import load_run as load_run
     from advsearch.api.model import load_model as load_model
     from advsearch.api.photos import photo_agreement as photo_agreement
     from advsearch.api.plan import plan as plan
@@ -30,16 +31,16 @@ if TYPE_CHECKING:
     from advsearch.api.replay import replay as replay
     from advsearch.api.stability import stability as stability
     from advsearch.api.sweep import sweep as sweep
+    from advsearch.engine.attack_result import AttackResult as AttackResult
     from advsearch.engine.loading import Scene as Scene
     from advsearch.engine.loading import load_scene as load_scene
-    from advsearch.engine.outcome import AttackResult as AttackResult
     from advsearch.engine.sweeps.answer import SweepResult as SweepResult
     from advsearch.models import Model as Model
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "AttackResult": "advsearch.engine.outcome",
+    "AttackResult": "advsearch.engine.attack_result",
     "Model": "advsearch.models",
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
@@ -50,6 +51,7 @@ _HOMES = {
     "gap": "advsearch.api.gap",
     "harden": "advsearch.api.harden",
     "load_model": "advsearch.api.model",
+    "load_run": "advsearch.api.load_run",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.api.photos",
     "plan": "advsearch.api.plan",

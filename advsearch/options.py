@@ -28,6 +28,8 @@ JOINED = "+"
 def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     """Return controls with ``{"mitsuba:KEY": RANGE}`` as ``{"mitsuba": {KEY: RANGE}}``, all keys together.
 
+    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``.
+
     Raises:
         InputError: a key has no range, or is given twice.
     """
@@ -35,7 +37,9 @@ def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     for name, given in controls.items():
         kind, colon, key = str(name).partition(":")
         if kind != BY_KEY or not colon:
-            found[name] = given
+            _, dot, parameter = str(name).partition(".")
+            alone = dot and ":" not in name and not (given is None or isinstance(given, Mapping))
+            found[name] = {parameter: given} if alone else given
         elif not key or given is None or given in ({}, ""):
             raise InputError(f"`controls` {name}: expected a range, as in {BY_KEY}:{key or 'KEY'}=[0.2, 0.8]")
         else:

@@ -247,7 +247,7 @@ def test_every_column_of_an_exported_table_is_in_the_page_about_runs() -> None:
     page = (DOCS / "runs.md").read_text("utf-8")
     said = {name for row in re.findall(r"^\| (`.*?) \|", page, re.M) for name in re.findall(r"`([a-z_]+)`", row)}
     assert not {*export.OWN, *export.AFTER} - said
-    assert {*export.OWN, *export.AFTER, "values"} == {one.name for one in fields(store.Row)}
+    assert {*export.OWN, *export.AFTER, "values", "metrics"} == {one.name for one in fields(store.Row)}
     assert all(f"`{format}`" in page for format in export.FORMATS)
 
 

@@ -166,6 +166,15 @@ class AttackConfig(DerivativeConfig):
         description="ground truth of each pixel, separated by commas, as layers of an EXR of the clean scene and the "
         "answer",
     )
+    metrics: dict[str, str] = setting(
+        dict,
+        "run",
+        "numbers of your own for every picture, each a column of the rows",
+        "NAME=package.module:function of image, output and truth",
+        flag="--metric",
+        metavar="NAME=FUNCTION",
+        form="assignments",
+    )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
         None, "run", "what is told of every evaluation as it comes, through its own package", otherwise="nothing"
     )

@@ -42,6 +42,7 @@ from advsearch.controls.values import (
     Spec,
     in_words,
     option_index,
+    plain,
     read,
     to_unit,
     to_value,
@@ -81,7 +82,7 @@ class NumberControl(Control, ABC):
         for setting in settings:
             if setting not in known:
                 raise UnknownNameError(f"setting of control {self.kind}", setting, known)
-        self._given = {setting: value for setting, value in settings.items() if value is not None}
+        self._given = {setting: plain(value) for setting, value in settings.items() if value is not None}
         self.chosen = {choice.name: self._given.get(choice.name, choice.default) for choice in self.choices}
         for choice in self.choices:
             choice.check(self.name, self.chosen[choice.name])

@@ -12,6 +12,7 @@ from torch import nn
 from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS
+from advsearch.engine.loading import MODEL, lent
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.ensemble import together
@@ -36,14 +37,15 @@ def scene_settings(fixed: Given | None, exposure: float | None) -> Given:
     return given
 
 
-def code_of(models: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
+def code_of(models: Iterable[str], kinds: Iterable[str], metrics: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the Python code that is imported for what is named: "package.module:attribute".
 
     Args:
         models: as `load_model` takes them.
         kinds: of the controls.
+        metrics: as settings name them.
     """
-    code = [named_code(name) for name in models]
+    code = [*(named_code(name) for name in models), *metrics]
     code += [name for name in kinds if CONTROLS.names_class(name)]
     return tuple(dict.fromkeys(name for name in code if name))
 
@@ -64,7 +66,8 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
         raise InputError(f"model: expected {len(parts)}, one for each task, got {len(asked)}")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(_load(one, own, config, alone=own is task) for one, own in zip(asked, parts, strict=True))
+        given = [(lent(MODEL, one) if isinstance(one, str) else None) or one for one in asked]
+        loaded = tuple(_load(one, own, config, alone=own is task) for one, own in zip(given, parts, strict=True))
     sentences = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
     for one in caught:
         if not issubclass(one.category, ModelWarning):

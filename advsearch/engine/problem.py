@@ -18,6 +18,7 @@ from advsearch.described import Value
 from advsearch.engine.answers import Described, Looked
 from advsearch.engine.asked import Asked
 from advsearch.engine.domains import domain_of
+from advsearch.engine.metrics import Metrics, mean_metrics, measured
 from advsearch.models import Model
 from advsearch.runs.results.plan import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
@@ -63,6 +64,7 @@ class Problem:
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
         printable: whether searches prefer colours that can be printed; see `print_terms`.
+        metrics: numbers of every picture that rows have beside what the task says.
         aovs: layers of ground truth that are kept of the clean scene and the answer (`scene.surfaces.AOVS`).
         domain: where a search may look: the searched controls.
         conditions: where the others are drawn from; None where there are none.
@@ -81,6 +83,7 @@ class Problem:
     search_depth: int | None = None
     printable: bool = False
     aovs: tuple[str, ...] = ()
+    metrics: Metrics = field(default_factory=dict)
     domain: Domain = field(init=False)
     conditions: Domain | None = field(init=False)
 
@@ -170,7 +173,8 @@ class Problem:
         with torch.no_grad():
             output, truth = self.model(picture), self.truth(whole)
             objective = float(self.objective(output, picture[None], truth, self.asked(whole))[0])
-            return replace(self.task.judge(output, truth)[0], objective=objective)
+            judgement = replace(self.task.judge(output, truth)[0], objective=objective)
+            return measured(judgement, self.metrics, picture, output, truth)
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
         """Return what shows the model's answer to a picture (H, W, 3) of the whole space at `whole`."""
@@ -282,7 +286,7 @@ class Problem:
         if on_image is not None and on_image.wants(index):
             on_image.tell(index, image)
         with torch.no_grad():
-            judgement = self.task.judge(output, truth)[0]
+            judgement = measured(self.task.judge(output, truth)[0], self.metrics, image, output, truth)
         evaluation = Evaluation(
             objective=float(value),
             gradient=derivative,
@@ -322,7 +326,10 @@ class Problem:
                 values = self.objective(outputs, pictures, truths[0], self.asked(*places))
             derivative = torch.autograd.grad(values.sum(), at)[0] if values.requires_grad else None
         with torch.no_grad():
-            said = [self.task.judge(output, truth)[0] for output, truth in zip(each, truths, strict=True)]
+            said = [
+                measured(self.task.judge(output, truth)[0], self.metrics, picture, output, truth)
+                for output, truth, picture in zip(each, truths, pictures, strict=True)
+            ]
         evaluations = [
             Evaluation(float(value), None, judgement.success, judgement=judgement)
             for value, judgement in zip(values.detach(), said, strict=True)
@@ -347,6 +354,7 @@ class Problem:
             with torch.no_grad():
                 output = self.task.average([output for _, output in found])
                 judgement = self.task.judge(output, self.truth())[0]
+        judgement = replace(judgement, metrics=mean_metrics([one.judgement for one in each]))
         return Evaluation(
             objective=sum(one.objective for one in each) / count,
             gradient=torch.stack(gradients).mean(dim=0) if gradients else gradient,

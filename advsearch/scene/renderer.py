@@ -12,6 +12,7 @@ get their derivative from a second one, which is the identity in the forward pas
 from __future__ import annotations
 
 import copy
+import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -20,13 +21,14 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 import torch
+from PIL import Image
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.description import OBJECT
-from advsearch.scene.formation import ImageFormation
+from advsearch.scene.formation import ImageFormation, levels_of
 from advsearch.scene.gradients.differences import central, one_sided, random_directions
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.motion import Motion, steps_for
@@ -109,6 +111,19 @@ class Renderer:
     @property
     def start(self) -> Tensor:
         return self.space.start
+
+    def __repr__(self) -> str:
+        height, width = self.formation.resolution
+        numbers = ", ".join(f"{group.name} ({group.size})" for group in self.space.groups)
+        return f"Renderer({len(self.start)} numbers: {numbers}; {height} x {width} pixels)"
+
+    def _repr_png_(self) -> bytes:
+        """The start as a notebook shows it; it does not count as a render."""
+        with torch.no_grad():
+            levels = levels_of(self.like()(self.start))
+        held = io.BytesIO()
+        Image.fromarray(levels.numpy()).save(held, "PNG")
+        return held.getvalue()
 
     def like(self, scene: MitsubaScene | None = None, **formation: Any) -> Renderer:
         """Return a renderer of the same space with another scene, or other fields of the image formation.

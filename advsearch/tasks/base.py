@@ -57,6 +57,8 @@ class Judgement:
         answer: what the model says.
         payload: what else is kept of it in the run's rows, as JSON values (boxes, masks); None where there is nothing.
         objective: what a search maximises, of this picture; None where nothing is searched.
+        metrics: numbers that the run's metrics say of this picture, by name, or None in the place of one that is none;
+            None where there are no metrics.
     """
 
     score: float
@@ -65,6 +67,7 @@ class Judgement:
     answer: Answer
     payload: JsonValue = None
     objective: float | None = None
+    metrics: Mapping[str, float | None] | None = None
 
     @classmethod
     def of(cls, score: float, margin: float, answer: Answer, payload: JsonValue = None) -> Judgement:
