@@ -124,11 +124,33 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     return torch.stack([print_terms.off_print(one, palette) for one in _pictures(colors)])
 
 
+# ---- as objectives --------------------------------------------------------------------------------------------------
+
+
+def check_aim(objective: object, *, targeted: bool) -> None:
+    """Check that one of these losses leads where a search is to go; any other objective passes.
+
+    Raises:
+        InputError: it needs a target that is not there, or would lead away from the one that is.
+    """
+    function = getattr(objective, "func", objective)  # of functools.partial
+    for name in (one for one in __all__ if f"targeted_{one}" in __all__):
+        if function is globals()[name] and targeted:
+            raise InputError(f"objective: losses.{name} leads away from the `target`; take losses.targeted_{name}")
+        if function is globals()[f"targeted_{name}"] and not targeted:
+            raise InputError(f"objective: losses.targeted_{name} needs a `target`; name one, or take losses.{name}")
+
+
 # ---- parts ----------------------------------------------------------------------------------------------------------
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
     """A loss of a label set; row by row where rows have different right answers."""
+    if not isinstance(labels, (Tensor, Sequence)):
+        raise InputError(
+            f"labels: expected (N,) int64 or the indices of a label set, got {type(labels).__name__}, the truth of "
+            "another task than classification; a loss of your own takes it as it is"
+        )
     if not isinstance(labels, Tensor):
         return loss(logits, logits, tuple(labels))
     each = [(int(one),) for one in labels.flatten()]

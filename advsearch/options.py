@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields
 from typing import Any
 
@@ -119,3 +120,22 @@ def as_setting(entry: Any) -> str | dict[str, JsonValue]:
 def told(given: object) -> str:
     """Return in words what was given in the place of an instance; of a class, what makes one of it."""
     return f"the class {given.__name__}; write {given.__name__}()" if isinstance(given, type) else f"{given!r:.80}"
+
+
+def check_takes(what: str, function: Callable[..., object], *names: str) -> None:
+    """Check that a user's function can be called with arguments by position.
+
+    Args:
+        what: "metrics: f", say.
+        function: what is called.
+        names: what it is given, for the message.
+
+    Raises:
+        InputError: it takes others.
+    """
+    try:
+        inspect.signature(function).bind(*names)
+    except ValueError:  # built in: nothing to look at
+        return
+    except TypeError as error:
+        raise InputError(f"{what}: expected a function of ({', '.join(names)}): {error}") from None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from advsearch import seeds
+from advsearch import losses, seeds
 from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
@@ -159,6 +159,7 @@ def attack(
         "metrics": metrics_as_settings(metrics or {}),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
+    losses.check_aim(objective, targeted=config.target is not None)
     parts = [f"the model {model_name(one)}" for one in several(model) if exists_here(one)]
     parts += ["the scene"] if scene.only_here else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
@@ -255,7 +256,7 @@ def parts_in(run: Path) -> AttackParts:
     Raises:
         InputError: only the Python session that asked has what judges it.
     """
-    if needed := [one for one in only_python_has(run) if not one.startswith(("the objective", "the policy"))]:
+    if needed := [one for one in only_python_has(run) if not one.startswith(SEARCHED_WITH)]:
         raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its answer")
     return _job(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
 
@@ -318,10 +319,14 @@ def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
         return False
 
 
+SEARCHED_WITH = ("the objective", "the policy", "the metric")
+"""How the parts of a run begin that say nothing of whether its answer is right."""
+
+
 def judged_alone(config: AttackConfig) -> AttackConfig:
-    """Return what an answer of a run is judged with: what counts as success needs neither an objective nor a policy
-    that only the session had which searched with them."""
-    change: dict[str, object] = {}
+    """Return what an answer of a run is judged with: what counts as success needs no metric, and neither an objective
+    nor a policy that only the session had which searched with them."""
+    change: dict[str, object] = {"metrics": {}}
     if config.objective is not None and config.objective not in OBJECTIVE_KINDS:
         change["objective"] = None
     if config.policy_name not in POLICIES:

@@ -34,7 +34,9 @@ from advsearch.engine.loading import (
 )
 from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, model_name
 from advsearch.engine.turn import in_turn
+from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.options import told
 from advsearch.settings import Config, as_python, is_shallow, settings
 
 Names = str | Sequence[str]
@@ -341,6 +343,12 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                 stack.enter_context(in_turn())
                 if "progress" in own.parameters:
                     plain["progress"] = stack.enter_context(watched(plain.get("progress")))
+                for key in {"task", "objective", "policy"} & plain.keys() - own.parameters.keys():
+                    if not isinstance(plain[key], (str, Mapping, type(None))):
+                        raise InputError(
+                            f"{key}: expected a name for {function.__name__}, got {told(plain[key])}; `attack` "
+                            "takes your own, and `sweep` a task of your own"
+                        )
                 for key in {"controls", "over"} & plain.keys() - own.parameters.keys():
                     if instances_in(plain[key]):
                         if only_here(plain[key]):

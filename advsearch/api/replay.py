@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, parts_in, problem_of_parts
+from advsearch.api.attack import LOADING, SEARCHED_WITH, parts_in, problem_of_parts
 from advsearch.api.keywords import ReplayKeywords, asks, configured
 from advsearch.config import ReplayConfig
 from advsearch.engine.attack_result import AttackParts, AttackResult
@@ -56,7 +56,8 @@ def replay(
         return replay_from_config(configured(ReplayConfig, answer=answer, **settings), progress=watcher(progress))
     if answer.run is None:
         raise InputError("answer: expected an attack that was kept, got one that was not; give it a `run`")
-    config = configured(ReplayConfig, answer=answer.run, **settings).with_only_here(only_here(answer.run))
+    needed = [one for one in only_here(answer.run) if not one.startswith(SEARCHED_WITH)]
+    config = configured(ReplayConfig, answer=answer.run, **settings).with_only_here(needed)
     return replay_from_config(
         config, progress=watcher(progress), parts=None if answer.parts is None else answer.parts()
     )

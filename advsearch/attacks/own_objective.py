@@ -15,12 +15,16 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.errors import InputError
+from advsearch.options import told
 
 ASKED = ("u", "texture", "textures", "inputs", "configuration")
 """What a function may ask for by the names of further parameters."""
 
 TRUTHS = ("target", "targets", "labels", "label", "truth")
 """What the second of two parameters is called in a loss of outputs and right answers alone."""
+
+IMAGES = ("images", "image")
+"""What the second of two parameters is called in a function that forgot the third."""
 
 More = Callable[[str], Any]
 """Gives what is asked for by one of the names in `ASKED`, at the configuration of each picture."""
@@ -60,6 +64,8 @@ def form_of(function: Callable[..., Any]) -> Form:
     Raises:
         InputError: it takes others.
     """
+    if isinstance(function, type):
+        raise InputError(f"objective: expected a name or a function (output, images, truth), got {told(function)}")
     try:
         signature = inspect.signature(function.forward if isinstance(function, nn.Module) else function)
     except ValueError:  # built in: nothing to look at
@@ -69,7 +75,8 @@ def form_of(function: Callable[..., Any]) -> Form:
         one.name for one in signature.parameters.values() if one.name in ASKED and one.name not in by_position[:2]
     )
     own = [name for name in by_position if name not in asked]
-    images = not (len(own) >= 2 and own[1] in TRUTHS)
+    images = not (len(own) >= 2 and (own[1] in TRUTHS or (len(own) == 2 and own[1] not in (*IMAGES, *ASKED))))
+    images = images or any(one.kind is one.VAR_POSITIONAL for one in signature.parameters.values())
     try:
         signature.bind(*([None] * (3 if images else 2)), **dict.fromkeys(asked))
     except TypeError as error:
@@ -94,7 +101,7 @@ def checked(function: Callable[..., Tensor]) -> Objective:
 
     def objective(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
         asked, count = {one: more(one) for one in form.asked}, images.shape[0]
-        given = (output, images, _labels(truth, output, count))
+        given = (output, images, labels_of(truth, output, count))
         try:
             values = function(*(given if form.images else given[::2]), **asked)
         except TypeError as error:
@@ -146,8 +153,8 @@ def _values(name: str, values: Any, count: int) -> Tensor:
     return found
 
 
-def _labels(truth: Any, output: Any, count: int) -> Any:
-    """The truth as a function gets it: a label set of one class as (N,) int64, anything else as it is."""
+def labels_of(truth: Any, output: Any, count: int) -> Any:
+    """Return the truth as a user's function gets it: a label set of one class as (N,) int64, anything else as it is."""
     if isinstance(truth, tuple) and len(truth) == 1 and isinstance(truth[0], int) and isinstance(output, Tensor):
         return torch.full((count,), truth[0], device=output.device)
     return truth

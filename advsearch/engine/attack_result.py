@@ -14,6 +14,7 @@ from advsearch.config import AttackConfig
 from advsearch.controls import Control
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel
+from advsearch.engine.objective import task_for
 from advsearch.engine.rendering import Rendering, render
 from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
@@ -149,7 +150,7 @@ class AttackResult:
         return render(
             shown,
             parts.loaded[0] if model is None else model,
-            task=parts.task,
+            task=parts.task if model is not None else task_for(parts.task, parts.loaded[0]),
             label=config.label,
             controls=parts.controls,
             at=self.u,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, ValuesView
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -42,7 +42,8 @@ from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
-"""One control or several, by name or instance; a mapping gives each name its settings, and ``mitsuba:KEY`` a range."""
+"""One control or several, by name or instance; a mapping gives each name its settings or
+its instance, and ``mitsuba:KEY`` a range."""
 
 Texture = str | Path | npt.ArrayLike | Tensor
 """A picture to paint an object with, see `load_scene`."""
@@ -287,47 +288,73 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
     Raises:
         InputError: not controls at all, or two of one name.
     """
-    if isinstance(controls, Mapping):
-        return {name: dict(given) for name, given in settings_by_name(controls).items()}
-    several = [controls] if isinstance(controls, Control) else controls
-    several = [part.strip() for part in several.split(",")] if isinstance(several, str) else several
-    as_controls(several)
-    return {
-        one.name if isinstance(one, Control) else one: one.settings() if isinstance(one, Control) else {}
-        for one in several
-        if one
-    }
+    asked = controls_by_name(controls)
+    if not isinstance(controls, Mapping):
+        as_controls(asked)
+    return {name: one.settings() if isinstance(one, Control) else dict(one) for name, one in asked.items()}
 
 
 def as_controls(controls: Controls) -> tuple[Control, ...]:
-    """Return control instances for whatever form they were given in.
+    """Return control instances for whatever form they were given in, in the order in which they were given.
 
     Raises:
         UnknownNameError: a name is not a control.
-        InputError: not controls at all.
+        InputError: not controls at all, or two of one name.
     """
+    asked = controls_by_name(controls)
+    ready = {name: one for name, one in asked.items() if isinstance(one, Control)}
+    named = gathered({name: {} if isinstance(one, Control) else one for name, one in asked.items()})
+    for name in ready:
+        if named[name]:
+            raise InputError(f"controls: {name} is given twice, by an instance and by name; say all of it in one")
+    return tuple(ready.get(name) or lent(CONTROL, name) or make_control(name, one) for name, one in named.items())
+
+
+def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
+    """Return instances and settings by name, in the order in which they were given.
+
+    Raises:
+        InputError: not controls at all, two of one name, or an instance under another name than its own.
+    """
+    if isinstance(controls, Mapping):
+        asked = dict(controls)
+        for name, one in asked.items():
+            if isinstance(one, type) or (isinstance(one, Control) and one.name != name):
+                got = f"one that is called {one.name}" if isinstance(one, Control) else told(one)
+                raise InputError(
+                    f"`controls` {name}: expected settings, or an instance of that name, got {got}; instances stand in "
+                    "a list as well, controls=[...]"
+                )
+    else:
+        asked = _listed(controls)
+    ready = {name: one for name, one in asked.items() if isinstance(one, Control)}
+    named = settings_by_name({**asked, **dict.fromkeys(ready)})
+    return {name: ready.get(name, given) for name, given in named.items()}
+
+
+def _listed(controls: str | Control | Iterable[object]) -> dict[str, object]:
+    """Return controls that were given without settings, by name: an instance, or None."""
     if isinstance(controls, str):
         controls = [part.strip() for part in controls.split(",") if part.strip()]
-    if isinstance(controls, Control):
-        controls = [controls]
-    if not isinstance(controls, Mapping):
-        listed = list(controls) if isinstance(controls, Iterable) else [controls]
-        for one in listed:
-            if not isinstance(one, (str, Control)):
-                raise InputError(f"controls: expected names or Control instances, got {told(one)}")
-        ready = tuple(one for one in controls if isinstance(one, Control))
-        if ready and len(ready) == len(controls):
-            return ready
-        names = [one for one in controls if isinstance(one, str)]
-        if len(set(names)) != len(names):
-            raise InputError(f"controls: every instance needs a name of its own, got {', '.join(names)}")
-        return ready + as_controls({one: {} for one in names})
-    return tuple(lent(CONTROL, name) or make_control(name, given) for name, given in gathered(controls).items())
+    listed: list[object] = list(controls) if isinstance(controls, Iterable) else [controls]
+    found: dict[str, object] = {}
+    for one in listed:
+        if not isinstance(one, (str, Control)):
+            raise InputError(f"controls: expected names or Control instances, got {told(one)}")
+        name = one if isinstance(one, str) else one.name
+        if name in found:
+            raise InputError(
+                f"controls: every instance needs a name of its own, got {name} twice; write KIND:NAME, such as "
+                "light:key,light:fill"
+            )
+        found[name] = one if isinstance(one, Control) else None
+    return found
 
 
 def instances_in(controls: object) -> list[Control]:
     """Return the instances among controls."""
-    listed = controls if isinstance(controls, (list, tuple)) else [controls]
+    listed = controls.values() if isinstance(controls, Mapping) else controls
+    listed = listed if isinstance(listed, (list, tuple, ValuesView)) else [listed]
     return [one for one in listed if isinstance(one, Control)]
 
 

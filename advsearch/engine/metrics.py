@@ -13,14 +13,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advsearch.attacks.own_objective import labels_of
 from advsearch.errors import InputError
+from advsearch.options import check_takes
 from advsearch.registry import check_import, current_directory_importable
 from advsearch.runs.export import AFTER, OWN
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import Output, Truth, mean
 
 Metric = Callable[[Tensor, Any, Any], Any]
-"""f(image, output, truth), which returns a number, or numbers by name."""
+"""f(image, output, truth), which returns a number, or numbers by name. Where one name is right, `truth` is its index, a
+tensor without axes."""
 
 Metrics = Mapping[str, Metric]
 """Metrics by the names of their columns."""
@@ -36,12 +39,14 @@ def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
         InputError: one is no function, or its name is that of a column that rows have already.
     """
     if not isinstance(metrics, Mapping) or not all(isinstance(name, str) for name in metrics):
-        raise InputError(f"metrics: expected a mapping from names to functions, got {metrics!r:.80}")
+        raise InputError(f'metrics: expected a mapping from names to functions, as {{"f": f}}, got {metrics!r:.80}')
     for name, function in metrics.items():
         if name in (*OWN, *AFTER) or not name:
             raise InputError(f"metrics: {name!r} is a column that rows have already; choose another name")
         if not (callable(function) or isinstance(function, str)):
             raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {function!r:.80}")
+        if not isinstance(function, str):
+            check_takes(f"metrics: {name}", function, "image", "output", "truth")
     return {name: one if isinstance(one, str) else _text(one) for name, one in metrics.items()}
 
 
@@ -118,7 +123,7 @@ def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Outp
         metrics: by name.
         image: (H, W, 3) sRGB in [0, 1].
         output: of the model, of one picture.
-        truth: as the task has it.
+        truth: as the task has it; a metric gets it as an objective does, of one picture.
 
     Raises:
         InputError: a metric returns something else than numbers.
@@ -126,9 +131,11 @@ def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Outp
     if not metrics:
         return judgement
     found: dict[str, float | None] = {}
+    labels = labels_of(truth, output, 1)
+    right = labels[0] if isinstance(labels, Tensor) else labels
     with torch.no_grad():
         for name, metric in metrics.items():
-            said = metric(image.detach(), output[0], truth)
+            said = metric(image.detach().clone(), output[0], right)
             if isinstance(said, Mapping):
                 found |= {f"{name}.{key}": _number(f"{name}.{key}", one) for key, one in said.items()}
             else:

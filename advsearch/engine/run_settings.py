@@ -8,7 +8,7 @@ from typing import Any
 
 from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
 from advsearch.controls.values import is_number
-from advsearch.engine.loading import CONTROL, Controls, as_controls, lent, settings_of
+from advsearch.engine.loading import CONTROL, Controls, as_controls, controls_by_name, lent
 from advsearch.errors import InputError, UnknownNameError
 
 
@@ -36,21 +36,21 @@ class RunSettings:
         Raises:
             InputError: an instance takes a setting that is given here.
         """
-        ready: tuple[Control, ...] = ()
-        if not isinstance(controls, (str, Mapping)):
-            controls = [controls] if isinstance(controls, Control) else list(controls)
-            as_controls(controls)  # refuses what is none
-            ready = tuple(one for one in controls if isinstance(one, Control))
-            controls = [one for one in controls if isinstance(one, str)]
-        named = settings_of(controls)
-        for one in (*ready, *(found for name in named if (found := lent(CONTROL, name)))):
-            for choice in _counting(type(one), one.settings()):
+        asked = controls_by_name(controls)
+        as_controls(controls)  # refuses what is none
+        for one in (one if isinstance(one, Control) else lent(CONTROL, name) for name, one in asked.items()):
+            for choice in _counting(type(one), one.settings()) if one is not None else ():
                 if choice.run_setting and getattr(self, choice.run_setting) is not None:
                     raise InputError(
                         f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
                         f"{type(one).__name__}({choice.name}=...)"
                     )
-        return ready + as_controls({asked: {**self._taken(asked, given), **given} for asked, given in named.items()})
+        return as_controls(
+            {
+                name: one if isinstance(one, Control) else {**self._taken(name, one), **one}
+                for name, one in asked.items()
+            }
+        )
 
     def _taken(self, asked: str, given: Mapping[str, object]) -> dict[str, object]:
         """What one control takes, by the names of its own settings."""

@@ -47,7 +47,7 @@ Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 
 
 class InputSpace(Protocol):
-    """What the renderer asks of a space: its start, its groups, and what a configuration does."""
+    """What the renderer and a loop of one's own ask of a space: its start, its groups, what a configuration does."""
 
     @property
     def start(self) -> Tensor:
@@ -62,6 +62,12 @@ class InputSpace(Protocol):
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Change the finished picture; differentiable."""
+
+    def printed(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the colours that are searched, (h, w, 3) or (h, w, 4), by control; differentiable."""
+
+    def numbers(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the numbers of the configuration, in their units, by name; differentiable."""
 
 
 class Renderer:

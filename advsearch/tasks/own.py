@@ -10,7 +10,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.options import FROM_RUN
+from advsearch.options import FROM_RUN, check_takes
 from advsearch.tasks.base import Answer, Facts, Task
 
 MOST_NUMBERS = 4
@@ -81,8 +81,12 @@ def own_task(function: Callable[[Any, Facts], Tensor]) -> OwnTask:
         function: `judge(output, truth)`, with the outputs of the model for N pictures (N, ...), and `Facts`: what is
             true of the scene in this configuration, such as `truth.number("pose.yaw")`, `truth.mask` or `truth.label`.
             It returns (N,), or a number for one picture: over 0 exactly where the output is wrong, differentiable.
+
+    Raises:
+        InputError: it takes other arguments.
     """
     name = getattr(function, "__name__", type(function).__name__)
+    check_takes(f"task {name}", function, "output", "truth")
     kind: Any = type(name, (OwnTask,), {"name": name})
     made: OwnTask = kind(function=function)
     return made

@@ -22,8 +22,10 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.api.watching import BarProgress, LineProgress, NotebookProgress, watched
-from advsearch.controls import PoseControl
+from advsearch.controls import LightControl, PoseControl
 from advsearch.engine.attack_result import AttackResult
+from advsearch.engine.loading import as_controls, instances_in, settings_of
+from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import NullProgress
@@ -160,11 +162,25 @@ def test_an_answer_is_rendered_under_another_view(attacked: AttackResult, tmp_pa
 
 def test_an_answer_of_another_session_is_rendered_with_what_its_run_names(tmp_path: Path) -> None:
     asked: dict[str, Any] = {**FAST, "resolution": 32, "steps": 1}
-    found = advsearch.attack("mug", controls="pose.yaw", policy="random", run=tmp_path / "run", **asked)
-    loaded = advsearch.load_run(tmp_path / "run")
-    assert isinstance(loaded, AttackResult)
+    controls: list[Any] = ["pose.yaw", LightControl()]
+    metrics = {"here": lambda image, output, truth: image.mean()}
+    run = tmp_path / "run"
+    found = advsearch.attack("mug", controls=controls, policy="random", metrics=metrics, run=run, **asked)
+    loaded = advsearch.load_run(run)
+    assert isinstance(loaded, AttackResult) and found.summary.controls == ["pose", "light"]
     one, other = (result.render(spp=4) for result in (found, loaded))
     assert torch.equal(one.views[0].picture, other.views[0].picture) and one.model == other.model == "reference"
+
+
+def test_the_answer_of_several_models_is_rendered(scene: advsearch.Scene) -> None:
+    """Each of them says what it sees."""
+    both = [
+        advsearch.load_model(Bright(one), labels=["mug", "vase"], input_size=SIDE, name=f"{one}") for one in (0.0, 1.0)
+    ]
+    asked: dict[str, Any] = {**FAST, "steps": 1, "policy": "random"}
+    found = advsearch.attack(scene, both, ensemble="worst", controls="pose.yaw", **asked)
+    assert found.render(spp=4).views[0].answers[0].label == "mug; vase"
+    assert found.render(both[1], spp=4).views[0].answers[0].label == "vase"
 
 
 def test_what_an_answer_says_is_not_set_beside_it(scene: advsearch.Scene, model: advsearch.Model) -> None:
@@ -240,6 +256,22 @@ def test_metrics_are_columns_of_a_sweep_and_of_one_that_goes_on(
     assert [row.metrics for row in again.rows()] == [row.metrics for row in whole.rows()]
 
 
+def test_a_metric_gets_a_picture_of_its_own_and_a_label_as_losses_do(scene: advsearch.Scene) -> None:
+    def spoils(image: Tensor, output: Tensor, truth: Tensor) -> Tensor:
+        image.zero_()
+        return nn.functional.cross_entropy(output, truth)
+
+    def light(image: Tensor, output: Tensor, truth: Tensor) -> Tensor:
+        return image.mean()
+
+    metrics, unsure = {"loss": spoils, "light": light}, advsearch.load_model(Bright(0.42), labels=["mug", "vase"])
+    swept = advsearch.sweep(scene, unsure, {"pose.yaw": [0, 90]}, metrics=metrics, trials=0, **PICTURE)
+    for row in swept.rows():
+        loss, seen = row.metrics["loss"], row.metrics["light"]
+        assert row.margin is not None and loss == pytest.approx(np.log1p(np.exp(row.margin)), rel=1e-4, abs=1e-6)
+        assert seen is not None and seen > 0.1
+
+
 def _other() -> Callable[..., float]:
     def both(image: Tensor, output: Tensor, truth: Any) -> float:
         return 1.0
@@ -260,6 +292,7 @@ def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Mod
         batches_of(settings)(range(1))
     refused: list[tuple[Any, str]] = [
         ({"f": 3}, "f: expected a function"),
+        ({"f": lambda image, output: 0.0}, r"f: expected a function of \(image, output, truth\): too many"),
         ({"margin": red}, "a column that rows have"),
     ]
     for wrong, words in refused:
@@ -331,6 +364,35 @@ def test_labels_numbers_and_ranges_come_as_they_are(scene: advsearch.Scene) -> N
         found = advsearch.attack(scene, Bright(), labels=["mug", "vase"], controls=controls, **asked)
         yaw = (found.summary.configuration or {})["pose.yaw"]
         assert (yaw.low, yaw.high) == pytest.approx((10.0, 20.0))
+
+
+def test_a_mapping_may_have_instances(scene: advsearch.Scene) -> None:
+    """In the order in which they are given, which is that of a file."""
+    given: dict[str, Any] = {"pose.yaw": {}, "light": LightControl(), "camera": None}
+    for controls in (given, ["pose.yaw", given["light"], "camera"]):
+        made = as_controls(controls)
+        assert [one.name for one in made] == ["pose", "light", "camera"] and made[1] is given["light"]
+        assert list(settings_of(controls)) == [*given] and instances_in(controls) == [made[1]]
+        assert [one.name for one in RunSettings(epsilon=None).given_to(controls)] == ["pose", "light", "camera"]
+    refused: list[tuple[Any, str]] = [
+        (
+            {"mine": LightControl()},
+            "mine: expected settings, or an instance of that name, got one that is called light",
+        ),
+        ({"light": LightControl}, r"light: .* got the class LightControl; write LightControl\(\)"),
+        ([LightControl(), "light.power"], "light is given twice, by an instance and by name"),
+        ([LightControl(), LightControl()], "a name of its own, got light twice"),
+    ]
+    for wrong, words in refused:
+        with pytest.raises(InputError, match=words):
+            scene.renderer(wrong)
+
+
+@pytest.mark.parametrize("key", ["task", "objective", "policy"])
+def test_what_a_question_takes_by_name_alone_it_says(key: str) -> None:
+    given: dict[str, Any] = {key: lambda output, truth: output}
+    with pytest.raises(InputError, match=f"^{key}: expected a name for gap, got <function .*; `attack` takes your own"):
+        advsearch.gap("mug", **given)
 
 
 def test_a_detector_is_told_what_it_is() -> None:

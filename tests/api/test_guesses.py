@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch import losses
 from advsearch.attacks import Random
+from advsearch.attacks.own_objective import form_of
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.tasks import Classification, Facts, make_task
@@ -66,7 +68,42 @@ def test_a_class_in_the_place_of_an_instance_is_told_how_to_be_one(scene: advsea
         advsearch.attack(scene, easy(), policy=Random)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"task: .* got the class Classification; write Classification\(\)"):
         make_task(Classification)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"objective: .* got the class CrossEntropyLoss; write CrossEntropyLoss\(\)"):
+        advsearch.attack(scene, easy(), objective=nn.CrossEntropyLoss)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"task wrong: expected a function of \(output, truth\): too many positional"):
+        make_task(wrong)  # type: ignore[arg-type]
     assert scene.renderer(PoseControl(yaw=[0, 10]), resolution=8).start.shape == (1,)
+
+
+def wrong(output: Tensor) -> Tensor:
+    """It is told nothing of what is right."""
+    return output[:, 0]
+
+
+def test_two_parameters_are_an_output_and_labels_whatever_they_are_called() -> None:
+    assert not form_of(lambda x, y: x).images and form_of(lambda x, z, y: x).images
+    assert form_of(lambda *given: given[0]).images
+    functions: list[Any] = [lambda logits, images: logits, lambda logits, texture: logits]
+    for one in functions:
+        with pytest.raises(InputError, match=r"takes \(output, images, truth\) or \(output, labels\)"):
+            form_of(one)
+
+
+def test_a_loss_that_leads_the_wrong_way_is_refused(scene: advsearch.Scene) -> None:
+    with pytest.raises(InputError, match=r"losses.targeted_margin needs a `target`; name one, or take losses.margin"):
+        advsearch.attack(scene, easy(), objective=losses.targeted_margin)
+    sure = functools.partial(losses.carlini_wagner, confidence=3.0)
+    with pytest.raises(InputError, match=r"losses.carlini_wagner leads away from the `target`; take losses.targeted_"):
+        advsearch.attack(scene, easy(), objective=sure, target="bowl")
+    with pytest.raises(InputError, match=r"labels: .* got Facts, the truth of another task than classification"):
+        losses.margin(torch.zeros(1, 2), Facts("mug"))  # type: ignore[arg-type]
+
+
+def test_a_space_has_what_a_loss_can_ask_for(scene: advsearch.Scene) -> None:
+    """Type checkers know it: mypy reads this test."""
+    render = scene.renderer({"texture": {"resolution": 4}, "pose": {"yaw": [0, 90]}}, resolution=8)
+    assert render.space.printed(render.start)["texture"].shape == (4, 4, 3)
+    assert float(render.space.numbers(render.start)["pose.yaw"]) == pytest.approx(0.0, abs=1e-4)
 
 
 def test_a_function_is_a_task(scene: advsearch.Scene) -> None:
