@@ -128,7 +128,7 @@ def attack(
         policy: a name, a mapping with a `name` and options, or an instance.
         over: controls that vary by chance: the answer has to hold for all of their values.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
-            truth) that return a number, or a dict of some. `workers` need functions of a module.
+            truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory only.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.

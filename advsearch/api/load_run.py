@@ -12,6 +12,7 @@ from torch import Tensor
 from advsearch.api.attack import parts_in
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.errors import InputError
 from advsearch.files import read_bytes
 from advsearch.report.tables import CurveTable, GapTable
 from advsearch.runs.answer import read_answer
@@ -38,8 +39,11 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
 
     Raises:
         UnknownNameError: there is no such run.
+        InputError: it is neither a name nor a folder.
         FileFormatError: it has not ended, or its files are damaged.
     """
+    if not isinstance(run, (str, Path)):
+        raise InputError(f"run: expected the name of a run or its folder, got {run!r:.80}")
     path = find_run(run)
     result = read_result(path)
     if isinstance(result, AttackSummary):

@@ -104,7 +104,7 @@ def sweep(
             draws; `summary.beside` compares the two. Where neither `grid` nor `controls` is given, what the attack was
             over varies.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
-            truth) that return a number, or a dict of some. `workers` need functions of a module.
+            truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
         progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
@@ -112,6 +112,8 @@ def sweep(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
+    if not isinstance(grid, (Mapping, type(None))):
+        raise InputError(f"grid: expected a mapping from parameters to values, got {type(grid).__name__}")
     brought = _brought(answer_of, varies=bool(grid) or bool(controls))
     if scene is None and not brought:
         raise InputError("scene: expected what load_scene returns or takes, got nothing; name one")

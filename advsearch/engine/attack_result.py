@@ -28,6 +28,7 @@ from advsearch.runs.results.attack import (
     AttackSummary,
 )
 from advsearch.scene.settings import Given
+from advsearch.settings import as_python
 from advsearch.tasks import Task
 
 if TYPE_CHECKING:
@@ -125,6 +126,7 @@ class AttackResult:
                 default as in the attack.
 
         Raises:
+            TypeError: there is no such keyword.
             InputError: the answer sets one of `settings` itself, or has other numbers than the scene takes.
         """
         if self.parts is None:
@@ -132,8 +134,12 @@ class AttackResult:
                 "render: expected a result of this session, got one from another process; load_run(FOLDER) has it "
                 "with all that it needs"
             )
+        if unknown := sorted(options.keys() - RenderKeywords.__annotations__):
+            known = ", ".join(["model", "scene", "camera", "settings", *RenderKeywords.__annotations__])
+            raise TypeError(f"render() got an unexpected keyword argument {unknown[0]!r}; it takes {known}")
         parts = self.parts()
         config = parts.config
+        camera, settings = as_python(camera), as_python(settings)
         shown = parts.scene if scene is None else scene if isinstance(scene, Scene) else load_scene(scene)
         if isinstance(camera, Mapping):
             settings, camera = {**(settings or {}), **{f"camera.{name}": one for name, one in camera.items()}}, None

@@ -132,6 +132,10 @@ def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.
     assert isinstance(loaded, RegionResult) and loaded == region
     with pytest.raises(UnknownNameError):
         advsearch.load_run(tmp_path / "none")
+    with pytest.raises(InputError, match=r"^run: expected the name of a run or its folder, got SweepResult\("):
+        advsearch.load_run(swept)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^grid: expected a mapping from parameters to values, got list"):
+        advsearch.sweep(scene, model, [("pose.yaw", [0, 90])])  # type: ignore[arg-type]
     (tmp_path / "region" / "summary.json").unlink()
     with pytest.raises(FileFormatError, match="did the run end"):
         advsearch.load_run(tmp_path / "region")
@@ -151,8 +155,11 @@ def test_an_answer_is_rendered_under_another_view(attacked: AttackResult, tmp_pa
     assert elsewhere.scene.environment_name == "noon" and elsewhere.views[0].picture.shape == (24, 24, 3)
     clean = advsearch.render("mug", Bright(), **plain)
     assert (clean.views[0].picture - same.views[0].picture).abs().max() > 4.0 / 255.0
-    above = attacked.render(camera={"elevation": 80.0}, spp=64).views[0].picture
+    above = attacked.render(camera={"elevation": np.float32(80.0)}, spp=64).views[0].picture
     assert (above - same.views[0].picture).abs().mean() > 0.01
+    words: Any = {"environment": "noon"}
+    with pytest.raises(TypeError, match="unexpected keyword argument 'environment'; it takes model, scene, camera"):
+        attacked.render(**words)
     with pytest.raises(UnknownNameError, match="camera of the scene"):
         attacked.render(camera="none")
     other = pickle.loads(pickle.dumps(attacked))
