@@ -131,16 +131,25 @@ def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Outp
     if not metrics:
         return judgement
     found: dict[str, float | None] = {}
-    labels = labels_of(truth, output, 1)
-    right = labels[0] if isinstance(labels, Tensor) else labels
+    seen, right = _of_one(output, truth)
     with torch.no_grad():
         for name, metric in metrics.items():
-            said = metric(image.detach().clone(), output[0], right)
+            said = metric(image.detach().clone(), seen, right)
             if isinstance(said, Mapping):
                 found |= {f"{name}.{key}": _number(f"{name}.{key}", one) for key, one in said.items()}
             else:
                 found[name] = _number(name, said)
     return replace(judgement, metrics=found)
+
+
+def _of_one(output: Output, truth: Truth) -> tuple[Any, Any]:
+    """The output and the truth of one picture as a metric gets them; of several models, a tuple of each."""
+    one = output[0]
+    if isinstance(one, (tuple, list)):
+        each = [_of_one(own, true) for own, true in zip(one, truth, strict=True)]
+        return tuple(seen for seen, _ in each), tuple(right for _, right in each)
+    labels = labels_of(truth, output, 1)
+    return one, labels[0] if isinstance(labels, Tensor) else labels
 
 
 def mean_metrics(judgements: Sequence[Judgement | None]) -> dict[str, float | None] | None:

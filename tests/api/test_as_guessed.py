@@ -180,12 +180,17 @@ def test_an_answer_of_another_session_is_rendered_with_what_its_run_names(tmp_pa
 
 
 def test_the_answer_of_several_models_is_rendered(scene: advsearch.Scene) -> None:
-    """Each of them says what it sees."""
+    """Each of them says what it sees, and a metric gets what each of them says."""
+
+    def least(image: Tensor, output: tuple[Tensor, ...], truth: tuple[Tensor, ...]) -> Tensor:
+        return torch.stack([one[right] for one, right in zip(output, truth, strict=True)]).min()
+
     both = [
         advsearch.load_model(Bright(one), labels=["mug", "vase"], input_size=SIDE, name=f"{one}") for one in (0.0, 1.0)
     ]
     asked: dict[str, Any] = {**FAST, "steps": 1, "policy": "random"}
-    found = advsearch.attack(scene, both, ensemble="worst", controls="pose.yaw", **asked)
+    found = advsearch.attack(scene, both, ensemble="worst", controls="pose.yaw", metrics={"least": least}, **asked)
+    assert all((row.metrics["least"] or 0.0) < 0.0 for row in found.rows()), "of the one that sees a vase"
     assert found.render(spp=4).views[0].answers[0].label == "mug; vase"
     assert found.render(both[1], spp=4).views[0].answers[0].label == "vase"
 
