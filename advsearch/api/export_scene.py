@@ -47,7 +47,8 @@ class AnsweredRun:
     def on_picture(self) -> list[str]:
         """The controls that change the finished picture there."""
         grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
-        slices = self.problem.space.slices(self.u)
+        space = self.problem.space
+        slices = zip(space.controls, self.u.split(space.sizes), strict=True)
         return [control.name for control, part in slices if not torch.equal(control.picture(part, grey), grey)]
 
     @property

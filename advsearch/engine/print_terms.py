@@ -50,7 +50,8 @@ def off_print(colors: Tensor) -> Tensor:
 
 def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
     """Both terms, summed over what is to be printed."""
-    found = [colors for control, part in space.slices(u) if (colors := control.printed(part)) is not None]
+    slices = zip(space.controls, u.split(space.sizes), strict=True)
+    found = [colors for control, part in slices if (colors := control.printed(part)) is not None]
     if not found:
         raise InputError(
             "printable: expected a search over the colours of a texture or a patch, got "
