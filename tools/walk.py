@@ -1,7 +1,7 @@
 """How far one question walks through the code: python tools/walk.py [CHECKOUT]
 
-A walk is what runs between two pictures that are shown to the network, a third of the way through a run: the rest of one
-evaluation and the beginning of the next, with whatever is logged and kept in between. For each it counts calls,
+A walk is what runs between two pictures that are shown to the network, a third of the way through a run: the rest of
+one evaluation and the beginning of the next, with whatever is logged and kept in between. For each it counts calls,
 functions, files, and changes from one file to another, of the package's own code. Then counts from the syntax trees:
 functions that a setting passes through, classes that declare it, functions that judge an answer, and private functions
 that are called in one place.
@@ -69,6 +69,11 @@ Step = tuple[str, str]
 """File and function."""
 
 
+def _name(frame: FrameType) -> str:
+    """The name of what a frame runs, with its class's (Python 3.11 and newer)."""
+    return str(getattr(frame.f_code, "co_qualname", frame.f_code.co_name))
+
+
 class Tracer:
     """Keeps which functions of the package are called, in order, and where among these the network was shown a picture.
 
@@ -84,8 +89,8 @@ class Tracer:
         code = frame.f_code
         if event != "call" or not code.co_filename.startswith(PACKAGE) or code.co_name in ("<genexpr>", "<listcomp>"):
             return
-        self.steps.append((code.co_filename.removeprefix(PACKAGE), code.co_qualname))
-        if code.co_qualname == "Model.__call__":
+        self.steps.append((code.co_filename.removeprefix(PACKAGE), _name(frame)))
+        if self.steps[-1][1] == "Model.__call__":
             self.pictures.append(len(self.steps))
 
     def walk(self) -> list[Step]:
@@ -108,7 +113,7 @@ def traced(command: list[str]) -> Tracer:
             status = main([*command, "--run", f"{folder}/run"])
         finally:
             sys.setprofile(None)
-            threading.setprofile(None)  # type: ignore[arg-type]
+            threading.setprofile(None)
     if status:
         raise SystemExit(f"{' '.join(command)} ended with status {status}")
     return tracer

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,9 @@ from advsearch.engine.problem import OnImage
 from advsearch.engine.rows import judgement_of
 from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.replay import Entry, LoggedEvaluation, LoggedJudgement
-from advsearch.runs.store import Row
+from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of, to_8_bit
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement
 
 PLAN = "gradient plan"
 """The note under which the store keeps how derivatives are obtained."""
@@ -71,6 +70,7 @@ class Memory:
         self._run = run
         self.counts: dict[str, int] = {} if run is None else run.store.counts()
         self._trials: dict[tuple[str, int], Row] = {}
+        self._pictures: dict[tuple[str, int], Tensor] = {}
         if run is not None and self.counts:
             for kind in self.counts:
                 if is_search(kind):
@@ -83,8 +83,12 @@ class Memory:
 
     def evaluation(self, kind: str, number: int) -> Evaluation | None:
         """Return an evaluation that is read back, or None."""
-        log = None if self._run is None else self._run.replay
-        return _evaluation(log.read(kind, number)) if log is not None and (kind, number) in log else None
+        stored = self._stored(kind, number)
+        return None if stored is None else _evaluation(*stored)
+
+    def _stored(self, kind: str, number: int) -> tuple[Row, Told] | None:
+        """What the store has of an evaluation; None once the run is done."""
+        return None if self._run is None or not self.holds(kind, number) else self._run.store.told(kind, number)
 
     def evaluator(
         self,
@@ -93,7 +97,7 @@ class Memory:
         frames: Frames | None = None,
         on_read: Callable[[str, int, Tensor], None] = lambda kind, index, u: None,
     ) -> Evaluate:
-        """Return the evaluation that reads back what the log has of this kind, and adds to it what it has not.
+        """Return the evaluation that reads back what the store has of this kind, and makes what it has not.
 
         Args:
             kind: of search.
@@ -104,38 +108,46 @@ class Memory:
         Raises:
             InputError: when called, if another configuration is proposed than the one that was stored.
         """
-        kept: dict[int, Tensor] = {}
 
         def told(index: int, image: Tensor) -> None:
             if frames is not None:
-                kept[index] = frames.add(image)
+                self._pictures[kind, index] = frames.add(image)
 
-        evaluate = make(None if frames is None else OnImage(frames.wants, told))
+        evaluate, count = make(None if frames is None else OnImage(frames.wants, told)), 0
         if self._run is None:
             return evaluate
-        log, count = self._run.replay, 0
 
         def remembered(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
             nonlocal count
             number, count = count, count + 1
-            if (kind, number) in log:
-                entry = log.read(kind, number)
-                self._check(entry, u, index)
-                on_read(kind, index, u)
-                if frames is not None and "picture" in entry.arrays:
-                    frames.add(torch.from_numpy(entry.arrays["picture"]).float() / 255.0)
-                return _evaluation(entry)
-            begun = time.perf_counter()
-            found = evaluate(u, index=index, gradient=gradient, **({} if samples == 1 else {"samples": samples}))
-            log.append(_entry(kind, number, index, u, found, kept.pop(index, None), time.perf_counter() - begun))
-            return found
+            stored = self._stored(kind, number)
+            if stored is None:
+                return evaluate(u, index=index, gradient=gradient, **({} if samples == 1 else {"samples": samples}))
+            row, told = stored
+            self._check(kind, number, told, u, index)
+            on_read(kind, index, u)
+            if frames is not None and told.picture is not None:
+                frames.add(torch.from_numpy(told.picture.copy()).float() / 255.0)
+            return _evaluation(row, told)
 
         return remembered
+
+    def told(self, kind: str, index: int, u: Tensor, evaluation: Evaluation) -> Told:
+        """Return what an evaluation told its search beside its row, with the picture that was kept of it."""
+        picture, gradient = self._pictures.pop((kind, index), None), evaluation.gradient
+        return Told(
+            number=index,
+            u=_digest(u),
+            non_finite=evaluation.non_finite,
+            cost=evaluation.cost,
+            gradient=None if gradient is None else gradient.detach().numpy(),
+            picture=None if picture is None else levels_of(picture).numpy(),
+        )
 
     def clock(self, kind: str, steps: int, seconds: float | None) -> Callable[[int], bool] | None:
         """Return what says whether the time of a search is over, that of its earlier lives included.
 
-        An evaluation that is read back never ends the search before the one after which it was ended; if the log has
+        An evaluation that is read back never ends the search before the one after which it was ended; if the store has
         renders of the ranking, that is the last one before these.
 
         Args:
@@ -145,10 +157,10 @@ class Memory:
         """
         if seconds is None:
             return None
-        entries = list(self._entries(kind))
-        explored = [entry for entry in entries if entry.facts.index < steps]
-        left = seconds - math.fsum(entry.facts.seconds for entry in explored)
-        ended, begun = len(entries) > len(explored), time.perf_counter()
+        stored = [one for number in range(self.counts.get(kind, 0)) if (one := self._stored(kind, number)) is not None]
+        explored = [row for row, told in stored if told.number < steps]
+        left = seconds - math.fsum(row.seconds or 0.0 for row in explored)
+        ended, begun = len(stored) > len(explored), time.perf_counter()
 
         def late(count: int) -> bool:
             if count < len(explored):
@@ -156,14 +168,6 @@ class Memory:
             return ended or time.perf_counter() - begun >= left
 
         return late
-
-    def _entries(self, kind: str) -> Iterator[Entry]:
-        if self._run is None:
-            return
-        log, number = self._run.replay, 0
-        while (kind, number) in log:
-            yield log.read(kind, number)
-            number += 1
 
     def trial(self, kind: str, number: int) -> Judgement | None:
         """Return a trial that was made already, or None; one of an older run that does not say what was right, too."""
@@ -190,11 +194,11 @@ class Memory:
             f"objective or scene are not those that it began with; take these again, or {again}"
         )
 
-    def _check(self, entry: Entry, u: Tensor, index: int) -> None:
-        if entry.facts.u != _digest(u) or entry.facts.index != index:
+    def _check(self, kind: str, number: int, told: Told, u: Tensor, index: int) -> None:
+        if told.u != _digest(u) or told.number != index:
             path, again = ("", "") if self._run is None else (self._run.path, self._run.again)
             raise InputError(
-                f"{path}: cannot go on: evaluation {entry.number} of the {entry.kind} is another one now than it was, "
+                f"{path}: cannot go on: evaluation {number} of the {kind} is another one now than it was, "
                 f"so advsearch, its packages or the number of threads have changed since; {again}"
             )
 
@@ -204,41 +208,17 @@ def is_search(kind: str) -> bool:
     return kind == "baseline" or kind.startswith("search")
 
 
-def _entry(
-    kind: str, number: int, index: int, u: Tensor, found: Evaluation, picture: Tensor | None, seconds: float
-) -> Entry:
-    facts = LoggedEvaluation(
-        index=index,
-        u=_digest(u),
-        objective=found.objective.hex() if found.finite else str(found.objective),
-        success=found.success,
-        non_finite=found.non_finite,
-        cost=found.cost,
-        seconds=seconds,
-        judgement=None if found.judgement is None else LoggedJudgement.of(found.judgement),
-    )
-    arrays = {}
-    if found.gradient is not None:
-        arrays["gradient"] = found.gradient.detach().numpy()
-    if picture is not None:
-        arrays["picture"] = levels_of(picture).numpy()
-    return Entry(kind, number, facts, arrays)
-
-
-def _evaluation(entry: Entry) -> Evaluation:
-    facts, gradient = entry.facts, entry.arrays.get("gradient")
-    text, told = facts.objective, facts.judgement
+def _evaluation(row: Row, told: Told) -> Evaluation:
+    judgement = None if row.correct is None else judgement_of(row)
     return Evaluation(
-        objective=float.fromhex(text) if "x" in text else float(text),
-        gradient=None if gradient is None else torch.from_numpy(gradient),
-        success=facts.success,
-        non_finite=facts.non_finite,
-        cost=facts.cost,
-        judgement=None
-        if told is None
-        else Judgement(told.score, told.margin, told.right, Answer(**vars(told.answer)), told.payload),
+        objective=math.nan if row.objective is None else row.objective,
+        gradient=None if told.gradient is None else torch.from_numpy(told.gradient.copy()),
+        success=bool(row.success),
+        non_finite=told.non_finite,
+        cost=told.cost,
+        judgement=judgement,
     )
 
 
-def _digest(u: Tensor) -> str:
-    return hashlib.blake2b(np.ascontiguousarray(u.detach().numpy()).tobytes(), digest_size=16).hexdigest()
+def _digest(u: Tensor) -> bytes:
+    return hashlib.blake2b(np.ascontiguousarray(u.detach().numpy()).tobytes(), digest_size=16).digest()

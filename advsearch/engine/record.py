@@ -161,7 +161,8 @@ class Recorder:
             renders=renders * problem.draws,
             machine=self._machine(),
         )
-        self.run.record(row if evaluation.judgement is None else judged(row, evaluation.judgement))
+        row = row if evaluation.judgement is None else judged(row, evaluation.judgement)
+        self.run.record(row, told=self._memory.told(kind, record.index, u, evaluation))
 
     def trial(
         self,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
-from advsearch.runs import images, lock, made_with, replay, store, summary, tracking
+from advsearch.runs import database, images, lock, made_with, store, summary, tracking
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 from advsearch.yaml_text import LARGEST
 
@@ -40,6 +40,9 @@ OBJECT_FILE = f"{ARTIFACTS}/object.glb"
 AOV_FOLDER = "aov"
 """Of a sweep: the ground truth of each picture, by its number."""
 
+OLD_LOG = "replay.bin"
+"""What a search needed to go on, of an older advsearch; now it is in the store."""
+
 PARTS = "parts"
 """Runs that a study consists of."""
 
@@ -55,7 +58,7 @@ CONTENTS = (
     f"{store.NAME}-wal",
     f"{store.NAME}-shm",
     f"{store.NAME}-journal",
-    replay.NAME,
+    OLD_LOG,
     summary.NAME,
     REPORT,
     COLUMNS,
@@ -83,7 +86,6 @@ class RunDirectory:
         self.path = path
         self._lock = held
         self._began = True
-        self._replay: replay.ReplayLog | None = None
         self._tracker: tracking.Tracker | None = None
         self.store = store.Store(path / store.NAME)
 
@@ -187,6 +189,7 @@ class RunDirectory:
         try:
             if config is not None:
                 opened._check_same(config)
+                opened._check_goes_on()
                 opened._note_sitting(config)
         except BaseException:
             opened.close()
@@ -199,6 +202,11 @@ class RunDirectory:
         if self.store.note(ONLY_HERE) is not None:
             return "start again where it was asked, in Python"
         return f"start again with advsearch run {self.path / CONFIG}"
+
+    def _check_goes_on(self) -> None:
+        """Refuse a search that an older advsearch has begun: it kept what searches were told elsewhere."""
+        if (self.path / OLD_LOG).exists():
+            raise InputError(f"{self.path}: cannot go on: it was begun by an older advsearch; {self.again}")
 
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
@@ -224,16 +232,9 @@ class RunDirectory:
             raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got a damaged note")
         return noted
 
-    @property
-    def replay(self) -> replay.ReplayLog:
-        """What searches were told; made when it is first asked for."""
-        if self._replay is None:
-            self._replay = replay.ReplayLog(self.path / replay.NAME)
-        return self._replay
-
     def finish(self) -> None:
         """Remove what only a run that goes on needs."""
-        self.replay.remove()
+        self.store.forget()
 
     def write_config(self, config: Config) -> Path:
         """Write `run.yaml`, from which `advsearch run` repeats the run, and return its path.
@@ -258,13 +259,17 @@ class RunDirectory:
         if now not in before:
             self.store.set_note(made_with.NOTE, json.dumps([*before, now]))
 
-    def record(self, *rows: store.Row) -> None:
+    def record(self, *rows: store.Row, told: store.Told | None = None) -> None:
         """Add evaluated configurations to the results; they survive a kill when this returns (see `store`).
+
+        Args:
+            rows: of them.
+            told: what the last of them told its search beside its row.
 
         Raises:
             StorageError: the disk is full or cannot be written; none of these rows is kept.
         """
-        self.store.append(rows)
+        self.store.append(rows, told)
         if self._tracker is not None:
             self._tracker.rows(rows)
 
@@ -313,8 +318,6 @@ class RunDirectory:
         """Close the results and give up the lock; a second call does nothing."""
         self._told()
         self.store.close()
-        if self._replay is not None:
-            self._replay.close()
         self._lock.release()
 
     def _told(self) -> None:
@@ -327,8 +330,6 @@ class RunDirectory:
         """Remove what this run wrote, and the directory if that leaves it empty."""
         self._told()
         self.store.close()
-        if self._replay is not None:
-            self._replay.close()
         with suppress(OSError):
             _clear(self.path)
             _remove_if_bare(self.path)
@@ -437,7 +438,7 @@ def only_here(path: Path) -> list[str]:
 
 def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
-    if store.is_ours(path / store.NAME):
+    if database.is_ours(path / store.NAME):
         return True
     from advsearch.settings import HEADER
 
@@ -497,12 +498,12 @@ def _clear(path: Path) -> None:
 
 def _never_began(path: Path) -> bool:
     """Whether a run was killed before its settings were written: there is nothing in it to lose."""
-    if (path / CONFIG).exists() or not store.is_ours(path / store.NAME):
+    if (path / CONFIG).exists() or not database.is_ours(path / store.NAME):
         return False
     with suppress(AdvsearchError):
         if (path / summary.NAME).exists():
             return False
-        if store.is_bare(path / store.NAME):
+        if database.is_bare(path / store.NAME):
             return True
         with store.Store(path / store.NAME, read_only=True) as results:
             return results.count() == 0

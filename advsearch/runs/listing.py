@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
-from advsearch.runs import lock, replay, store, summary
+from advsearch.runs import database, lock, store, summary
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.runs.results.base import Result
 from advsearch.settings import read_yaml
@@ -54,9 +54,15 @@ def listed(folder: Path) -> list[Listed]:
 
 def finished(path: Path) -> bool:
     """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
-    if (path / replay.NAME).exists():
+    if not (path / summary.NAME).is_file() or summary.read_result(path).goes_on:
         return False
-    return (path / summary.NAME).is_file() and not summary.read_result(path).goes_on
+    return not database.is_ours(path / store.NAME) or not goes_on(path)
+
+
+def goes_on(path: Path) -> bool:
+    """Whether a run keeps what a search needs to go on."""
+    with store.Store(path / store.NAME, read_only=True) as results:
+        return results.goes_on
 
 
 def described(path: Path, *, counts: bool = True) -> Listed:

@@ -10,100 +10,31 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, final, get_args, get_type_hints
 
+import numpy as np
+from numpy.typing import NDArray
+
 from advsearch.described import Value
 from advsearch.errors import FileFormatError
-from advsearch.files import JsonValue, open_regular, parse_json
+from advsearch.files import JsonValue, parse_json
+from advsearch.runs.database import DAMAGED, check_schema, check_version, connect_to_read, connect_to_write, readable
 from advsearch.runs.files import storage_errors
 from advsearch.runs.results.base import plain
 
 NAME = "results.sqlite"
-
-_DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
-
-LARGEST = 64 << 30
-"""Most bytes of it."""
-
-APPLICATION_ID = 0x41445653
-"""In the header of every results.sqlite that is ours: "ADVS"."""
 
 SYNC_INTERVAL = 1.0
 """Least seconds between two forced writes to the disk; what a power cut may cost."""
 
 SYNC_SHARE = 0.02
 """Largest share of the time that forced writes may take."""
-
-MIGRATIONS = (
-    """
-    -- How this file came to be; times are UTC. PRAGMA user_version is the number of migrations it has been through.
-    CREATE TABLE meta (
-        key   TEXT PRIMARY KEY,
-        value TEXT NOT NULL
-    ) WITHOUT ROWID;
-    INSERT INTO meta VALUES ('created', strftime('%Y-%m-%dT%H:%M:%SZ', 'now'));
-
-    -- One row for each evaluated configuration, in the order in which they were evaluated.
-    CREATE TABLE evaluations (
-        id          INTEGER PRIMARY KEY, -- grows by one
-        kind        TEXT    NOT NULL,    -- what it was for: search, baseline, verification, control, ...
-        step        INTEGER NOT NULL,    -- step or trial within its kind, from 0
-        seed        INTEGER,             -- of the render
-        spp         INTEGER,             -- samples per pixel of the render
-        objective   REAL,                -- what was maximised; NULL when it was not a number
-        success     INTEGER,             -- 1 when the model was wrong, 0 when right, NULL when not judged
-        label       TEXT,                -- the class that the model answered
-        label_index INTEGER,             -- its number
-        probability REAL,                -- the model's probability for it, in [0, 1]
-        values_json TEXT    NOT NULL,    -- {"camera.azimuth": {"value": 130.0, "unit": "degrees"}, ...}
-        seconds     REAL,                -- that the evaluation took
-        time        REAL    NOT NULL     -- when the row was written, seconds since 1970 (UTC)
-    );
-    CREATE INDEX evaluations_kind ON evaluations (kind, step);
-    """,
-    """
-    -- Pictures that the evaluation took: more than one where derivatives came from differences, or it was rendered
-    -- with a multiple of the samples. NULL in rows of version 1.
-    ALTER TABLE evaluations ADD COLUMN renders INTEGER;
-    """,
-    """
-    -- What the model said, whatever a search was after. NULL in older rows, but those of a sweep, where `success` said
-    -- that the model was wrong; now a sweep's rows have no success: nothing is sought there.
-    ALTER TABLE evaluations ADD COLUMN correct INTEGER; -- 1 when the answer was a right one, else 0
-    ALTER TABLE evaluations ADD COLUMN margin REAL;     -- largest logit of a wrong class minus largest of a right one
-    UPDATE evaluations SET correct = coalesce(success = 0, 0), margin = objective, success = NULL WHERE kind = 'sweep';
-    """,
-    """
-    -- What a task keeps of an answer beside its words, as JSON (boxes, masks). NULL where it keeps nothing, and in
-    -- older rows.
-    ALTER TABLE evaluations ADD COLUMN payload_json TEXT;
-    """,
-    """
-    -- A step of a kind is there once, whoever writes it how often.
-    DELETE FROM evaluations WHERE id NOT IN (SELECT min(id) FROM evaluations GROUP BY kind, step);
-    DROP INDEX evaluations_kind;
-    CREATE UNIQUE INDEX evaluations_step ON evaluations (kind, step);
-    -- What the row was evaluated on, by its name in the note "machines". NULL for the machine that wrote the row.
-    ALTER TABLE evaluations ADD COLUMN machine TEXT;
-    """,
-    """
-    -- What a task says of an answer, over 0 where it is what is sought. Before, `objective` held it in all rows but
-    -- those of searches, of which it is not known (NULL).
-    ALTER TABLE evaluations ADD COLUMN score REAL;
-    UPDATE evaluations SET score = objective, objective = NULL
-        WHERE kind <> 'baseline' AND substr(kind, 1, 6) <> 'search';
-    """,
-)
-"""What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
 
 @dataclass(frozen=True)
@@ -155,11 +86,37 @@ class Row:
     id: int | None = None
 
 
+@dataclass(frozen=True)
+class Told:
+    """What an evaluation told its search beside its row. A policy's state follows from what it has been told, so a
+    search goes on by being told all of that again.
+
+    Attributes:
+        number: of its seed.
+        u: digest of the configuration.
+        non_finite: numbers of the gradient that were not.
+        cost: in evaluations.
+        gradient: (d,) float32; None where none was wanted.
+        picture: (H, W, 3) uint8; None where it is not kept.
+    """
+
+    number: int
+    u: bytes
+    non_finite: int
+    cost: int
+    gradient: NDArray[np.float32] | None = None
+    picture: NDArray[np.uint8] | None = None
+
+
+_TOLD = "number, u, non_finite, cost, gradient, picture, height"
 _AS_JSON = ("payload", "values")
 _COLUMNS = tuple(f"{one.name}_json" if one.name in _AS_JSON else one.name for one in fields(Row))
 _INSERT = (
     f"INSERT INTO evaluations ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) ON CONFLICT DO NOTHING"
 )
+
+
+_INSERT_TOLD = "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations WHERE kind = ? AND step = ?"
 
 
 @final
@@ -178,15 +135,15 @@ class Store:
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
         self._next_sync = -math.inf
-        with _readable(path):
-            self._db = _connect_to_read(path) if read_only else _connect_to_write(path)
-            _check_version(self._db, path)
-            _check_schema(self._db, path)
+        with readable(path):
+            self._db = connect_to_read(path) if read_only else connect_to_write(path)
+            check_version(self._db, path)
+            check_schema(self._db, path)
 
-    def append(self, rows: Iterable[Row]) -> None:
+    def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
         """Add rows in one transaction; they survive a kill of the process when this returns.
 
-        A row whose kind and step are there already changes nothing.
+        A row whose kind and step are there already changes nothing. What it `told` is that of the last one.
 
         Raises:
             StorageError: the disk is full or can't be written; none of these rows is kept.
@@ -197,6 +154,8 @@ class Store:
             self._db.execute(f"PRAGMA synchronous = {'FULL' if force else 'NORMAL'}")
             with self._db:
                 self._db.executemany(_INSERT, (_encode(row, stamp) for row in rows))
+                if told is not None:
+                    self._db.execute(_INSERT_TOLD, (*_encoded(told), rows[-1].kind, rows[-1].step))
         if force:
             ended = time.monotonic()
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
@@ -209,30 +168,70 @@ class Store:
             after: the id behind which to begin.
         """
         where, given = ("id > ?", (after,)) if kind is None else ("id > ? AND kind = ?", (after, kind))
-        with _readable(self.path):
+        with readable(self.path):
             cursor = self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", given)
         while (values := self._next(cursor)) is not None:
             yield _decode(values, self.path)
 
     def row(self, kind: str, step: int) -> Row | None:
         """Return the last row of a kind with a step; None where there is none."""
-        with _readable(self.path):
+        with readable(self.path):
             found = self._db.execute(
                 f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE kind = ? AND step = ? ORDER BY id DESC LIMIT 1",
                 (kind, step),
             ).fetchone()
         return None if found is None else _decode(found, self.path)
 
+    def told(self, kind: str, step: int) -> tuple[Row, Told] | None:
+        """Return a row of a search with what it told; None where there is none, or the run is done."""
+        row = self.row(kind, step)
+        with readable(self.path):
+            found = row and self._db.execute(f"SELECT {_TOLD} FROM told WHERE row = ?", (row.id,)).fetchone()
+        return (row, _told(found, self.path)) if row and found else None
+
+    def pictures(self, kind: str, after: int, until: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield the number and the picture of what the rows of a kind with these ids have told, while the run goes on.
+
+        Args:
+            kind: of search.
+            after: the id behind which to begin.
+            until: the last id.
+        """
+        with readable(self.path):
+            cursor = self._db.execute(
+                "SELECT number, u, non_finite, cost, NULL, picture, height FROM told JOIN evaluations ON row = id "
+                "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id",
+                (kind, after, until),
+            )
+        while (values := self._next(cursor)) is not None:
+            one = _told(values, self.path)
+            assert one.picture is not None
+            yield one.number, one.picture
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether there is something that searches were told: the run is not done."""
+        with readable(self.path):
+            return bool(self._db.execute("SELECT EXISTS (SELECT * FROM told)").fetchone()[0])
+
+    def forget(self) -> None:
+        """Remove what searches were told: the run is done."""
+        with storage_errors(self.path):
+            with self._db:
+                anything = self._db.execute("DELETE FROM told").rowcount
+            if anything:
+                self._db.execute("VACUUM")
+
     def last_step(self, kind: str) -> int:
         """Return the largest step of a kind; -1 where there is none."""
-        with _readable(self.path):
+        with readable(self.path):
             found = self._db.execute("SELECT max(step) FROM evaluations WHERE kind = ?", (kind,)).fetchone()[0]
         return -1 if found is None else int(found)
 
     def count(self, kind: str | None = None) -> int:
         """Return how many rows there are, or how many of one kind."""
         where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
-        with _readable(self.path):
+        with readable(self.path):
             return int(self._db.execute(f"SELECT count(*) FROM evaluations{where}", given).fetchone()[0])
 
     def curve(self, kind: str) -> list[tuple[int, float | None]]:
@@ -242,7 +241,7 @@ class Store:
     def missing(self, kind: str, count: int) -> Iterator[range]:
         """Yield the steps from 0 to `count` of which there is no row of a kind, neighbours together."""
         expected = 0
-        with _readable(self.path):
+        with readable(self.path):
             cursor = self._db.execute("SELECT step FROM evaluations WHERE kind = ? ORDER BY step", (kind,))
         while (found := self._next(cursor)) is not None:
             if found[0] > expected:
@@ -252,18 +251,18 @@ class Store:
             yield range(expected, count)
 
     def _next(self, cursor: sqlite3.Cursor) -> Any:
-        with _readable(self.path):
+        with readable(self.path):
             return cursor.fetchone()
 
     def counts(self) -> dict[str, int]:
         """Return how many rows there are of each kind."""
-        with _readable(self.path):
+        with readable(self.path):
             found = self._db.execute("SELECT kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind").fetchall()
         return {str(kind): count for kind, count in found}
 
     def note(self, key: str) -> str | None:
         """Return what was noted under `key`, or None."""
-        with _readable(self.path):
+        with readable(self.path):
             found = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
         return None if found is None else str(found[0])
 
@@ -277,7 +276,7 @@ class Store:
         try:
             return None if text is None else parse_json(text)
         except ValueError as error:
-            raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {_DAMAGED}") from None
+            raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {DAMAGED}") from None
 
     def set_note(self, key: str, value: str) -> None:
         """Keep a text under `key`, in place of what was there.
@@ -299,116 +298,6 @@ class Store:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def is_ours(path: Path) -> bool:
-    """Return whether the file at `path` starts like a results.sqlite of advsearch."""
-    try:
-        with open_regular(path, "a results.sqlite", LARGEST) as file:
-            header = file.read(72)
-    except (OSError, FileFormatError):
-        return False
-    return header[:15] == b"SQLite format 3" and header[68:72] == APPLICATION_ID.to_bytes(4, "big")
-
-
-def is_bare(path: Path) -> bool:
-    """Return whether the file at `path`, which is ours, has no tables yet: its process was killed as it made them."""
-    with _readable(path), closing(_connect_to_read(path)) as db:
-        return _version(db) == 0 and not _schema(db)
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Turn what SQLite says of a damaged file inside the block into an error that names it."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        text = repr(str(error))[1:-1][:200]  # it quotes what is in the file
-        raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {text}; {_DAMAGED}") from error
-
-
-def _check_schema(db: sqlite3.Connection, path: Path) -> None:
-    """Check that the file has what `MIGRATIONS` make and no more: a view or a trigger is code, and may never end."""
-    if _schema(db) != _own_schema():
-        db.close()
-        raise FileFormatError(f"{path}: expected the tables of a run, got others; {_DAMAGED}")
-
-
-@cache
-def _own_schema() -> frozenset[Any]:
-    with closing(sqlite3.connect(":memory:")) as db:
-        _migrate(db)
-        return _schema(db)
-
-
-def _schema(db: sqlite3.Connection) -> frozenset[Any]:
-    """Return the tables and the like, and the columns of the rows; a column that is computed is another one."""
-    parts = db.execute("SELECT type, name FROM sqlite_master WHERE name NOT LIKE 'sqlite%'").fetchall()
-    columns = db.execute("PRAGMA table_xinfo(evaluations)").fetchall()
-    return frozenset([*parts, *((name, kind, hidden) for _, name, kind, *_, hidden in columns)])
-
-
-def _connect_to_write(path: Path) -> sqlite3.Connection:
-    """Open or make the file and bring it up to date."""
-    if path.is_symlink():
-        raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {_DAMAGED}")
-    if path.exists():
-        open_regular(path, "a results.sqlite", LARGEST).close()
-    with storage_errors(path):
-        db = sqlite3.connect(path)
-        version = _version(db)
-        if version == 0:
-            _make(db)
-        _migrate(db)
-    return db
-
-
-def _make(db: sqlite3.Connection) -> None:
-    """Start an empty file. There is nothing in it to lose yet, so the disk isn't waited for."""
-    db.execute("PRAGMA synchronous = OFF")
-    db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
-    db.execute("PRAGMA journal_mode = WAL")
-
-
-def _connect_to_read(path: Path) -> sqlite3.Connection:
-    """Open the file for reading; where the log's index can't be made (a read-only disk), as one that never changes."""
-    if not os.path.isfile(path):
-        raise FileFormatError(f"{path}: expected the results of a run, got no such file; check the name of the run")
-    address = path.resolve().as_uri()
-    db = sqlite3.connect(f"{address}?mode=ro", uri=True)
-    try:
-        _version(db)
-    except sqlite3.OperationalError:
-        db.close()
-        db = sqlite3.connect(f"{address}?immutable=1", uri=True)
-    return _migrated_copy(db) if 0 < _version(db) < len(MIGRATIONS) else db
-
-
-def _migrated_copy(db: sqlite3.Connection) -> sqlite3.Connection:
-    """An older file's contents in memory, as the present version has them; the file stays as it is."""
-    copy = sqlite3.connect(":memory:")
-    db.backup(copy)
-    db.close()
-    _migrate(copy)
-    return copy
-
-
-def _migrate(db: sqlite3.Connection) -> None:
-    """Bring a file up to date."""
-    for number, script in enumerate(MIGRATIONS[_version(db) :], start=_version(db) + 1):
-        db.executescript(f"BEGIN; {script} PRAGMA user_version = {number}; COMMIT;")
-
-
-def _version(db: sqlite3.Connection) -> int:
-    return int(db.execute("PRAGMA user_version").fetchone()[0])
-
-
-def _check_version(db: sqlite3.Connection, path: Path) -> None:
-    version = _version(db)
-    if version != len(MIGRATIONS):
-        db.close()
-        advice = "use a newer advsearch" if version > len(MIGRATIONS) else "it is not a finished results.sqlite"
-        raise FileFormatError(f"{path}: expected version {len(MIGRATIONS)} of the results, got {version}; {advice}")
 
 
 _FIELDS = tuple(one.name for one in fields(Row))
@@ -461,10 +350,33 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
         except ValueError:
             wrong = ["payload_json"]
     if wrong:
-        raise FileFormatError(f"{path}: row {given['id']!r}: expected another type of {wrong[0]}; {_DAMAGED}")
+        raise FileFormatError(f"{path}: row {given['id']!r}: expected another type of {wrong[0]}; {DAMAGED}")
     for name in ("success", "correct"):
         given[name] = None if given[name] is None else bool(given[name])
     return Row(**given)
+
+
+def _encoded(told: Told) -> tuple[Any, ...]:
+    arrays = [None if one is None else one.tobytes() for one in (told.gradient, told.picture)]
+    height = None if told.picture is None else len(told.picture)
+    return told.number, told.u, told.non_finite, told.cost, *arrays, height
+
+
+def _told(values: tuple[Any, ...], path: Path) -> Told:
+    number, u, non_finite, cost, gradient, picture, height = values
+    try:
+        if [type(one) for one in (number, u, non_finite, cost)] != [int, bytes, int, int]:
+            raise TypeError("a number that is none")
+        return Told(
+            number,
+            u,
+            non_finite,
+            cost,
+            gradient=None if gradient is None else np.frombuffer(gradient, np.float32),
+            picture=None if picture is None else np.frombuffer(picture, np.uint8).reshape(height, -1, 3),
+        )
+    except (TypeError, ValueError) as error:
+        raise FileFormatError(f"{path}: expected what a search was told, got something else ({error})") from None
 
 
 def _values(text: str) -> dict[str, Value] | None:

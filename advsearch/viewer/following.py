@@ -7,26 +7,27 @@ from itertools import islice
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
+from numpy.typing import NDArray
+
 from advsearch.report.markup import Html, element
-from advsearch.runs import listing, lock, replay, store
+from advsearch.runs import listing, lock, store
 from advsearch.runs.directory import PARTS, REPORT
-from advsearch.runs.replay import Entry
 from advsearch.runs.results.base import plain
 from advsearch.runs.store import Row
 from advsearch.viewer.document import data_script, data_url, document
 from advsearch.viewer.thumbnails import thumbnail
 
-MOST_ROWS, MOST_ENTRIES = 2000, 200
-"""Evaluations, and entries with pictures, that are sent at once; the page asks for the rest."""
+MOST_ROWS = 2000
+"""Evaluations that are sent at once; the page asks for the rest."""
 
-START = "0-0"
-"""Where a page begins: the last row, and the place in the log, that it has."""
+START = 0
+"""Where a page begins: the last row that it has."""
 
 
 def goes_on(run: Path) -> bool:
     """Whether a run has no page that says what came out: none at all, or one of an attack that is being resumed."""
-    report = run / REPORT
-    return not report.is_file() or (lock.is_held(run) and (run / replay.NAME).is_file())
+    return not (run / REPORT).is_file() or (lock.is_held(run) and listing.goes_on(run))
 
 
 def following_page(name: str, run: Path) -> str:
@@ -50,34 +51,29 @@ def following_page(name: str, run: Path) -> str:
     )
 
 
-def progress(run: Path, after: str) -> bytes:
+def progress(run: Path, after: int) -> bytes:
     """Return what is new in a run as JSON.
 
     Args:
         run: its folder.
-        after: what `next` was in the answer before, or `START`: two whole numbers.
+        after: what `next` was in the answer before, or `START`.
 
     Raises:
         FileFormatError: what it keeps is damaged.
     """
-    row, place = map(int, after.split("-"))
+    last = after
     running, ended = lock.is_held(run), not goes_on(run)  # before what it has is read: what comes later is asked for
     rows: list[Row] = []
+    pictures: list[dict[str, object]] = []
     if (run / store.NAME).is_file():
         with store.Store(run / store.NAME, read_only=True) as results:
-            rows = list(islice(results.rows(after=row), MOST_ROWS))
-    row = rows[-1].id or row if rows else row
-    pictures = []
-    for count, (entry, behind) in enumerate(replay.entries(run / replay.NAME, place)):
-        if count == MOST_ENTRIES:
-            break
-        place = behind
-        if "picture" in entry.arrays and entry.kind == "search":
-            pictures.append(_shown(entry))
+            rows = list(islice(results.rows(after=after), MOST_ROWS))
+            last = (rows[-1].id or after) if rows else after
+            pictures = [_shown(*one) for one in results.pictures("search", after, last)]
     answer: dict[str, object] = {
         "rows": [_told(one) for one in rows],
         "pictures": pictures,
-        "next": f"{row}-{place}",
+        "next": last,
         "running": running,
         "ended": ended,
     }
@@ -90,9 +86,9 @@ def _told(row: Row) -> dict[str, object]:
     return {**found, "values": values}
 
 
-def _shown(entry: Entry) -> dict[str, object]:
-    picture = thumbnail(entry.arrays["picture"].astype("float32") / 255.0)
-    return {"step": entry.facts.index, "picture": data_url(picture, "image/jpeg")}
+def _shown(number: int, picture: NDArray[np.uint8]) -> dict[str, object]:
+    shown = thumbnail(picture.astype("float32") / 255.0)
+    return {"step": number, "picture": data_url(shown, "image/jpeg")}
 
 
 def _parts(run: Path) -> Html | None:

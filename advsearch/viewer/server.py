@@ -296,10 +296,10 @@ class _Handler(BaseHTTPRequestHandler):
         return _html(report.read_bytes(), "../../")
 
     def _progress(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        after = query.get("after", [START])[0]
-        if not re.fullmatch(r"[0-9]{1,15}-[0-9]{1,15}", after):
-            raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row and a place")
-        return "application/json", progress(self._run(name), after)
+        after = query.get("after", [str(START)])[0]
+        if not re.fullmatch(r"[0-9]{1,15}", after):
+            raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
+        return "application/json", progress(self._run(name), int(after))
 
     def _part(self, _query: Mapping[str, list[str]], name: str, part: str) -> tuple[str, bytes]:
         """The page of one of the attacks that a study consists of, where the study's page links to it."""

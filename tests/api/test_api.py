@@ -19,7 +19,7 @@ from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
-from advsearch.runs.listing import listed
+from advsearch.runs.listing import goes_on, listed
 from advsearch.runs.store import Row, Store
 
 SIZE = 32
@@ -180,11 +180,11 @@ def test_a_stopped_run_goes_on_where_it_was(
 
         patch.setattr(Problem, "evaluator", interrupted)
         stopped = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **options)
-    assert stopped.summary.ending == "interrupted" and (tmp_path / "run" / "replay.bin").exists()
+    assert stopped.summary.ending == "interrupted" and goes_on(tmp_path / "run")
     again = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", resume=True, **options)
     assert torch.equal(again.u, whole.u) and again.summary.verified == whole.summary.verified
     assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole")
-    assert not (tmp_path / "run" / "replay.bin").exists()
+    assert not goes_on(tmp_path / "run")
 
 
 def rows_of(run: Path) -> list[Row]:

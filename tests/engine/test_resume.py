@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import random
 import signal
@@ -11,7 +10,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,11 +26,10 @@ from advsearch.engine.memory import Memory
 from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
-from advsearch.runs import store
+from advsearch.runs import database
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.replay import Entry, LoggedEvaluation, LoggedJudgement, ReplayLog
-from advsearch.runs.results.render import ClassAnswer
-from advsearch.runs.store import Row
+from advsearch.runs.listing import goes_on
+from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import Config
 
 POLICIES = ("pgd", "auto", "random", "cmaes")
@@ -78,12 +76,12 @@ def test_killed_at_random_moments_it_ends_with_the_same_rows(tmp_path: Path, pol
         capture_output=True,
         text=True,
         timeout=300,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "tests")},
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join((str(ROOT / "tests"), str(ROOT)))},
     )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 5, "it was hardly killed"
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
-    assert not (tmp_path / "run" / "replay.bin").exists()
+    assert not goes_on(tmp_path / "run")
 
 
 def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
@@ -101,7 +99,7 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
         memory = Memory(run)
         attack = attack_on(problem, config, make_policy("pgd"), memory, Stages(NullProgress()), run)
         assert attack.carry_out().interrupted
-    assert (tmp_path / "run" / "replay.bin").exists()
+    assert goes_on(tmp_path / "run")
     found = carry_out(tmp_path / "run", config, resume=True)
     assert found.search is not None and len(found.search.history) == 25
     assert len(found.frames) == 25  # those from before the interrupt too
@@ -139,8 +137,9 @@ def test_an_interrupt_of_the_check_keeps_the_answer_and_going_on_verifies_it(
 def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         problem: Any = StandInProblem()
-        evaluate = Memory(run).evaluator("search", lambda tell: problem.evaluator("search", tell))
-        evaluate(torch.full((6,), 0.5), index=0, gradient=False)
+        memory, u = Memory(run), torch.full((6,), 0.5)
+        found = memory.evaluator("search", lambda tell: problem.evaluator("search", tell))(u, index=0, gradient=False)
+        run.record(Row("search", 0, objective=found.objective), told=memory.told("search", 0, u, found))
         again = Memory(run).evaluator("search", lambda tell: problem.evaluator("search", tell))
         with pytest.raises(InputError, match="cannot go on: evaluation 0 of the search is another one now"):
             again(torch.full((6,), 0.4), index=0, gradient=False)
@@ -204,48 +203,27 @@ def test_a_run_that_is_older_than_the_note_goes_on_and_a_damaged_note_is_named(t
         RunDirectory.resume(tmp_path / "run", configuration())
 
 
-LOGGED = LoggedEvaluation(
-    index=3,
-    u="12",
-    objective=(0.1 + 0.2).hex(),
-    success=False,
-    non_finite=0,
-    cost=2,
-    seconds=0.5,
-    judgement=LoggedJudgement(
-        score=0.1 + 0.2,
-        margin=-math.inf,
-        right=True,
-        answer=ClassAnswer(label="mug", index=None, probability=1.0 / 3.0),
-        payload={"boxes": [[0.1, 2]]},
-    ),
-)
-
-
-def test_a_log_keeps_whole_entries_only(tmp_path: Path) -> None:
-    path = tmp_path / "replay.bin"
-    log = ReplayLog(path)
-    gradient = np.arange(5, dtype=np.float32) / 3
-    log.append(Entry("search", 0, LOGGED, {"gradient": gradient}))
-    log.append(Entry("search", 1, LOGGED))
-    log.close()
-    size = path.stat().st_size
-    for cut in range(1, 40):
-        path.write_bytes(path.read_bytes()[: size - cut])
-        with path.open("r+b"):
-            log = ReplayLog(path)
-        assert ("search", 0) in log and ("search", 1) not in log
-        entry = log.read("search", 0)
-        assert np.array_equal(entry.arrays["gradient"], gradient) and entry.arrays["gradient"].dtype == np.float32
-        assert entry.facts == LOGGED and float.fromhex(entry.facts.objective) == 0.1 + 0.2
-        log.append(Entry("search", 1, LOGGED))
-        assert ("search", 1) in log
-        log.close()
-    log = ReplayLog(path)
-    with pytest.raises(KeyError):
-        log.read("search", 2)
-    log.remove()
-    assert not path.exists()
+def test_what_a_search_was_told_comes_back_bit_for_bit_until_the_run_is_done(tmp_path: Path) -> None:
+    gradient, picture = np.arange(5, dtype=np.float32) / np.float32(3), np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    row = Row("search", 0, objective=0.1 + 0.2, margin=-2.5, correct=True, payload={"boxes": [[0.1, 2]]})
+    with Store(tmp_path / "results.sqlite") as store:
+        store.append([row], Told(3, b"12", 0, 2, gradient, picture))
+        store.append([replace(row, step=1)], Told(4, b"13", 1, 1))
+        store.append([replace(row, kind="control")])
+        assert store.goes_on and store.told("search", 2) is None and store.told("control", 0) is None
+        stored = store.told("search", 0)
+        assert stored is not None
+        again, told = stored
+        assert (again.objective, again.margin, again.payload) == (0.1 + 0.2, -2.5, row.payload)
+        assert told.gradient is not None and np.array_equal(told.gradient, gradient)
+        assert told.picture is not None and np.array_equal(told.picture, picture)
+        assert (told.number, told.u, told.cost) == (3, b"12", 2)
+        assert [number for number, _ in store.pictures("search", 0, 9)] == [3]
+        store.append([row, replace(row, step=2)])
+        assert store.told("search", 2) is None, "it was told nothing"
+        store.forget()
+        assert store.told("search", 0) is None and store.count() == 4
+    assert not goes_on(tmp_path)
 
 
 def test_two_processes_on_one_run_are_refused(tmp_path: Path) -> None:
@@ -306,11 +284,11 @@ def test_a_kill_before_the_results_had_tables_leaves_a_folder_that_a_run_can_tak
     folder = tmp_path / "run"
     folder.mkdir()
     with closing(sqlite3.connect(folder / "results.sqlite")) as made:
-        made.execute(f"PRAGMA application_id = {store.APPLICATION_ID}")
+        made.execute(f"PRAGMA application_id = {database.APPLICATION_ID}")
     with RunDirectory.create(folder) as run:
         run.write_config(configuration())
     with closing(sqlite3.connect(tmp_path / "results.sqlite")) as made:
-        made.execute(f"PRAGMA application_id = {store.APPLICATION_ID}")
+        made.execute(f"PRAGMA application_id = {database.APPLICATION_ID}")
         made.execute("CREATE TABLE others (text)")
     folder.joinpath("run.yaml").unlink()
     (tmp_path / "results.sqlite").replace(folder / "results.sqlite")

@@ -41,7 +41,7 @@ def results() -> bytes:
         path = Path(folder) / "results.sqlite"
         with Store(path) as store:
             values: dict[str, Value] = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}
-            store.append(Row("search", step, seed=step, objective=0.5, values=values) for step in range(40))
+            store.append([Row("search", step, seed=step, objective=0.5, values=values) for step in range(40)])
         with closing(sqlite3.connect(path)) as db:
             db.execute("PRAGMA journal_mode = DELETE")  # or reading it makes a log beside it
         return path.read_bytes()

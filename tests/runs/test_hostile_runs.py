@@ -6,10 +6,8 @@ import json
 import os
 import shutil
 import sqlite3
-import struct
-import zlib
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +15,11 @@ import pytest
 from samples import GAP, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
+from advsearch.config import AttackConfig
 from advsearch.described import Value
-from advsearch.errors import AdvsearchError, FileFormatError
+from advsearch.errors import AdvsearchError, FileFormatError, InputError
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.replay import ReplayLog
-from advsearch.runs.store import Row, Store
+from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import HEADER
 
 SUMMARY = attack(ending="interrupted", verified=rated(3)).to_dict()
@@ -169,7 +167,7 @@ def test_pipes_in_a_run_do_not_block(name: str, run: Path) -> None:
     os.mkfifo(run / name)
     assert main(["runs"]) == 0 and main(["show", "it"]) in (0, 2) and main(["export", "it"]) in (0, 2)
     with suppress(AdvsearchError), RunDirectory.resume("it") as opened:
-        opened.replay.close()
+        opened.store.count()
 
 
 @pytest.mark.parametrize("name", ["results.sqlite", "replay.bin", ".lock", "images", "artifacts"])
@@ -187,32 +185,27 @@ def test_a_run_that_links_elsewhere_changes_nothing_there(name: str, run: Path, 
     assert outside.read_bytes() == before
 
 
-def entry(head: bytes, body: bytes = b"") -> bytes:
-    return struct.pack("<4sIII", b"ADVr", len(head), len(body), zlib.crc32(body, zlib.crc32(head))) + head + body
-
-
 @pytest.mark.parametrize(
-    "data",
+    "change",
     [
-        entry(b"[]"),
-        entry(b"{"),
-        entry(b"[" * 100_000),
-        entry(b'{"kind": 3, "number": 0, "facts": {}, "arrays": {}}'),
-        entry(b'{"kind": "a", "number": 0, "facts": [], "arrays": {}}'),
-        entry(b'{"kind": "a", "number": 0, "facts": {}, "arrays": {"x": ["O", [1]]}}', bytes(8)),
-        entry(b'{"kind": "a", "number": 0, "facts": {}, "arrays": {"x": ["<f4", [1000000000000]]}}', bytes(8)),
-        entry(b'{"kind": "a", "number": 0, "facts": {}, "arrays": {"x": ["<f4", "a"]}}', bytes(8)),
+        "number = 'x'",
+        "u = 3",
+        "gradient = x'010203'",
+        "picture = x'01', height = 1",
+        "picture = x'01', height = NULL",
     ],
 )
-def test_what_a_search_was_told_is_checked(data: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "replay.bin"
-    path.write_bytes(data)
-    with pytest.raises(AdvsearchError, match=r"replay.bin: expected what a search was told"):
-        ReplayLog(path)
+def test_what_a_search_was_told_is_checked(change: str, tmp_path: Path) -> None:
+    path = tmp_path / "results.sqlite"
+    with Store(path) as store:
+        store.append([Row("search", 0)], Told(0, b"u", 0, 1))
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute(f"UPDATE told SET {change}")
+    with Store(path) as store, pytest.raises(FileFormatError, match="expected what a search was told, got"):
+        store.told("search", 0)
 
 
-def test_a_length_that_is_not_there_takes_no_memory(tmp_path: Path) -> None:
-    path = tmp_path / "replay.bin"
-    path.write_bytes(struct.pack("<4sIII", b"ADVr", 2**32 - 1, 2**32 - 1, 0) + b"{}")
-    ReplayLog(path).close()
-    assert path.read_bytes() == b""
+def test_a_search_that_an_older_advsearch_has_begun_is_refused(run: Path) -> None:
+    (run / "replay.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"cannot go on: it was begun by an older advsearch; start again with"):
+        RunDirectory.resume("it", AttackConfig(object="mug", controls="pose"))

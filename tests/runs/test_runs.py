@@ -30,13 +30,14 @@ from samples import attack, exr, rated, sweep
 from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.runs import directory, images
+from advsearch.runs.database import MIGRATIONS
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
 from advsearch.runs.export import FORMATS, export
 from advsearch.runs.files import PART, replacing, write_bytes, write_text
 from advsearch.runs.listing import finished, listed
 from advsearch.runs.lock import RunLock
 from advsearch.runs.results.base import Result, plain
-from advsearch.runs.store import MIGRATIONS, Row, Store
+from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import read_result
 
 WRITER = """
@@ -261,7 +262,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
     with sqlite3.connect(path) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(FileFormatError, match=r"expected version 6 of the results, got 99; use a newer advsearch"):
+    with pytest.raises(FileFormatError, match=r"expected version 7 of the results, got 99; use a newer advsearch"):
         Store(path)
 
 
@@ -484,7 +485,7 @@ def test_a_run_cannot_be_made_on_a_bad_disk(home: Path, monkeypatch: pytest.Monk
     assert not list(home.iterdir())
 
 
-@pytest.mark.parametrize("part", ["advsearch.runs.store._check_version", "fcntl.flock"])
+@pytest.mark.parametrize("part", ["advsearch.runs.store.check_version", "fcntl.flock"])
 def test_a_run_that_cannot_start_leaves_nothing(home: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
     monkeypatch.setattr(part, _raises(errno.ENOSPC))
     with pytest.raises((StorageError, OSError)):

@@ -24,14 +24,13 @@ from advsearch.api.photos import Photographs
 from advsearch.config import AttackConfig
 from advsearch.report.phrases import answer_text, percent_number
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.replay import Entry, LoggedEvaluation
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.stability import StabilityResult
-from advsearch.runs.store import Row, Store
+from advsearch.runs.store import Row, Store, Told
 from advsearch.tasks import Answer
 from advsearch.viewer import thumbnails
 from advsearch.viewer.attack_page import write_report
@@ -314,13 +313,10 @@ def test_an_attack_that_goes_on_is_followed_step_by_step(browser: Browser, tmp_p
     path = tmp_path / "going"
 
     def evaluated(run: RunDirectory, number: int) -> None:
-        facts = LoggedEvaluation(
-            index=number, u="", objective="0x1p+0", success=False, non_finite=0, cost=1, seconds=0.1
-        )
-        picture = np.full((8, 8, 3), 25 * number, np.uint8)
-        run.replay.append(Entry("search", number, facts, {"picture": picture}))
+        told = Told(number, b"", 0, 1, picture=np.full((8, 8, 3), 25 * number, np.uint8))
         values = {"pose.yaw": described(10.0 * number, "degrees")}
-        run.record(Row("search", number, objective=float(number), label="vase" if number > 5 else "mug", values=values))
+        label = "vase" if number > 5 else "mug"
+        run.record(Row("search", number, objective=float(number), label=label, values=values), told=told)
 
     with RunDirectory.create_for(AttackConfig(object="mug", run=str(path))) as run, serving(path) as server:
         for number in range(5):

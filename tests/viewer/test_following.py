@@ -1,4 +1,4 @@
-"""A run that goes on, as the dashboard follows it: what is new in its rows and its log, and when its page is shown."""
+"""A run that goes on, as the dashboard follows it: what is new in its rows, and when its page is shown."""
 
 from __future__ import annotations
 
@@ -8,31 +8,23 @@ from typing import Any
 from urllib.request import urlopen
 
 import numpy as np
-import pytest
 from stored_sweeps import described, serving
 
 from advsearch.config import AttackConfig
-from advsearch.errors import FileFormatError
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.replay import Entry, LoggedEvaluation, entries
-from advsearch.runs.store import Row
+from advsearch.runs.store import Row, Told
 from advsearch.viewer.following import START, following_page, goes_on, progress
 
 
 def step(run: RunDirectory, number: int, *, picture: bool = True) -> None:
     """What a search leaves of one evaluation."""
-    facts = LoggedEvaluation(
-        index=number, u="", objective="0x1p+0", success=False, non_finite=0, cost=1, seconds=0.1
-    )  # fmt: skip
-    arrays: dict[str, Any] = {"gradient": np.zeros(5)}
-    if picture:
-        arrays["picture"] = np.full((4, 4, 3), 20 * number, np.uint8)
-    run.replay.append(Entry("search", number, facts, arrays))
+    shown = np.full((4, 4, 3), 20 * number, np.uint8) if picture else None
+    told = Told(number, b"", 0, 1, gradient=np.zeros(5, np.float32), picture=shown)
     values = {"pose.yaw": described(10.0 * number, "degrees")}
-    run.record(Row("search", number, objective=float(number), success=False, label="mug", values=values))
+    run.record(Row("search", number, objective=float(number), success=False, label="mug", values=values), told=told)
 
 
-def news(run: Path, after: str = START) -> dict[str, Any]:
+def news(run: Path, after: int = START) -> dict[str, Any]:
     found = json.loads(progress(run, after))
     assert isinstance(found, dict)
     return found
@@ -58,22 +50,6 @@ def test_what_is_new_is_told_once(tmp_path: Path) -> None:
         assert [(row["kind"], row["objective"]) for row in later["rows"]] == [("search", 3.0), ("baseline", None)]
         assert [one["step"] for one in later["pictures"]] == [3]
     assert not news(tmp_path / "run")["running"]
-
-
-def test_an_entry_that_is_being_written_is_waited_for(tmp_path: Path) -> None:
-    with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "run"))) as run:
-        step(run, 0)
-        step(run, 1)
-        log = run.path / "replay.bin"
-        whole = log.read_bytes()
-        log.write_bytes(whole[:-3])
-        ((_, place),) = entries(log)
-        log.write_bytes(whole)
-        assert [entry.number for entry, _ in entries(log, place)] == [1]
-        assert list(entries(log, place + 1)) == []
-        assert list(entries(tmp_path / "none")) == []
-        with pytest.raises(FileFormatError):
-            list(entries(tmp_path))
 
 
 def test_its_own_page_is_shown_when_it_has_ended(tmp_path: Path) -> None:
