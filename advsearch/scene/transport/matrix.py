@@ -124,7 +124,8 @@ class ColouredRows:
             found: Floats = (self._both_ways[0] @ torch.from_numpy(values)).numpy()
         else:
             found = self._shares() @ values
-        return found * self._kept_colours().reshape(-1, 3).numpy()
+        found = found * self._kept_colours().reshape(-1, 3).numpy()
+        return found
 
     def transposed_times(self, values: Floats) -> Floats:
         """Return the transpose times (rows, 3): (columns, 3)."""
