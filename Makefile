@@ -16,7 +16,7 @@ SOURCES := advsearch scenes tests benchmarks docs tools
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-quick test-slow fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
+.PHONY: help setup attack test test-quick test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -40,6 +40,9 @@ test-quick: $(STAMP) ## run the quick tests of every room
 test-slow: $(STAMP) ## run the tests that take minutes
 	@$(BIN)/python -m pytest -m slow $(ARGS)
 
+test-zoo: $(STAMP) ## run the tests of torchvision's, timm's and transformers' networks with these, in build/zoo
+	@bash tools/test_zoo.sh $(BIN)/python build/zoo $(ARGS)
+
 fuzz: $(STAMP) ## load 400 hostile files, each in bounds of time and memory; ARGS="--seed 1" makes others
 	@PYTHONPATH=tests $(BIN)/python -m fuzz $(ARGS)
 
@@ -61,7 +64,7 @@ docs: $(STAMP) ## build the documentation into build/site; fails on a broken lin
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # what compares answers and not times, and takes long
-STUDIES := searches every_control rotation close_calls closed_form policies precision kill harden kill_cluster
+STUDIES := searches every_control rotation close_calls closed_form policies precision kill harden kill_cluster detached
 
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
 	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py) benchmarks/golden.py benchmarks/matrix.py,$(wildcard benchmarks/[!_]*.py)); do \

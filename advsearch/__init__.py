@@ -13,11 +13,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from advsearch import losses as losses
     from advsearch.api.attack import attack as attack
     from advsearch.api.check import check as check
     from advsearch.api.explain import explain as explain
     from advsearch.api.gap import gap as gap
     from advsearch.api.harden import harden as harden
+    from advsearch.api.load_run import load_run as load_run
     from advsearch.api.model import load_model as load_model
     from advsearch.api.photos import photo_agreement as photo_agreement
     from advsearch.api.plan import plan as plan
@@ -29,16 +31,16 @@ if TYPE_CHECKING:
     from advsearch.api.replay import replay as replay
     from advsearch.api.stability import stability as stability
     from advsearch.api.sweep import sweep as sweep
+    from advsearch.engine.attack_result import AttackResult as AttackResult
     from advsearch.engine.loading import Scene as Scene
     from advsearch.engine.loading import load_scene as load_scene
-    from advsearch.engine.outcome import AttackResult as AttackResult
     from advsearch.engine.sweeps.answer import SweepResult as SweepResult
     from advsearch.models import Model as Model
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "AttackResult": "advsearch.engine.outcome",
+    "AttackResult": "advsearch.engine.attack_result",
     "Model": "advsearch.models",
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
@@ -49,6 +51,7 @@ _HOMES = {
     "gap": "advsearch.api.gap",
     "harden": "advsearch.api.harden",
     "load_model": "advsearch.api.model",
+    "load_run": "advsearch.api.load_run",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.api.photos",
     "plan": "advsearch.api.plan",
@@ -62,14 +65,17 @@ _HOMES = {
 }
 """The public names, and the module of each."""
 
-__all__ = list(_HOMES)
+_MODULES = ("losses",)
+"""Public modules."""
+
+__all__ = [*_HOMES, *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
     """Import the interface on first use (PEP 562)."""
-    if name in _HOMES:
+    if name in __all__:
         import_module("advsearch.api")  # sets the threads before torch is imported
-        return getattr(import_module(_HOMES[name]), name)
+        return import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -21,8 +21,14 @@ BY_KEY = "mitsuba"
 """The control whose parameters have Mitsuba's names."""
 
 
+JOINED = "+"
+"""Between the names of tasks that are asked of several models at once."""
+
+
 def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     """Return controls with ``{"mitsuba:KEY": RANGE}`` as ``{"mitsuba": {KEY: RANGE}}``, all keys together.
+
+    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``.
 
     Raises:
         InputError: a key has no range, or is given twice.
@@ -31,7 +37,9 @@ def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     for name, given in controls.items():
         kind, colon, key = str(name).partition(":")
         if kind != BY_KEY or not colon:
-            found[name] = given
+            _, dot, parameter = str(name).partition(".")
+            alone = dot and ":" not in name and not (given is None or isinstance(given, Mapping))
+            found[name] = {parameter: given} if alone else given
         elif not key or given is None or given in ({}, ""):
             raise InputError(f"`controls` {name}: expected a range, as in {BY_KEY}:{key or 'KEY'}=[0.2, 0.8]")
         else:
@@ -106,3 +114,8 @@ def as_setting(entry: Any) -> str | dict[str, JsonValue]:
         if plain and value != default_of(declared):
             given[option] = value
     return {"name": name, **given} if given else name
+
+
+def told(given: object) -> str:
+    """Return in words what was given in the place of an instance; of a class, what makes one of it."""
+    return f"the class {given.__name__}; write {given.__name__}()" if isinstance(given, type) else f"{given!r:.80}"

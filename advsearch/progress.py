@@ -36,3 +36,12 @@ class NullProgress:
 
     def message(self, text: str) -> None:
         """See `Progress.message`."""
+
+
+Watched = Progress | bool | None
+"""Who watches, as a caller says it: True is a bar, False nobody, None a bar on a terminal (`api.watching`)."""
+
+
+def watcher(watched: Watched) -> Progress:
+    """Return who is told how far it is: the watcher that was given, and nobody where none was."""
+    return NullProgress() if watched is None or isinstance(watched, bool) else watched

@@ -45,6 +45,19 @@ class Painter(nn.Module):
         return torch.stack([torch.zeros_like(mug), mug, mug - 5.0], dim=1)
 
 
+class Ranger(nn.Module):
+    """Disparity of each pixel, up to a scale and a shift: the ground's by its row, as a plane has it, and the mug's for
+    whatever is bright or blue."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        row = torch.arange(x.shape[2], dtype=x.dtype, device=x.device)[None, :, None] * (SIDE / x.shape[2])
+        ground = torch.where(row < 13.0, 0.0, 0.107 + 0.0133 * row)
+        bright, blue = x.mean(dim=1) - 0.5, x[:, 2] - x[:, 0] - 0.02
+        lead = nn.functional.avg_pool2d(torch.maximum(bright, blue)[:, None], 3, 1, 1, count_include_pad=False)[:, 0]
+        near = torch.sigmoid(40.0 * lead)
+        return 40.0 * (ground + near * (0.52 - ground)) - 3.0
+
+
 class Blue(nn.Module):
     """A mug where the band in the middle is bluer than a threshold, else a vase.
 

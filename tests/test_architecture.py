@@ -28,6 +28,7 @@ COMMON = {
     "files",
     "interrupts",
     "options",
+    "pictures",
     "registry",
     "seeds",
     "threads",
@@ -55,6 +56,7 @@ class Rule:
 HEAVY = frozenset(RENDERER | {"torch"})
 RULES = {
     **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
+    "pictures": Rule(set(), {"numpy", "PIL"}, HEAVY),
     "yaml_text": Rule(set(), {"yaml"}),
     # typing_extensions for the type checker only
     "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),
@@ -80,9 +82,10 @@ RULES = {
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
     "explanations": Rule({"attacks", "recipes", "config", "settings"}, {"numpy", "scipy"}, HEAVY),
     "recipes": Rule({"attacks", "runs", "report", "config", "settings"}, {"matplotlib", "pydantic"}, HEAVY),
+    "losses": Rule({"attacks", "engine"}, {"torch"}),
     "api": Rule(None),
     "cli": Rule(None),
-    "": Rule({"api", "engine", "models"}, set()),
+    "": Rule({"api", "engine", "losses", "models"}, set()),
 }
 """As in docs/design.md, "Rooms, and who may know whom". The empty name is `advsearch/__init__.py`."""
 

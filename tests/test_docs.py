@@ -247,7 +247,7 @@ def test_every_column_of_an_exported_table_is_in_the_page_about_runs() -> None:
     page = (DOCS / "runs.md").read_text("utf-8")
     said = {name for row in re.findall(r"^\| (`.*?) \|", page, re.M) for name in re.findall(r"`([a-z_]+)`", row)}
     assert not {*export.OWN, *export.AFTER} - said
-    assert {*export.OWN, *export.AFTER, "values"} == {one.name for one in fields(store.Row)}
+    assert {*export.OWN, *export.AFTER, "values", "metrics"} == {one.name for one in fields(store.Row)}
     assert all(f"`{format}`" in page for format in export.FORMATS)
 
 
@@ -411,9 +411,10 @@ def check_names(config: Config) -> None:
     if isinstance(config, AttackConfig):
         as_controls(config.over)
         make_policy(config.policy_name, **config.policy_options)
+        task = make_task(config.task)
         check_objective(
-            config.objective or make_task(config.task).objective,
-            config.task_name,
+            config.objective or task.objective,
+            task.name,
             targeted=config.target is not None,
             minimise=config.minimise,
         )
@@ -495,7 +496,7 @@ def test_every_python_example_compiles_and_names_what_exists(page: Path) -> None
                 assert node.attr in advsearch.__all__
             if isinstance(node, ast.Call) and re.fullmatch(r"advsearch\.\w+", ast.unparse(node.func)):
                 known = parameters(ast.unparse(node.func).removeprefix("advsearch."))
-                assert not {keyword.arg for keyword in node.keywords} - known
+                assert not {keyword.arg for keyword in node.keywords if keyword.arg} - known
 
 
 @pytest.mark.slow
@@ -506,6 +507,23 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
         exec(compile(block, "README.md", "exec"), names)
     assert names["result"].search.renders == planned_renders(40)
     assert float(names["u"].grad.abs().max()) > 0.0
+
+
+def test_the_page_about_losses_of_ones_own_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every block, after those before it, with smaller pictures and fewer steps than on the page."""
+    page = DOCS / "own-loss.md"
+    small = {"steps": 4, "trials": 6, "spp": 2, "verify_spp": 4, "denoise": "none", "measure": "no"}
+    names: dict[str, Any] = {}
+    endings: list[str] = []
+    attacked = advsearch.attack
+    monkeypatch.setattr(advsearch, "attack", lambda *asked, **given: attacked(*asked, **{**given, **small}))
+    for block in blocks(page, "python"):
+        names.pop("result", None)
+        exec(compile(block.replace("resolution=48", "resolution=16"), page.name, "exec"), names)
+        names.setdefault("quick", {})["resolution"] = 24
+        endings += [names["result"].summary.ending] if "result" in names else []
+    assert len(endings) == 7 and not {"already wrong"} & {*endings}
+    assert names["wrong"] and float(names["u"].grad.abs().max()) > 0.0 and float(names["derivative"].abs().max()) > 0.0
 
 
 # ---- the scripts ----------------------------------------------------------------------------------------------------

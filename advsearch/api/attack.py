@@ -14,7 +14,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Policy, make_policy
-from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
@@ -26,20 +26,25 @@ from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.ahead import Ahead, seen_by
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
+from advsearch.engine.attack_result import AttackParts, AttackResult
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import (
+    SCENE,
     Controls,
     PictureSettings,
     Scene,
     framed,
+    lent,
     load_scene,
     make_renderer,
-    named_camera,
     only_here,
+    scene_as_settings,
     settings_of,
 )
 from advsearch.engine.memory import Memory
+from advsearch.engine.metrics import Metric, Metrics, check_shared, load_metrics, metrics_as_settings
+from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
     OF_SCENE,
     AnyModel,
@@ -52,7 +57,7 @@ from advsearch.engine.naming import (
     several,
 )
 from advsearch.engine.objective import Wanted, objective_for, task_for
-from advsearch.engine.outcome import AttackResult, Question, summarise
+from advsearch.engine.outcome import Question, summarise
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
@@ -63,10 +68,11 @@ from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.ensemble import together
-from advsearch.options import as_setting
-from advsearch.progress import NullProgress, Progress
+from advsearch.options import as_setting, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.wording import count
-from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
+from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
+from advsearch.runs.directory import only_here as only_python_has
 from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.scene.description import SceneDescription
@@ -75,6 +81,7 @@ from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
+from advsearch.tasks.own import OwnTask, function_of
 from advsearch.tasks.together import Together
 
 if TYPE_CHECKING:
@@ -95,9 +102,10 @@ def attack(
     objective: str | Callable[..., Tensor] | None = None,
     policy: str | Mapping[str, object] | Policy[Any] = "auto",
     over: Controls = (),
+    metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[AttackKeywords],
 ) -> AttackResult:
     """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
@@ -109,36 +117,38 @@ def attack(
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes; with `ensemble`, several.
         object: the node or shape that is the object, where `scene` is a file or dictionary that holds several.
-        task: what judges the model's output: a name, a mapping with a `name` and options, or an instance.
+        task: what judges the model's output: a name, a mapping with a `name` and options, an instance, or a function
+            (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
         controls: what may vary: names, instances, or a mapping from names to settings.
         objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
-            images (N, H, W, 3), truth, or the target where there is one) that returns (N,) values, which are maximised;
-            in classification the output is logits (N, C) and the truth the indices of the right answers. None takes the
-            task's own.
+            images (N, H, W, 3), truth, or the target where there is one) or of (output, labels) that returns (N,)
+            values, which are maximised; in classification the output is logits (N, C) and the truth the index of the
+            right answer, (N,), or a tuple of several. It may ask for more by the names of further parameters: `u`,
+            `texture`, `inputs`, `configuration` (docs/own-loss.md). None takes the task's own.
         policy: a name, a mapping with a `name` and options, or an instance.
         over: controls that vary by chance: the answer has to hold for all of their values.
+        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
+            truth) that return a number, or a dict of some. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory only.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
+    task = make_task(task) if callable(task) else task
     loaded_already = not all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
-    if loaded_already or callable(objective) or only_here(controls) or only_here(over):
+    if loaded_already or callable(objective) or only_here(controls) or only_here(over) or isinstance(task, OwnTask):
         check_not_spread(options)
     if not isinstance(policy, (str, Mapping, Policy)):
         raise InputError(
-            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {policy!r}"
+            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
         )
     scene = _scene(scene, object, settings)
     described = {
-        "object": scene.description.object_name,
-        "environment": scene.description.environment_name,
-        "up": scene.description.up,
-        "camera": named_camera(scene.description),
+        **scene_as_settings(scene),
         "model": ",".join(map(model_name, several(model))),
         "controls": settings_of(controls),
         "over": settings_of(over),
@@ -146,6 +156,7 @@ def attack(
         "objective": _own_name(objective) if callable(objective) else objective,
         "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
         "set": _set_by(scene, settings.get("exposure")),
+        "metrics": metrics_as_settings(metrics or {}),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     parts = [f"the model {model_name(one)}" for one in several(model) if exists_here(one)]
@@ -154,6 +165,9 @@ def attack(
     parts += [f"the objective {config.objective}"] if callable(objective) else []
     parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, _policy_of) else []
     parts += [f"the control {name}" for name in (*only_here(controls), *only_here(over))]
+    parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
+    if config.workers is not None or config.cluster is not None:
+        check_shared(config.metrics)
     config = config.with_only_here(parts)
     if config.is_matrix and config.ensemble is None:
         raise InputError(
@@ -173,10 +187,11 @@ def attack(
     stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
     with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
         loaded = _model(model, config, asked)
-        job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None)
+        measured = load_metrics(config.metrics, metrics)
+        job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
         if folder is None:
-            return _carry_out(job, progress or NullProgress())
-        return _go_on(job, folder, progress or NullProgress())
+            return _carry_out(job, watcher(progress))
+        return _go_on(job, folder, watcher(progress))
 
 
 def attack_from_config(
@@ -230,6 +245,32 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
         denoise: another denoiser than the configuration's.
     """
     job = _job(AttackConfig.of(config, denoise=denoise or config.denoise))
+    problem = _problem(job)
+    return problem, [*job.loaded[1], *sentences(problem.space.moved)]
+
+
+def parts_in(run: Path) -> AttackParts:
+    """Find and load everything that the run of an attack was asked with, as its answer is judged.
+
+    Raises:
+        InputError: only the Python session that asked has what judges it.
+    """
+    if needed := [one for one in only_python_has(run) if not one.startswith(("the objective", "the policy"))]:
+        raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its answer")
+    return _job(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
+
+
+def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, list[str]]:
+    """Return the problem that an attack was asked with, and warnings on the way.
+
+    Args:
+        parts: as a result has them.
+        **changes: settings that are different; of another `model`, its name.
+    """
+    assert isinstance(parts, _Job)
+    config = parts.config.model_copy(update=changes)
+    model = _model(config.model, config, parts.task) if "model" in changes else (parts.loaded[0], [*parts.loaded[1]])
+    job = replace(parts, config=config, loaded=model)
     problem = _problem(job)
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
@@ -326,6 +367,7 @@ class _Job:
     objective: str | Callable[..., Tensor]
     policy: str | Policy[Any]
     keep: bool
+    metrics: Metrics = field(default_factory=dict)
     clean: CleanMatrix = field(default_factory=CleanMatrix)
 
 
@@ -337,9 +379,12 @@ def _job(config: AttackConfig) -> _Job:
     task, objective = _asked(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **_policy_options(config))
     given = scene_settings(config.set_, config.exposure)
-    scene = load_scene(config.object, config.environment, up=config.up, settings=given, camera=config.camera)
+    scene = lent(SCENE, config.object) or load_scene(
+        config.object, config.environment, up=config.up, settings=given, camera=config.camera
+    )
     model = _model(config.model, config, task)
-    return _Job(config, scene, model, task, searched, drawn, objective, policy, True)
+    metrics = load_metrics(config.metrics)
+    return _Job(config, scene, model, task, searched, drawn, objective, policy, True, metrics)
 
 
 def _given(config: AttackConfig, scene: Scene, model: Model) -> _Job:
@@ -371,7 +416,7 @@ def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tup
 def _model(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
     """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
     models, warnings = load_models(several(model), task, config)
-    return models[0] if config.ensemble is None else together(models, config.resolution), warnings
+    return models[0] if len(models) == 1 else together(models, config.resolution), warnings
 
 
 def _policy_options(config: AttackConfig) -> JsonObject:
@@ -403,7 +448,8 @@ def _task(job: _Job, *, shows: bool = True) -> tuple[Task, Callable[[Described, 
     alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
     tasks = list[Task]()
     for one, network in alone:
-        check_truth(one, network, job.scene, facts(dict), pictures)
+        known = task.told(one, facts(dict)) if isinstance(task, Together) else facts(dict)
+        check_truth(one, network, job.scene, known, pictures)
         tasks.append(shown(one, network, [job.scene], config.label, pictures) if shows else one)
         job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
     task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
@@ -452,7 +498,10 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
         searched=len(job.controls),
         printable=config.printable,
         aovs=aovs_of(config.aov),
+        metrics=job.metrics,
     )
+    for name in asked_by(job.objective):
+        problem.asked(problem.whole(problem.domain.start))(name)  # refuses what is not there
     problem.draws = search_size(config, problem)[1]
     return problem
 
@@ -509,7 +558,9 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
         if kept is not None:
-            check_made_of(kept, [job.loaded[0]], {"objective": job.objective if callable(job.objective) else None})
+            functions = {f"metric {name}": one for name, one in job.metrics.items()}
+            objective = {"objective": job.objective} if callable(job.objective) else {}
+            check_made_of(kept, [job.loaded[0]], {**functions, **objective, "task": function_of(job.task)})
         memory = Memory(kept)
         with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
             recorder = Recorder(kept, problem, memory, Ahead(executor))
@@ -521,7 +572,9 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
                 )
             spent = (budget, policy, recorder, memory, stages, preparation_of(job.config))
             findings = Attack(problem, *spent, clean=job.clean).carry_out()
-        return summarise(_question(job), problem, findings, recorder, stages, warnings)
+        found = summarise(_question(job), problem, findings, recorder, stages, warnings)
+        parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
+        return replace(found, parts=lambda: parts)
 
 
 def announced_of(settings: JsonObject) -> Call:

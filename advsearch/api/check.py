@@ -29,8 +29,10 @@ from advsearch.engine.gradients import (
     smooth_loss,
     verdict,
 )
+from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
+from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import (
     CONVERGED,
     COUNTS,
@@ -42,7 +44,7 @@ from advsearch.engine.planning import (
 )
 from advsearch.engine.problem import Problem
 from advsearch.engine.run_settings import RunSettings
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.check import (
     WHOLE,
@@ -81,10 +83,10 @@ IN_PARAMETERS = "one for each parameter; `resolution` or fewer controls shorten 
 
 @asks(CheckConfig, CheckKeywords)
 def check(
-    object: str | Path = "mug",
-    model: str | Path = "reference",
+    object: Scene | str | Path = "mug",
+    model: AnyModel = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[CheckKeywords],
 ) -> CheckResult:
     """Compare the gradient of every parameter of a scene with differences (docs/gradients.md).
@@ -92,15 +94,15 @@ def check(
     All other arguments are the settings of `advsearch check`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: the name of an object, or a file of one.
-        model: the network under test, as `advsearch check` takes it.
-        progress: told how far it is.
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(CheckConfig, object=object, model=model, **settings)
-    return check_from_config(config, progress=progress)
+    return check_from_config(config, progress=watcher(progress))
 
 
 def check_from_config(

@@ -34,7 +34,7 @@ from advsearch.explanations.renders import along, inside, lies_inside
 from advsearch.explanations.rules import CHANCE, Conditions, CountedRule, RuleCondition, covered, find_rules
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.recipes.table import Answered, rows_of
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, find_run
 from advsearch.runs.results.base import INTERRUPTED
@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 def explain(
     sweeps: str | Path | Sequence[str | Path],
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[ExplainKeywords],
 ) -> ExplainResult:
     """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
@@ -75,12 +75,12 @@ def explain(
     Args:
         sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
             recipe, its sweeps.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=progress)
+    return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=watcher(progress))
 
 
 def explain_from_config(

@@ -47,8 +47,7 @@ class AnsweredRun:
     def on_picture(self) -> list[str]:
         """The controls that change the finished picture there."""
         grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
-        space = self.problem.space
-        slices = zip(space.controls, self.u.split(space.sizes), strict=True)
+        slices = self.problem.space.slices(self.u)
         return [control.name for control, part in slices if not torch.equal(control.picture(part, grey), grey)]
 
     @property

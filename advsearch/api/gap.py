@@ -21,13 +21,14 @@ from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.ahead import Ahead, AheadAnswer, PictureAhead, seen_by
 from advsearch.engine.answers import one_label_for_several
-from advsearch.engine.naming import different, load_models
+from advsearch.engine.loading import Scene
+from advsearch.engine.naming import AnyModel, different, load_models
 from advsearch.engine.problem import Problem
 from advsearch.engine.transfer import Transfer
 from advsearch.engine.transport import CleanMatrix
 from advsearch.files import JsonObject
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.drawing import Figures
 from advsearch.report.studies import curve_figure, gap_figure, matrix_figure
 from advsearch.report.tables import CurveTable, GapTable
@@ -50,10 +51,10 @@ if TYPE_CHECKING:
 
 @asks(GapConfig, GapKeywords)
 def gap(
-    object: str | Path,
-    model: str | Path = "reference",
+    object: Scene | str | Path,
+    model: AnyModel = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[GapKeywords],
 ) -> GapTable:
     """Compare the worst configuration with the average, for each object and each control (docs/questions.md).
@@ -61,15 +62,15 @@ def gap(
     All other arguments are the settings of `advsearch gap`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: names of objects, or files of them, separated by commas.
-        model: the network under test, as `advsearch gap` takes it.
-        progress: told how far it is.
+        object: from `load_scene`, or names of objects, or files of them, separated by commas.
+        model: from `load_model`, or what that takes.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(GapConfig, object=object, model=model, **settings)
-    return gap_from_config(config, progress=progress)
+    return gap_from_config(config, progress=watcher(progress))
 
 
 def curve_from_config(

@@ -45,7 +45,7 @@ from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
 from advsearch.models.imported import split_weights
 from advsearch.models.trainable import Trainable, trainable
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.hardening import hardened_figure
 from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes
@@ -74,7 +74,7 @@ def harden(
     optimiser: MakeOptimiser | None = None,
     beside: Examples | None = None,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[HardenKeywords],
 ) -> HardenResult:
     """Train a copy of a model on its worst cases, and prove what it is better at (docs/harden.md).
@@ -90,7 +90,7 @@ def harden(
             (N,). One is taken with each step.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
@@ -100,7 +100,7 @@ def harden(
     config = configured(HardenConfig, model=model_name(model), **settings)
     path = run_path(config.run) if resume and config.run is not None else None
     resumed = path if path is not None and is_run(path) else None
-    return _carry_out(config, model, optimiser, beside, progress or NullProgress(), resumed)
+    return _carry_out(config, model, optimiser, beside, watcher(progress), resumed)
 
 
 def harden_from_config(

@@ -15,9 +15,26 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar
 
-from advsearch.engine.loading import Controls, instances_in, lending, lent_controls, only_here, settings_of
-from advsearch.engine.naming import check_not_spread
+import numpy as np
+from torch import nn
+
+from advsearch.api.watching import watched
+from advsearch.engine.loading import (
+    CONTROL,
+    MODEL,
+    SCENE,
+    Controls,
+    Scene,
+    all_lent,
+    instances_in,
+    lending,
+    only_here,
+    scene_as_settings,
+    settings_of,
+)
+from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, model_name
 from advsearch.engine.turn import in_turn
+from advsearch.models import Model
 from advsearch.settings import Config, as_python, is_shallow, settings
 
 Names = str | Sequence[str]
@@ -44,7 +61,7 @@ class PictureKeywords(TypedDict, total=False):
     resolution: int | str | tuple[int, int] | None
     labels: Path | Names | None
     prompt: Names | None
-    label: int | Names | None
+    label: int | np.integer[Any] | Names | None
     texture_resolution: int | None
     denoise: Literal["oidn", "none"]
     pixel_sampler: Literal["independent", "multijitter"]
@@ -259,6 +276,28 @@ class StabilityKeywords(RunKeywords, total=False):
     seconds: float | None
 
 
+LOADED = (Scene, Model, nn.Module)
+"""What a question may be given in place of a name."""
+
+
+class _Signature(inspect.Signature):
+    """A signature with all settings, for editors, which `help` writes without them: it lists them below.
+
+    Attributes:
+        short: the same with `**settings` in their place.
+    """
+
+    __slots__ = ("short",)
+    short: Any
+
+    def __str__(self) -> str:
+        return str(self.short) if hasattr(self, "short") else super().__str__()
+
+    def format(self, **options: Any) -> str:
+        """See `inspect.Signature.format`, of Python 3.13."""
+        return str(self.short.format(**options))
+
+
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -287,24 +326,33 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                 continue
             added.append(inspect.Parameter(name, ONLY_BY_NAME, default=one.default, annotation=hints[name]))
             lines.append(textwrap.fill(f"{name}: {one.text}", 110, subsequent_indent="    "))
-        signature = own.replace(parameters=[*plain, *added])
+        signature = _Signature([*plain, *added], return_annotation=own.return_annotation)
+        signature.short = own
 
         @wraps(function)
         def asked(*args: Any, **given: Any) -> Any:
             try:
-                signature.bind(*args, **given)
+                bound = signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
-            kept = ("scene", "model", "beside")
+            kept = ("scene", "model", "beside", "progress", "metrics")
             plain = {key: one if key in kept or not is_shallow(one) else as_python(one) for key, one in given.items()}
             with ExitStack() as stack:
                 stack.enter_context(in_turn())
+                if "progress" in own.parameters:
+                    plain["progress"] = stack.enter_context(watched(plain.get("progress")))
                 for key in {"controls", "over"} & plain.keys() - own.parameters.keys():
                     if instances_in(plain[key]):
                         if only_here(plain[key]):
                             check_not_spread(plain)
-                        stack.enter_context(lending(plain[key]))
+                        stack.enter_context(lending(CONTROL, {one.name: one for one in instances_in(plain[key])}))
                         plain[key] = settings_of(plain[key])
+                if "object" in own.parameters and "scene" not in own.parameters:
+                    loaded = {name: one for name, one in bound.arguments.items() if isinstance(one, LOADED)}
+                    if loaded:
+                        check_not_spread(plain)
+                        args, plain = (), {**dict(zip(own.parameters, args, strict=False)), **plain}
+                        plain |= _named(loaded, plain, stack)
                 return function(*args, **plain)
 
         text = inspect.cleandoc(function.__doc__ or "")
@@ -319,4 +367,20 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
 def configured(config: type[Made], **given: object) -> Made:
     """Return a configuration of settings as Python has them; None is one that was not given."""
     made = config(**{name: value for name, value in given.items() if value is not None})
-    return made.with_only_here([f"the control {name}" for name in only_here(lent_controls())])
+    parts = [f"the model {model_name(one)}" for one in all_lent(MODEL) if exists_here(one)]
+    parts += ["the scene"] if any(one.only_here for one in all_lent(SCENE)) else []
+    return made.with_only_here([*parts, *(f"the control {name}" for name in only_here(all_lent(CONTROL)))])
+
+
+def _named(loaded: Mapping[str, Any], given: Mapping[str, Any], stack: ExitStack) -> dict[str, Any]:
+    """Lend a scene and a model that a question takes by name, and return the settings that name them."""
+    named: dict[str, Any] = {}
+    for one in loaded.values():
+        if isinstance(one, Scene):
+            check_not_of_scene({name: value for name, value in given.items() if name != "object"})
+            named |= {name: value for name, value in scene_as_settings(one).items() if value is not None}
+            stack.enter_context(lending(SCENE, {named["object"]: one}))
+        else:
+            named["model"] = model_name(one)
+            stack.enter_context(lending(MODEL, {named["model"]: one}))
+    return named

@@ -208,7 +208,7 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
     config: AttackConfig | SweepConfig
     config = (AttackConfig if command == "attack" else SweepConfig).from_yaml(run / CONFIG)
     made = make_task(config.task)
-    if made.varies:
+    if made.varies or made.looks:
         return _by_sweep(config) if isinstance(config, SweepConfig) else _by_attack(run, config)
     models, _ = load_models(config.models, made, config)
     given, judges = scene_settings(config.set_, config.exposure), []

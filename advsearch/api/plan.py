@@ -13,12 +13,14 @@ from advsearch.api.keywords import PlanKeywords, asks, configured
 from advsearch.config import PlanConfig
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
+from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
+from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Formation
@@ -42,10 +44,10 @@ PlannedRow = CosineRow | PathLength | GainRow | TexelRow
 
 @asks(PlanConfig, PlanKeywords)
 def plan(
-    object: str | Path = "mug",
-    model: str | Path = "reference",
+    object: Scene | str | Path = "mug",
+    model: AnyModel = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[PlanKeywords],
 ) -> PlanResult:
     """Choose how every derivative of a search is obtained and what is left out, by measurement (docs/gradients.md).
@@ -53,15 +55,15 @@ def plan(
     All other arguments are the settings of `advsearch plan`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: the name of an object, or a file of one.
-        model: the network under test, as `advsearch plan` takes it.
-        progress: told how far it is.
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(PlanConfig, object=object, model=model, **settings)
-    return plan_from_config(config, progress=progress)
+    return plan_from_config(config, progress=watcher(progress))
 
 
 def plan_from_config(

@@ -21,8 +21,10 @@ from advsearch.attacks import Policy, make_policy
 from advsearch.cluster.executor import Call, Executor
 from advsearch.config import PrecisionConfig
 from advsearch.engine.gradients import Loss, inside, smooth_loss
+from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
+from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
@@ -36,7 +38,7 @@ from advsearch.evaluation.precision.report import MeasuredLine, Section, report_
 from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
 from advsearch.evaluation.precision.sharing import ReferencePart, shared_parts
 from advsearch.files import JsonObject
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes, write_text
@@ -68,10 +70,10 @@ IMAGE = "image"
 
 @asks(PrecisionConfig, PrecisionKeywords)
 def precision(
-    object: str | Path = "mug",
-    model: str | Path = "reference",
+    object: Scene | str | Path = "mug",
+    model: AnyModel = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[PrecisionKeywords],
 ) -> PrecisionResult:
     """Measure error against run time of a scene, its gradients and searches over it (docs/precision.md).
@@ -79,15 +81,15 @@ def precision(
     All other arguments are the settings of `advsearch precision`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: the name of an object, or a file of one.
-        model: the network under test, as `advsearch precision` takes it.
-        progress: told how far it is.
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(PrecisionConfig, object=object, model=model, **settings)
-    return precision_from_config(config, progress=progress)
+    return precision_from_config(config, progress=watcher(progress))
 
 
 def precision_from_config(

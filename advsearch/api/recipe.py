@@ -23,7 +23,7 @@ from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.recipes.columns import ANY, check_figures
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
@@ -57,19 +57,19 @@ NOTE = "recipe"
 
 
 @asks(RecipeConfig, RecipeKeywords)
-def recipe(recipe: str | Path, *, progress: Progress | None = None, **settings: Unpack[RecipeKeywords]) -> RecipeResult:
+def recipe(recipe: str | Path, *, progress: Watched = None, **settings: Unpack[RecipeKeywords]) -> RecipeResult:
     """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
 
     All other arguments are the settings of `advsearch recipe`. The run is kept, in `run` or under runs/.
 
     Args:
         recipe: the name of a bundled recipe, or a YAML file.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=progress)
+    return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=watcher(progress))
 
 
 def recipe_from_config(

@@ -16,13 +16,15 @@ from advsearch.api.keywords import RegionKeywords, asks, configured
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
+from advsearch.engine.loading import Scene
 from advsearch.engine.memory import Memory
+from advsearch.engine.naming import AnyModel
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.verifier import Verifier
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.report.studies import map_figure
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
@@ -58,10 +60,10 @@ class Varied:
 
 @asks(RegionConfig, RegionKeywords)
 def region(
-    object: str | Path,
-    model: str | Path = "reference",
+    object: Scene | str | Path,
+    model: AnyModel = "reference",
     *,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[RegionKeywords],
 ) -> RegionResult:
     """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md).
@@ -69,15 +71,15 @@ def region(
     All other arguments are the settings of `advsearch region`. The run is kept, in `run` or under runs/.
 
     Args:
-        object: the name of an object, or a file of one.
-        model: the network under test, as `advsearch region` takes it.
-        progress: told how far it is.
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(RegionConfig, object=object, model=model, **settings)
-    return region_from_config(config, progress=progress)
+    return region_from_config(config, progress=watcher(progress))
 
 
 def region_from_config(
@@ -111,7 +113,7 @@ def region_from_config(
             object=config.object,
             environment=problem.environment,
             model=problem.model.name,
-            task=problem.task.name,
+            task=problem.task.title,
             controls=[bound.name for bound in problem.space.controls],
             ending=ending,
             **vars(answer),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+from advsearch.api.watching import shows_progress
 from advsearch.config import RenderConfig
 from advsearch.engine import rendering
 from advsearch.engine.loading import load_scene
@@ -18,7 +19,7 @@ from advsearch.runs.results.render import RenderResult
 from advsearch.scene.surfaces import aovs_of
 from advsearch.tasks import make_task
 
-render = in_turn()(rendering.render)
+render = in_turn()(shows_progress(rendering.render))
 
 
 def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, judged_alone, problem_from_config
+from advsearch.api.attack import LOADING, parts_in, problem_of_parts
 from advsearch.api.keywords import ReplayKeywords, asks, configured
-from advsearch.config import AttackConfig, ReplayConfig
+from advsearch.config import ReplayConfig
+from advsearch.engine.attack_result import AttackParts, AttackResult
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.replaying import OWN_LIGHT, Way, ways_of
@@ -22,9 +23,9 @@ from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.engine.rows import control_group, verified_rate
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.answer import read_answer
-from advsearch.runs.directory import CONFIG, RunDirectory, find_run, only_here
+from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.replay import NOT_DONE, ReplayResult, ReplayRow
@@ -37,26 +38,45 @@ if TYPE_CHECKING:
 
 
 @asks(ReplayConfig, ReplayKeywords)
-def replay(answer: str | Path, *, progress: Progress | None = None, **settings: Unpack[ReplayKeywords]) -> ReplayResult:
+def replay(
+    answer: str | Path | AttackResult, *, progress: Watched = None, **settings: Unpack[ReplayKeywords]
+) -> ReplayResult:
     """Render the answer of a run under other conditions, each beside the clean scene (docs/questions.md).
 
     All other arguments are the settings of `advsearch replay`. The run is kept, in `run` or under runs/.
 
     Args:
-        answer: name or folder of a run of `attack` that has ended.
-        progress: told how far it is.
+        answer: of an attack that was kept and has ended: its result, or name or folder of its run.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return replay_from_config(configured(ReplayConfig, answer=answer, **settings), progress=progress)
+    if not isinstance(answer, AttackResult):
+        return replay_from_config(configured(ReplayConfig, answer=answer, **settings), progress=watcher(progress))
+    if answer.run is None:
+        raise InputError("answer: expected an attack that was kept, got one that was not; give it a `run`")
+    config = configured(ReplayConfig, answer=answer.run, **settings).with_only_here(only_here(answer.run))
+    return replay_from_config(
+        config, progress=watcher(progress), parts=None if answer.parts is None else answer.parts()
+    )
 
 
 def replay_from_config(
-    config: ReplayConfig, *, progress: Progress | None = None, resumed: Path | None = None
+    config: ReplayConfig,
+    *,
+    progress: Progress | None = None,
+    resumed: Path | None = None,
+    parts: AttackParts | None = None,
 ) -> ReplayResult:
     """Render an answer again as a configuration describes; every trial is stored at once, and a run goes on with the
     next.
+
+    Args:
+        config: what.
+        progress: told how far it is.
+        resumed: the folder of a run to go on with.
+        parts: what the attack was asked with; None loads what its run names.
 
     Raises:
         InputError: the run has no answer, or its scene is another one now.
@@ -65,20 +85,17 @@ def replay_from_config(
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage(LOADING)
     folder = find_run(config.answer)
-    summary, theirs = attack_of(folder), judged_alone(AttackConfig.from_yaml(folder / CONFIG))
-    if config.threads is not None:
-        theirs = theirs.model_copy(update={"threads": config.threads})
+    summary = attack_of(folder)
     if summary.adversarial is None:
         raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to render again")
-    if needed := [one for one in only_here(folder) if not one.startswith(("the objective", "the policy"))]:
-        raise InputError(
-            f"{folder}: {', '.join(needed)}: only the Python session that asked has what judges its answer"
-        )
     different((OWN_MODEL, *config.models), "model")
-    problem, warnings = problem_from_config(theirs)
+    parts = parts or parts_in(folder)
+    threads = {} if config.threads is None else {"threads": config.threads}
+    again = partial(problem_of_parts, parts, **threads)
+    problem, warnings = again()
     u = kept_answer(folder, problem)
-    ways = [*_ways(config, theirs, problem, summary), *_models(config, theirs, problem, summary)]
-    ending, seed = "done", seeds.stream(theirs.seed, "replay")
+    ways = [*_ways(config, again, problem, summary), *_models(config, again, problem, summary)]
+    ending, seed = "done", seeds.stream(parts.config.seed, "replay")
     with RunDirectory.of(config, resumed) as run:
         table = _Table(ways, u, config.trials, seed, run, progress)
         try:
@@ -101,7 +118,7 @@ def replay_from_config(
             renders=table.renders,
             warnings=warnings,
             seconds={"total": time.perf_counter() - begun},
-            seed=theirs.seed,
+            seed=parts.config.seed,
             command_line=config.command_line(),
         )
         run.write_summary(result)
@@ -173,6 +190,9 @@ def _batches(ways: Sequence[Way]) -> list[list[int]]:
     return [sharing, *([number] for number, way in enumerate(ways) if not way.shares)]
 
 
+Again = Callable[..., tuple[Problem, list[str]]]
+"""The problem of the run with some settings changed, and warnings; see `problem_of_parts`."""
+
 OWN_MODEL = "the run's own"
 """What no other model is called."""
 
@@ -197,22 +217,22 @@ def _spp(summary: AttackSummary) -> int:
     return summary.sample_count.spp if summary.sample_count else summary.verified.spp if summary.verified else 64
 
 
-def _ways(config: ReplayConfig, theirs: AttackConfig, problem: Problem, summary: AttackSummary) -> Iterator[Way]:
+def _ways(config: ReplayConfig, again: Again, problem: Problem, summary: AttackSummary) -> Iterator[Way]:
     """The run's own condition, and those that are asked for."""
 
     def sized(size: tuple[int, int]) -> Problem:
-        return problem_from_config(theirs.model_copy(update={"resolution": size}))[0]
+        return again(resolution=size)[0]
 
     own, *others = ways_of(problem, _spp(summary), sized)
     yield own
     yield from (way for way in others if way.name in config.chosen)
 
 
-def _models(config: ReplayConfig, theirs: AttackConfig, problem: Problem, summary: AttackSummary) -> Iterator[Way]:
+def _models(config: ReplayConfig, again: Again, problem: Problem, summary: AttackSummary) -> Iterator[Way]:
     """Other models, loaded before anything is rendered; those that are shown pictures as the run's own model is take
     its renders."""
     for name in config.models:
-        other = problem_from_config(AttackConfig.of(theirs, model=name, ensemble=None))[0]
+        other = again(model=name, ensemble=None)[0]
         shares = other.renderer.formation == problem.renderer.formation
         if shares:
             other = replace(other, renderer=problem.renderer)

@@ -12,7 +12,7 @@ from advsearch.config import StabilityConfig
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
 from advsearch.evaluation.stability.suite import chosen, run_cases
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.stability import CaseRow, StabilityResult
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 
 @asks(StabilityConfig, StabilityKeywords)
-def stability(*, progress: Progress | None = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
+def stability(*, progress: Watched = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
     """Try extreme scenes, objectives and arithmetic, and say whether each of them holds (docs/stability.md).
 
     All other arguments are the settings of `advsearch stability`. The run is kept, in `run` or under runs/.
 
     Args:
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    return stability_from_config(configured(StabilityConfig, **settings), progress=progress)
+    return stability_from_config(configured(StabilityConfig, **settings), progress=watcher(progress))
 
 
 def stability_from_config(

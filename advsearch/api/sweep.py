@@ -17,9 +17,12 @@ from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
 from advsearch.engine.answers import one_label_for_several, shown
+from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.budget import verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, only_here, settings_of
+from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
+from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
     AnyModel,
     check_not_of_scene,
@@ -31,7 +34,6 @@ from advsearch.engine.naming import (
     scene_settings,
     several,
 )
-from advsearch.engine.outcome import AttackResult
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
@@ -42,7 +44,7 @@ from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
@@ -52,6 +54,7 @@ from advsearch.scene.formation import next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES, split_names
 from advsearch.tasks import AnyTask, Task, make_task
+from advsearch.tasks.own import OwnTask, function_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -78,8 +81,9 @@ def sweep(
     samples: int | None = None,
     controls: Controls = (),
     answer_of: str | Path | AttackResult | None = None,
+    metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
-    progress: Progress | None = None,
+    progress: Watched = None,
     **settings: Unpack[SweepKeywords],
 ) -> SweepResult:
     """Render every configuration of a grid, and draws by chance, and say how often the model is right.
@@ -91,15 +95,18 @@ def sweep(
         scene: from `load_scene`, or what that takes; or several. None takes that of `answer_of`.
         model: from `load_model`, or what that takes; or several, which are shown the same pictures. None takes that of
             `answer_of`, and the reference model without.
-        task: what judges the models' outputs: a name, a mapping with a `name` and options, or an instance.
+        task: what judges the models' outputs: a name, a mapping with a `name` and options, an instance, or a function
+            (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
         grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
         samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
         controls: what is drawn by chance, as for `attack`.
         answer_of: an attack that was kept, or its folder, whose answer is swept beside the clean scene, under the same
             draws; `summary.beside` compares the two. Where neither `grid` nor `controls` is given, what the attack was
             over varies.
+        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
+            truth) that return a number, or a dict of some. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
-        progress: told how far it is.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
@@ -114,6 +121,7 @@ def sweep(
     networks = _several(brought.get("model", "reference") if model is None else model)
     controls = controls or brought.get("controls", ())
     task = brought.get("task", task) if task == "classification" else task
+    task = make_task(task) if callable(task) else task
     names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
     if names and len(names) < len(scenes):
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
@@ -124,6 +132,7 @@ def sweep(
         "grid": dict(grid or {}),
         "samples": samples,
         "answer_of": _folder(answer_of),
+        "metrics": metrics_as_settings(metrics or {}),
     }
     loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
     if loaded:
@@ -135,15 +144,19 @@ def sweep(
     parts = [f"the model {model_name(one)}" for one in networks if exists_here(one)]
     parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
+    parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
     config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
+    if config.workers is not None or config.cluster is not None:
+        check_shared(config.metrics)
     if config.keep_pictures != "none" and config.run is None:
         raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
     if config.aov is not None and config.run is None:
         raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
-    progress = progress or NullProgress()
-    if loaded or only_here(controls) or not all(isinstance(one, (str, Path)) for one in networks):
+    progress = watcher(progress)
+    told = all(isinstance(one, (str, Path)) for one in networks) and not isinstance(task, OwnTask)
+    if loaded or only_here(controls) or not told:
         check_not_spread(options)
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
@@ -151,6 +164,7 @@ def sweep(
     asked = task if isinstance(task, Task) else config.task
     with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as folder:
         job = _job(config, loaded or _places(config), several(networks), asked, controls)
+        job = replace(job, metrics=load_metrics(config.metrics, metrics))
         if config.run is not None:
             return _kept(config, job, progress, folder)
         with _executor(config, progress) as executor:
@@ -253,7 +267,8 @@ def _described(places: Sequence[NamedScene]) -> dict[str, object]:
 
 def job_of(config: SweepConfig) -> Job:
     """Find and load everything that a configuration names."""
-    return _job(config, _places(config), config.models, config.task, config.controls)
+    job = _job(config, _places(config), config.models, config.task, config.controls)
+    return replace(job, metrics=load_metrics(config.metrics))
 
 
 def _job(
@@ -356,7 +371,8 @@ def _stopped(config: SweepConfig) -> Path | None:
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
     with RunDirectory.of(config, resumed) as run, _executor(config, progress) as executor:
-        check_made_of(run, job.models)
+        functions = {f"metric {name}": one for name, one in job.metrics.items()}
+        check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
         return carry_out(job, run, progress, executor)
 
 

@@ -1,4 +1,4 @@
-"""An objective of features: how far a picture has moved from the clean one in the eyes of the network."""
+"""Objectives of features: how far a picture has moved from the clean one in the eyes of the network."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from advsearch.errors import InputError
 
@@ -52,8 +53,7 @@ def feature_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor,
     reference = _reference(features, clean)
     length = torch.linalg.vector_norm(reference)
     scale = torch.where(length > 0.0, length, torch.ones_like(length))
-    away = torch.randn(reference.shape, generator=torch.Generator().manual_seed(0)).to(reference)
-    away = NEARBY * away / torch.linalg.vector_norm(away)
+    away = _away(reference)
 
     def objective(logits: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
         moved = (features(images) - reference) / scale + away
@@ -65,15 +65,50 @@ def feature_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor,
     return objective
 
 
+def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
+    """One minus the cosine of the features and those of the clean picture: from 0 where they are the same to 2.
+
+    That is |e|^2 / 2 for e the difference of both at length 1. Its gradient is zero at the clean picture, where every
+    search starts, so `h` e . r is added, with r and `h` as in `feature_distance`: at the clean picture the gradient
+    leads along r, and beyond a few `h` it is that of the distance.
+
+    Args:
+        features: of the clean picture; called once, here.
+        clean: as for `feature_distance`.
+
+    Returns:
+        An objective (features (N, F), images, labels) -> (N,), at least 0 but for `h`^2, that looks at the features
+        only, whatever their length.
+
+    Raises:
+        InputError: as for `feature_distance`.
+    """
+    reference = functional.normalize(_reference(features, clean), dim=0)
+    away = _away(reference)
+
+    def objective(output: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
+        moved = functional.normalize(output, dim=1) - reference.to(output)
+        distance: Tensor = moved.square().sum(dim=1) / 2.0 + moved @ away.to(output)
+        return distance
+
+    return objective
+
+
+def _away(reference: Tensor) -> Tensor:
+    """Return a fixed direction (F,) of length `NEARBY`."""
+    away = torch.randn(reference.shape, generator=torch.Generator().manual_seed(0)).to(reference)
+    return away * (NEARBY / float(torch.linalg.vector_norm(away)))
+
+
 def _reference(features: ReadFeatures, clean: Tensor) -> Tensor:
     """Return the mean features (F,) of the clean pictures."""
     with torch.no_grad():
         found = features(clean if clean.dim() == 4 else clean[None])
     if found.dim() != 2:
-        raise InputError(f"feature_distance: expected features of shape (N, F), got {tuple(found.shape)}")
+        raise InputError(f"objective: expected features of shape (N, F), got {tuple(found.shape)}")
     if not bool(torch.isfinite(found).all()):
         raise InputError(
-            "feature_distance: expected finite features of the clean picture, got NaN or infinity; check that the "
+            "objective: expected finite features of the clean picture, got NaN or infinity; check that the "
             "model answers it"
         )
     return found.mean(dim=0)

@@ -7,19 +7,20 @@ An objective is a callable `(output, images, truth) -> values`, the larger the n
 - truth: what is true of the scene, as the task has it; in classification the indices of the label set Y, every one of
   which is a right answer;
 - values: (N,), differentiable.
+
+What `get_objective` returns is called with a fourth argument where there is a configuration: `more`, which gives what a
+user's function asks for by the names of its parameters (`advsearch.attacks.own_objective`).
 """
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, final
+from typing import Any, final
 
-import torch
 from torch import Tensor
 
-from advsearch.attacks.feature_distance import ReadFeatures, feature_distance
+from advsearch.attacks.feature_distance import ReadFeatures, cosine_distance, feature_distance
 from advsearch.attacks.logit_objectives import (
     cross_entropy,
     dlr,
@@ -30,17 +31,21 @@ from advsearch.attacks.logit_objectives import (
     targeted_log_odds,
     targeted_margin,
 )
+from advsearch.attacks.own_objective import More, Objective, checked, form_of, nothing_more
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
-from advsearch.tasks import Classification, Segmentation, Task
+from advsearch.tasks import TASKS, Classification, Depth, Segmentation, Similarity, Task
 from advsearch.tasks.classes import ClassTask
+from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS, Detection
+from advsearch.tasks.together import Together
 
 __all__ = [
     "OBJECTIVES",
     "OBJECTIVE_KINDS",
     "Objective",
     "ObjectiveKind",
+    "asked_by",
     "check_objective",
     "checked",
     "cross_entropy",
@@ -55,14 +60,6 @@ __all__ = [
 ]
 
 
-class Objective(Protocol):
-    """The signature of an objective, called by position; see the module's docstring."""
-
-    def __call__(self, output: Any, images: Tensor, truth: Any, /) -> Tensor:
-        """Return (N,) values to maximise."""
-        ...
-
-
 @final
 @dataclass(frozen=True)
 class ObjectiveKind:
@@ -72,23 +69,35 @@ class ObjectiveKind:
         name: its name.
         summary: one line about it.
         unit: of its values.
-        plain: the function of the right answers; None for one that has to be made for a run.
+        plain: the function of the right answers, which may ask for more as a user's own does; None for one that has to
+            be made for a run.
         targeted: the same, of a target in their place; None if it has no such form.
-        task: name of the task whose outputs it takes; None for any.
-        needs_features: whether it is made from the model's features and a clean picture.
+        task: name of the task whose outputs it takes, and of those tasks that are kinds of it; None for any.
+        of_features: what makes it from the model's features and a clean picture; None where nothing does.
         of_task: what makes it from the task, which knows of target and direction itself; None where nothing does.
     """
 
     name: str
     summary: str
     unit: str
-    plain: Objective | None = None
-    targeted: Objective | None = None
+    plain: Callable[..., Tensor] | None = None
+    targeted: Callable[..., Tensor] | None = None
     task: str | None = Classification.name
-    needs_features: bool = False
+    of_features: Callable[[ReadFeatures, Tensor], Callable[..., Tensor]] | None = None
     of_task: Callable[[Any], Objective] | None = None
 
-    def form(self, *, targeted: bool) -> Objective:
+    @property
+    def needs_features(self) -> bool:
+        """Whether it is made from features."""
+        return self.of_features is not None
+
+    def fits(self, task: str) -> bool:
+        """Whether it takes the outputs of the task of that name."""
+        return self.task in (None, task) or (
+            self.task in TASKS and task in TASKS and issubclass(TASKS[task], TASKS[self.task])
+        )
+
+    def form(self, *, targeted: bool) -> Callable[..., Tensor]:
         """Return the plain or the targeted function."""
         found = self.targeted if targeted else self.plain
         if found is None:
@@ -99,7 +108,7 @@ class ObjectiveKind:
 def _score_of(task: Task) -> Objective:
     """The score of a task."""
 
-    def score(output: Any, images: Tensor, truth: Any) -> Tensor:
+    def score(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
         return task.score(output, truth)
 
     return score
@@ -108,7 +117,7 @@ def _score_of(task: Task) -> Objective:
 def _pixel_margin_of(task: Segmentation) -> Objective:
     """The mean over the object's pixels."""
 
-    def pixel_margin(output: Tensor, images: Tensor, truth: Any) -> Tensor:
+    def pixel_margin(output: Tensor, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
         return task.pixel_margin(output, truth)
 
     return pixel_margin
@@ -149,7 +158,14 @@ _OWN = {
             "feature_distance",
             "how far the features lie from those of the clean picture",
             "lengths of the clean features",
-            needs_features=True,
+            of_features=feature_distance,
+        ),
+        ObjectiveKind(
+            "distance",
+            "how far the features lie from those of the clean picture, by the angle",
+            "1 - cosine",
+            task=Similarity.name,
+            of_features=cosine_distance,
         ),
         ObjectiveKind(
             "score",
@@ -161,6 +177,17 @@ _OWN = {
         *(
             ObjectiveKind(name, f"sought: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
             for name, summary in GOALS.items()
+        ),
+        ObjectiveKind(
+            Together.objective,
+            "of several tasks at once: each task's own objective, put together by `ensemble`",
+            "those of the tasks",
+            task=Together.name,
+            of_task=_score_of,
+        ),
+        *(
+            ObjectiveKind(name, f"sought: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
+            for name, summary in DEPTH_GOALS.items()
         ),
         ObjectiveKind(
             "pixel_margin",
@@ -180,7 +207,9 @@ OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
 )
 """Every objective that has a name."""
 
-OBJECTIVES: dict[str, Objective] = {name: kind.plain for name, kind in _OWN.items() if kind.plain is not None}
+OBJECTIVES: dict[str, Callable[..., Tensor]] = {
+    name: kind.plain for name, kind in _OWN.items() if kind.plain is not None
+}
 """Those of our own that need nothing but logits, in their plain form."""
 
 
@@ -205,7 +234,7 @@ def get_objective(
     targeted form, and the user's function gets the target in place of the truth. To minimise, either is negated.
 
     Args:
-        objective: a name, or a function of (output, images, truth).
+        objective: a name, or a function of (output, images, truth) or of (output, labels), which may ask for more.
         task: judges the model; classification of any wrong answer if None.
         features: for an objective that `needs_features`: `advsearch.models.features.features_of(model)`.
         clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
@@ -221,16 +250,17 @@ def get_objective(
         found = checked(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
         return kind.of_task(task)
-    elif kind.needs_features:
+    elif kind.of_features is not None:
         if features is None or clean is None:
             raise InputError(
                 f"objective {kind.name!r}: expected the model's features and a clean picture, got none; use "
                 "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
             )
-        found = feature_distance(features, clean)
+        found = _plain(kind.of_features(features, clean))
     else:
-        found = kind.form(targeted=targeted)
-        if isinstance(task, ClassTask) and task.nothing:
+        form = kind.form(targeted=targeted)
+        found = _plain(form) if _OWN.get(kind.name) is kind else checked(form)
+        if isinstance(task, Similarity) or (isinstance(task, ClassTask) and task.nothing):
             found = _of_answers(found, task)
     found = _aimed(found, task.target) if targeted else found
     return negated(found) if task.minimise else found
@@ -258,16 +288,16 @@ def check_objective(
             "give that as `label`"
         )
     if isinstance(objective, str) and objective not in OBJECTIVE_KINDS:
-        hint = "From Python, objective= also takes a function (output, images, truth)."
+        hint = "From Python, objective= also takes a function (output, images, truth), or (output, labels)."
         raise UnknownNameError("objective", objective, OBJECTIVE_KINDS, hint)
     if not isinstance(objective, str) and not callable(objective):
         raise InputError(f"objective: expected a name or a function (output, images, truth), got {objective!r}")
     kind = _kind_of(objective)
     if kind is None:
-        _check_signature(objective)  # type: ignore[arg-type]
+        form_of(objective)  # type: ignore[arg-type]
         return
-    if kind.task not in (None, task):
-        fitting = [name for name, one in OBJECTIVE_KINDS.items() if one.task in (None, task)]
+    if not kind.fits(task):
+        fitting = [name for name, one in OBJECTIVE_KINDS.items() if one.fits(task)]
         raise InputError(
             f"objective: expected one of task {task} ({', '.join(fitting)}), got {kind.name}, which takes outputs of "
             f"{kind.task}"
@@ -280,6 +310,13 @@ def check_objective(
         raise InputError(f"{setting}: {expected}, got {kind.name}; {reason}")
 
 
+def asked_by(objective: str | Callable[..., Tensor]) -> tuple[str, ...]:
+    """Return what an objective, checked already, asks for beside output, images and truth."""
+    kind = _kind_of(objective)
+    function = objective if kind is None else kind.plain
+    return form_of(function).asked if callable(function) else ()
+
+
 def _kind_of(objective: object) -> ObjectiveKind | None:
     """Return the kind of a name, or of a function that has one; None for the user's own."""
     if isinstance(objective, str):
@@ -287,11 +324,20 @@ def _kind_of(objective: object) -> ObjectiveKind | None:
     return next((kind for kind in OBJECTIVE_KINDS.values() if kind.plain is objective), None)
 
 
+def _plain(function: Callable[..., Tensor]) -> Objective:
+    """An objective that asks for nothing more."""
+
+    def plain(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        return function(output, images, truth)
+
+    return plain
+
+
 def _aimed(objective: Objective, target: Any) -> Objective:
     """Wrap an objective of a target so that it is called with the truth, like any other."""
 
-    def aimed(output: Any, images: Tensor, truth: Any) -> Tensor:
-        return objective(output, images, target)
+    def aimed(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        return objective(output, images, target, more)
 
     return aimed
 
@@ -299,8 +345,8 @@ def _aimed(objective: Objective, target: Any) -> Objective:
 def _of_answers(objective: Objective, task: Task) -> Objective:
     """Wrap an objective of logits so that it sees only what is an answer."""
 
-    def of_answers(output: Any, images: Tensor, truth: Any) -> Tensor:
-        return objective(task.answerable(output, truth), images, truth)
+    def of_answers(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        return objective(task.answerable(output, truth), images, truth, more)
 
     return of_answers
 
@@ -308,67 +354,7 @@ def _of_answers(objective: Objective, task: Task) -> Objective:
 def negated(objective: Objective) -> Objective:
     """Wrap an objective so that what is maximised is its negative: easier to recognise instead of harder."""
 
-    def negative(output: Any, images: Tensor, truth: Any) -> Tensor:
-        return -objective(output, images, truth)
+    def negative(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        return -objective(output, images, truth, more)
 
     return negative
-
-
-def checked(function: Callable[..., Tensor]) -> Objective:
-    """Wrap a user's function: a scalar becomes (1,), and a wrong type, shape or a lost gradient is an InputError.
-
-    The function gets (output, images, truth) as the module's docstring says and returns (N,), or a scalar for one
-    image. What it raises itself passes through. NaN values pass too: a search has a rule for them.
-
-    Raises:
-        InputError: the function does not take three arguments.
-    """
-    name = _name_of(function)
-    _check_signature(function)
-
-    def objective(output: Any, images: Tensor, truth: Any) -> Tensor:
-        values = function(output, images, truth)
-        count = images.shape[0]
-        if not isinstance(values, Tensor):
-            raise InputError(
-                f"objective {name!r}: expected a torch tensor of shape ({count},), got {type(values).__name__}; "
-                "compute it with torch operations and don't call .item(), float() or .numpy()"
-            )
-        if not values.is_floating_point():
-            raise InputError(
-                f"objective {name!r}: expected floating-point values, got {values.dtype}; a count or a comparison has "
-                "no gradient"
-            )
-        if values.ndim == 0 and count == 1:
-            values = values.reshape(1)
-        if values.shape != (count,):
-            raise InputError(
-                f"objective {name!r}: expected one value per image, shape ({count},), got {tuple(values.shape)}; "
-                "reduce over everything but the first axis"
-            )
-        seen = [images, output] if isinstance(output, Tensor) else [images]
-        wanted = torch.is_grad_enabled() and any(one.requires_grad for one in seen)
-        if wanted and not values.requires_grad:
-            raise InputError(
-                f"objective {name!r}: the result does not depend on the output or the images differentiably; "
-                "remove .detach(), torch.no_grad() or argmax, or choose a policy without gradients (random)"
-            )
-        return values
-
-    return objective
-
-
-def _name_of(function: Callable[..., Tensor]) -> str:
-    return getattr(function, "__name__", type(function).__name__)
-
-
-def _check_signature(function: Callable[..., Tensor]) -> None:
-    try:
-        inspect.signature(function).bind(None, None, None)
-    except ValueError:  # built in: nothing to look at
-        return
-    except TypeError as error:
-        raise InputError(
-            f"objective {_name_of(function)!r}: expected a function that takes (output, images, truth), by position: "
-            f"{error}"
-        ) from None

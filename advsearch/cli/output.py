@@ -95,11 +95,14 @@ def _code_in(file: Path) -> Sequence[str]:
     from advsearch.settings import split_names
 
     config = described(command_in(file), file, {})
-    if not isinstance(config, SceneConfig) or ":" not in "".join([config.model, *config.kinds_of_controls]):
+    if not isinstance(config, SceneConfig):
+        return ()
+    metrics = getattr(config, "metrics", {}).values()
+    if ":" not in "".join([config.model, *config.kinds_of_controls, *metrics]):
         return ()
     from advsearch.engine.naming import code_of  # takes seconds
 
-    return code_of(split_names(config.model), config.kinds_of_controls)
+    return code_of(split_names(config.model), config.kinds_of_controls, metrics)
 
 
 @contextmanager

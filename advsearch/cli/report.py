@@ -155,13 +155,20 @@ def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
 
     from advsearch.options import FROM_RUN
     from advsearch.tasks import make_task
+    from advsearch.tasks.together import Together
 
     given: Any = settings.get("task")
     if given is None:
         return {}
     with suppress(AdvsearchError):
         task = make_task(given)
-        return {one.name: getattr(task, one.name) for one in fields(task) if one.metadata != FROM_RUN}
+        alone = [("", task)] if not isinstance(task, Together) else [(f"{one.name}.", one) for one in task.parts]
+        return {
+            f"{of}{option.name}": getattr(one, option.name)
+            for of, one in alone
+            for option in fields(one)
+            if option.metadata != FROM_RUN
+        }
     return {}
 
 

@@ -12,7 +12,7 @@ from advsearch.config.named import name_in, read_named
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.files import JsonObject
-from advsearch.settings import Clash, setting, setting_as_in
+from advsearch.settings import Clash, setting, setting_as_in, split_names
 
 if TYPE_CHECKING:
     pass
@@ -57,7 +57,7 @@ class AttackConfig(DerivativeConfig):
         ),
         Clash(
             "ensemble",
-            lambda one: not one.is_matrix,
+            lambda one: len(split_names(one.model)) < 2,
             "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
         ),
         Clash(
@@ -165,6 +165,15 @@ class AttackConfig(DerivativeConfig):
         "aov",
         description="ground truth of each pixel, separated by commas, as layers of an EXR of the clean scene and the "
         "answer",
+    )
+    metrics: dict[str, str] = setting(
+        dict,
+        "run",
+        "numbers of your own for every picture, each a column of the rows",
+        "NAME=package.module:function of image, output and truth",
+        flag="--metric",
+        metavar="NAME=FUNCTION",
+        form="assignments",
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
         None, "run", "what is told of every evaluation as it comes, through its own package", otherwise="nothing"

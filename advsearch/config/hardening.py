@@ -35,6 +35,7 @@ class HardenConfig(AttackConfig):
         "ensemble",
         "printable",
         "aov",
+        "metrics",
         "log",
         "target",
         "minimise",

@@ -18,7 +18,7 @@ class GapConfig(AttackConfig):
 
     command: ClassVar[str] = "gap"
     several: ClassVar[tuple[str, ...]] = ("object",)
-    without: ClassVar[tuple[str, ...]] = ("smallest", "ensemble", "printable", "aov", "log")
+    without: ClassVar[tuple[str, ...]] = ("smallest", "ensemble", "printable", "aov", "metrics", "log")
 
     model: str = setting_as_in(SceneConfig, "model")
     average: int = setting_as_in(AttackConfig, "average", default=200, ge=1)

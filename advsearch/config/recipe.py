@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, field_validator
 
-from advsearch.config.named import read_named
+from advsearch.config.named import read_joined
 from advsearch.config.scene import SceneConfig
 from advsearch.files import MESHES, either
 from advsearch.settings import Clash, Config, setting, setting_as_in, split_names
@@ -97,7 +97,7 @@ class RecipeConfig(Config):
     @field_validator("task", mode="before")
     @classmethod
     def _task_with_options(cls, value: Any) -> Any:
-        return read_named(value, "task", "classification")
+        return read_joined(value, "task", "classification")
 
     @field_validator("photographs")
     @classmethod

@@ -7,10 +7,10 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, field_validator, model_validator
 
-from advsearch.config.named import name_in, read_named
+from advsearch.config.named import name_in, read_joined
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
-from advsearch.options import by_key
+from advsearch.options import JOINED, by_key
 from advsearch.settings import Clash, Config, as_text, check_once, number_or_text, setting, shown, split_names
 
 DEFAULT_ENVIRONMENT = "studio"
@@ -119,15 +119,16 @@ class SceneConfig(Config):
     prompt: str | None = setting(
         None,
         "model",
-        "the text that a model such as CLIP compares pictures with, for each of labels; several are averaged",
-        "a text with {} where the name goes, several with | between them",
-        otherwise="a photo of a {}",
+        "the text that a model is given beside a picture: what one such as CLIP compares it with, for each of labels, "
+        "or what one such as LLaVA is asked",
+        "a text, for CLIP with {} where the name goes, or several with | between them",
+        otherwise="a photo of a {}, or What is this?",
         metavar="TEXT",
     )
     task: str | dict[str, JsonValue] = setting(
         "classification",
         "model",
-        "what the model is to do, and how it is judged",
+        "what the model is to do, and how it is judged; several with + between them, one for each of several models",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
     label: str | None = setting(
@@ -193,7 +194,14 @@ class SceneConfig(Config):
     def _one_of_each(self) -> SceneConfig:
         """Refuse several objects, environments or models where one is looked at."""
         for name in ("object", "environment", "model"):
-            names = split_names(getattr(self, name) or "")
+            names, tasks = split_names(getattr(self, name) or ""), self.task_name.split(JOINED)
+            if name == "model" and len(tasks) > 1:
+                if len(names) != len(tasks):
+                    raise InputError(
+                        f"model: expected {len(tasks)} with commas between them, one for each of {', '.join(tasks)}, "
+                        f"got {len(names)}"
+                    )
+                continue
             if len(names) > 1 and name not in self.several:
                 raise one_only(name, names)
         return self
@@ -243,8 +251,8 @@ class SceneConfig(Config):
 
     @property
     def models(self) -> tuple[str, ...]:
-        """The models by name."""
-        return split_names(self.model)
+        """The models by name; those of several tasks are one together."""
+        return (self.model,) if JOINED in self.task_name else split_names(self.model)
 
     @field_validator(
         "object",
@@ -273,18 +281,18 @@ class SceneConfig(Config):
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
-        """Accept several in a list; each says where the name goes."""
+        """Accept several in a list."""
         several = isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value)
         text = " | ".join(value) if several else value
-        if isinstance(text, str) and not all("{}" in one for one in text.split("|")):
-            raise ValueError("no place for a name")
+        if isinstance(text, str) and not all(one.strip() for one in text.split("|")):
+            raise ValueError("no text")
         return text
 
     @field_validator("task", mode="before")
     @classmethod
     def _task_with_options(cls, value: Any) -> Any:
-        """Accept ``{name: yaw, tolerance: 5}``, ``yaw={tolerance: 5}`` and a name."""
-        return read_named(value, "task", cls.model_fields["task"].default)
+        """Accept ``{name: yaw, tolerance: 5}``, ``yaw={tolerance: 5}`` and a name, and several with + between them."""
+        return read_joined(value, "task", cls.model_fields["task"].default)
 
     @field_validator("spp")
     @classmethod

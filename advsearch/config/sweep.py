@@ -128,6 +128,7 @@ class SweepConfig(SceneConfig):
     )
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
+    metrics: dict[str, str] = setting_as_in(AttackConfig, "metrics")
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(AttackConfig, "log")
     workers: int | None = setting_as_in(
         AttackConfig,

@@ -135,6 +135,11 @@ class BoundControl(ABC):
         without."""
         return None
 
+    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
+        """Return the numbers of the configuration by parameter, in its unit, (k,) or without dimensions, as
+        differentiable functions of u; names have none."""
+        return {}
+
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
         """Return other files worth keeping, by name with ending: a mesh as PLY, say; see `describe`."""
         return {}

@@ -41,6 +41,7 @@ from advsearch.controls.values import (
     Spec,
     in_words,
     option_index,
+    plain,
     read,
     to_unit,
     to_value,
@@ -80,7 +81,7 @@ class NumberControl(Control, ABC):
         for setting in settings:
             if setting not in known:
                 raise UnknownNameError(f"setting of control {self.kind}", setting, known)
-        self._given = {setting: value for setting, value in settings.items() if value is not None}
+        self._given = {setting: plain(value) for setting, value in settings.items() if value is not None}
         self.chosen = {choice.name: self._given.get(choice.name, choice.default) for choice in self.choices}
         for choice in self.choices:
             choice.check(self.name, self.chosen[choice.name])
@@ -291,6 +292,10 @@ class BoundNumbers(BoundControl):
             number = parameter.options.index(one) if isinstance(one, str) else one
             found[parameter.name] = torch.full(shape, float(number), dtype=torch.float32, device=u.device)
         return found
+
+    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
+        named = {slot.parameter.name for slot in self.slots if slot.parameter.options}
+        return {name: value for name, value in self.values(u).items() if name not in named}
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return self.control.scene_inputs(self.scene, self.values(u), so_far)

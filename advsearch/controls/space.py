@@ -73,8 +73,12 @@ class Space:
 
     @cached_property
     def sizes(self) -> list[int]:
-        """How many coordinates each control has: `u.split(space.sizes)` are their slices."""
+        """How many coordinates each control has."""
         return [len(control.start) for control in self.controls]
+
+    def slices(self, u: Tensor) -> list[tuple[BoundControl, Tensor]]:
+        """Return each control with its slice of u."""
+        return list(zip(self.controls, u.split(self.sizes), strict=True))
 
     @cached_property
     def _turns(self) -> tuple[int, ...]:
@@ -114,7 +118,7 @@ class Space:
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Apply what controls do to the finished picture (H, W, 3) sRGB, in their order; differentiable in both."""
-        for control, part in zip(self.controls, u.split(self.sizes), strict=True):
+        for control, part in self.slices(u):
             image = control.picture(part, image)
         return image
 
@@ -125,6 +129,16 @@ class Space:
             if controls is None or control in controls:
                 found.update(control.describe(part, so_far))
         return found
+
+    def printed(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the searched colours that a printer would print, by control; see `BoundControl.printed`."""
+        found = {control.name: control.printed(part) for control, part in self.slices(u)}
+        return {name: colors for name, colors in found.items() if colors is not None}
+
+    def numbers(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the numbers of a configuration by parameter ("pose.yaw"); see `BoundControl.numbers`."""
+        each = ((control.name, control.numbers(part)) for control, part in self.slices(u))
+        return {f"{name}.{one}": value for name, numbers in each for one, value in numbers.items()}
 
     def holding(self, u: Tensor) -> Space:
         """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
@@ -183,6 +197,9 @@ class _Held(BoundControl):
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         return self._control.describe(self._at, so_far)
+
+    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
+        return self._control.numbers(self._at)
 
 
 def file_name(name: str) -> str:

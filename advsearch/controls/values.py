@@ -54,6 +54,13 @@ class OneOf:
 Spec = Fixed | Range | OneOf
 
 
+def plain(given: object) -> object:
+    """Return numbers and arrays of numpy and torch, also in a list, as Python's."""
+    if isinstance(given, (list, tuple)):
+        return type(given)(map(plain, given))
+    return given.tolist() if hasattr(given, "tolist") and hasattr(given, "dtype") else given
+
+
 def read(where: str, parameter: Parameter, given: object) -> Spec:
     """Return the setting of a parameter from what was given for it.
 

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import final
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
 
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.switches import plainly
+from advsearch.options import told
 from advsearch.scene import settings
-from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
+from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -28,6 +33,7 @@ from advsearch.scene.description import (
 )
 from advsearch.scene.formation import SAMPLER, ImageFormation
 from advsearch.scene.gradients.motion import Motion
+from advsearch.scene.importing.images import read_picture
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
@@ -36,6 +42,12 @@ from advsearch.settings import as_python
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 """One control or several, by name or instance; a mapping gives each name its settings, and ``mitsuba:KEY`` a range."""
+
+Texture = str | Path | npt.ArrayLike | Tensor
+"""A picture to paint an object with, see `load_scene`."""
+
+CONTROL, SCENE, MODEL = "control", "scene", "model"
+"""Kinds of things that may stand for a name (`lent`)."""
 
 DEFAULT_RESOLUTION = 128
 
@@ -102,6 +114,17 @@ class Scene:
         fixed = "".join(f", {name}={value!r}" for name, value in sorted(described.given_values.items()))
         return f"Scene({described.object_name!r}, {described.environment_name!r}{fixed})"
 
+    def with_texture(self, texture: Texture) -> Scene:
+        """Return the scene with another texture of the object; see `load_scene`.
+
+        Raises:
+            FileFormatError: the file is no picture.
+            InputError: it is no (h, w, 3) picture in [0, 1].
+        """
+        own = self.description
+        painted = replace(own.object, base_color=_texels(texture))
+        return Scene(replace(own, object=painted), only_here=True)
+
     def with_settings(self, given: Given) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
 
@@ -145,6 +168,7 @@ def load_scene(
     up: str | None = None,
     settings: Given | None = None,
     camera: str | None = None,
+    texture: Texture | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -157,6 +181,8 @@ def load_scene(
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
         camera: name of a camera of a scene file; "orbit" or None for the one around the object.
+        texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
+            top; `result.artifacts["texture"]`, say.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
@@ -173,7 +199,36 @@ def load_scene(
     only_here = isinstance(scene, Mapping) or not all(
         one is None or isinstance(one, (str, Path)) for one in (object, environment)
     )
-    return Scene(described if camera is None else described.seen_by(camera), only_here)
+    loaded = Scene(described if camera is None else described.seen_by(camera), only_here)
+    return loaded if texture is None else loaded.with_texture(texture)
+
+
+def _texels(texture: Texture) -> Floats:
+    """A texture as an object has it: (h, w, 3) float32 sRGB in [0, 1]."""
+    if isinstance(texture, (str, Path)):
+        return read_picture(Path(texture), None)
+    given = np.asarray(texture.detach().cpu() if isinstance(texture, Tensor) else texture)
+    texels: Floats = given.astype(np.float32) / (255.0 if given.dtype == np.uint8 else 1.0)
+    if texels.ndim != 3 or texels.shape[2] != 3 or not texels.size:
+        raise InputError(f"texture: expected a picture (h, w, 3), got an array of shape {given.shape}")
+    if not (np.isfinite(texels).all() and texels.min() >= 0.0 and texels.max() <= 1.0):
+        raise InputError(
+            f"texture: expected sRGB in [0, 1], or 8 bits as uint8, got {given.dtype} from {given.min():g} to "
+            f"{given.max():g}"
+        )
+    return np.ascontiguousarray(texels)
+
+
+def scene_as_settings(scene: Scene) -> dict[str, Any]:
+    """Return the settings that say what a scene is, as far as settings can."""
+    described = scene.description
+    return {
+        "object": described.object_name,
+        "environment": described.environment_name,
+        "up": described.up,
+        "camera": named_camera(described),
+        "set": described.given_values,
+    }
 
 
 def named_camera(description: SceneDescription) -> str | None:
@@ -234,7 +289,7 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
     if isinstance(controls, Mapping):
         return {name: dict(given) for name, given in settings_by_name(controls).items()}
     several = [controls] if isinstance(controls, Control) else controls
-    several = [part.strip() for part in several.split(",")] if isinstance(several, str) else list(several)
+    several = [part.strip() for part in several.split(",")] if isinstance(several, str) else several
     as_controls(several)
     return {
         one.name if isinstance(one, Control) else one: one.settings() if isinstance(one, Control) else {}
@@ -255,8 +310,10 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
     if isinstance(controls, Control):
         controls = [controls]
     if not isinstance(controls, Mapping):
-        if not all(isinstance(one, (str, Control)) for one in controls):
-            raise InputError(f"controls: expected names or Control instances, got {controls!r}")
+        listed = list(controls) if isinstance(controls, Iterable) else [controls]
+        for one in listed:
+            if not isinstance(one, (str, Control)):
+                raise InputError(f"controls: expected names or Control instances, got {told(one)}")
         ready = tuple(one for one in controls if isinstance(one, Control))
         if ready and len(ready) == len(controls):
             return ready
@@ -264,7 +321,7 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
         if len(set(names)) != len(names):
             raise InputError(f"controls: every instance needs a name of its own, got {', '.join(names)}")
         return ready + as_controls({one: {} for one in names})
-    return tuple(lent_control(name) or make_control(name, given) for name, given in gathered(controls).items())
+    return tuple(lent(CONTROL, name) or make_control(name, given) for name, given in gathered(controls).items())
 
 
 def instances_in(controls: object) -> list[Control]:
@@ -273,23 +330,28 @@ def instances_in(controls: object) -> list[Control]:
     return [one for one in listed if isinstance(one, Control)]
 
 
-_LENT: ContextVar[Mapping[str, Control]] = ContextVar("lent", default=MappingProxyType({}))
+_LENT: ContextVar[Mapping[tuple[str, str], Any]] = ContextVar("lent", default=MappingProxyType({}))
 
 
-def lent_control(name: str) -> Control | None:
-    """Return the instance that stands for the name of a control, if one does."""
-    return _LENT.get().get(name)
+def lent(kind: str, name: str) -> Any:
+    """Return what stands for a name where only names are told; None if nothing does.
+
+    Args:
+        kind: `CONTROL`, `SCENE` or `MODEL`.
+        name: as settings have it.
+    """
+    return _LENT.get().get((kind, name))
 
 
-def lent_controls() -> list[Control]:
-    """Return all of them."""
-    return list(_LENT.get().values())
+def all_lent(kind: str) -> list[Any]:
+    """Return everything of a kind that stands for a name."""
+    return [one for (of, _), one in _LENT.get().items() if of == kind]
 
 
 @contextmanager
-def lending(controls: Controls) -> Iterator[None]:
-    """Let the instances among controls be what their names stand for inside the block, where only names are told."""
-    token = _LENT.set({**_LENT.get(), **{one.name: one for one in instances_in(controls)}})
+def lending(kind: str, things: Mapping[str, Any]) -> Iterator[None]:
+    """Let things be what their names stand for inside the block, where only names are told; see `lent`."""
+    token = _LENT.set({**_LENT.get(), **{(kind, name): one for name, one in things.items()}})
     try:
         yield
     finally:

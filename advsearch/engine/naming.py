@@ -12,12 +12,15 @@ from torch import nn
 from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS
+from advsearch.engine.loading import MODEL, lent
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
+from advsearch.models.ensemble import together
 from advsearch.models.loading import named_code
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
 from advsearch.tasks import Task
+from advsearch.tasks.together import Together
 
 
 def scene_settings(fixed: Given | None, exposure: float | None) -> Given:
@@ -34,14 +37,15 @@ def scene_settings(fixed: Given | None, exposure: float | None) -> Given:
     return given
 
 
-def code_of(models: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
+def code_of(models: Iterable[str], kinds: Iterable[str], metrics: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the Python code that is imported for what is named: "package.module:attribute".
 
     Args:
         models: as `load_model` takes them.
         kinds: of the controls.
+        metrics: as settings name them.
     """
-    code = [named_code(name) for name in models]
+    code = [*(named_code(name) for name in models), *metrics]
     code += [name for name in kinds if CONTROLS.names_class(name)]
     return tuple(dict.fromkeys(name for name in code if name))
 
@@ -51,19 +55,31 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
 
     Args:
         models: as `load_model` takes them.
-        task: what their outputs are for.
+        task: what their outputs are for; several tasks are for one model each, which are put together as one.
         config: has the names of their classes, the texts that these are put into, and the processor threads that
             everything takes from here on.
     """
     threads.configure(config.used_threads)
+    parts = task.parts if isinstance(task, Together) else (task,) * len(models)
+    asked = several(models) if isinstance(task, Together) else models
+    if len(asked) != len(parts):
+        raise InputError(f"model: expected {len(parts)}, one for each task, got {len(asked)}")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(load_model(one, labels=config.labels, prompt=config.prompt, task=task) for one in models)
+        given = [(lent(MODEL, one) if isinstance(one, str) else None) or one for one in asked]
+        loaded = tuple(_load(one, own, config, alone=own is task) for one, own in zip(given, parts, strict=True))
     sentences = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
     for one in caught:
         if not issubclass(one.category, ModelWarning):
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-    return loaded, sentences
+    return (together(loaded, config.resolution),) if isinstance(task, Together) else loaded, sentences
+
+
+def _load(model: Any, task: Task, config: SceneConfig, *, alone: bool) -> Model:
+    """Load a model; of several tasks, those that take no label or have names of their own are given none."""
+    if not alone and (task.names_from or not task.labelled):
+        return load_model(model, task=task)
+    return load_model(model, labels=config.labels, prompt=config.prompt, task=task)
 
 
 AnyModel = Model | nn.Module | str | Path

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from advsearch.attacks import Objective, get_objective
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
+from advsearch.attacks.own_objective import More, nothing_more
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.ensemble import Ensemble, Outputs, of_each
@@ -30,7 +31,9 @@ CLEAN_SPP = 64
 
 def task_for(task: Task, model: Model) -> Task:
     """Return the task, or that of several models where the model is an ensemble of them."""
-    return Together(task=task, models=model.module.models) if isinstance(model.module, Ensemble) else task
+    if isinstance(task, Together) or not isinstance(model.module, Ensemble):
+        return task
+    return Together(parts=(task,) * len(model.module.models))
 
 
 def objective_for(
@@ -49,7 +52,8 @@ def objective_for(
         model: that is attacked.
         renderer: of the whole space.
         seed: of the clean picture.
-        ensemble: how the objectives of several models are put together.
+        ensemble: how the objectives of several models are put together; None for the mean, or the least of those of
+            several tasks, whose units differ.
 
     Raises:
         InputError: an objective of features, of several models.
@@ -59,14 +63,16 @@ def objective_for(
     if isinstance(task, Together):
         if of_features:
             raise InputError(f"objective: {wanted} compares the features of one model; take another for `ensemble`")
-        return of_ensemble([get_objective(wanted, one) for one in task.tasks], ensemble or "mean"), ""
+        own = wanted == Together.objective
+        each = [get_objective(one.objective if own else wanted, one) for one in task.tasks]
+        return of_ensemble(each, ensemble or ("worst" if own else "mean")), ""
     if not of_features:
         return get_objective(wanted, task), ""
-    features = features_of(model)
+    features = features_of(model) if task.reads_logits else None  # otherwise they are what the model answers with
     with torch.no_grad():
         clean = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
-    note = "" if features.penultimate else features.source
-    return get_objective(wanted, task, features=features, clean=clean), note
+    note = "" if features is None or features.penultimate else features.source
+    return get_objective(wanted, task, features=features or model, clean=clean), note
 
 
 def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
@@ -80,9 +86,11 @@ def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
         way: "mean" or "worst".
     """
 
-    def objective(output: Sequence[Outputs], images: Tensor, truth: tuple[Any, ...]) -> Tensor:
+    def objective(
+        output: Sequence[Outputs], images: Tensor, truth: tuple[Any, ...], more: More = nothing_more, /
+    ) -> Tensor:
         each = zip(objectives, of_each(output), truth, strict=True)
-        values = torch.stack([one(own, images, right) for one, own, right in each])
+        values = torch.stack([one(own, images, right, more) for one, own, right in each])
         return values.mean(dim=0) if way == "mean" else values.amin(dim=0)
 
     return objective

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 from torch import Tensor
@@ -14,6 +13,7 @@ from torch import Tensor
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
+from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.domains import domain_of
 from advsearch.engine.failures import described_failures, write_failures
 from advsearch.engine.pictures import KeptPicture, trial_to_show, write_artifacts, write_object, write_pictures
@@ -23,14 +23,8 @@ from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.searches import UNPRINTED
 from advsearch.engine.transport import remark
-from advsearch.errors import InputError
-from advsearch.report.drawing import new_axes
-from advsearch.report.notebook import attack_html, side_by_side
-from advsearch.report.studies import search_axes
 from advsearch.report.wording import number_text
-from advsearch.runs import store
 from advsearch.runs.answer import write_answer
-from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import (
     AnswerDistribution,
@@ -86,78 +80,6 @@ class Question:
     command_line: str
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class AttackResult:
-    """The answer of an attack.
-
-    Attributes:
-        summary: what `summary.json` holds.
-        run: the run directory, or None if it was not kept.
-        u: (d,) the configuration that was verified; the start where nothing was searched.
-        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration, as in the trial that
-            the summary names; its `clean` has what the model says of it.
-        adversarial: the same of `u`.
-        artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w, 3) sRGB in [0, 1].
-        search: the search's own log and claim.
-    """
-
-    summary: AttackSummary
-    run: Path | None
-    u: Tensor
-    clean: Tensor
-    adversarial: Tensor
-    artifacts: dict[str, Tensor]
-    search: SearchResult | None
-
-    @property
-    def found(self) -> bool:
-        """Whether a verified configuration was found."""
-        return self.summary.ending == Ending.FOUND.value
-
-    def rows(self, kind: str | None = None) -> Iterator[store.Row]:
-        """Yield every evaluated configuration, or those of one kind ("search", "verification", ...), in order.
-
-        Raises:
-            InputError: the run was not kept, so that nothing but the answer is there.
-        """
-        if self.run is None:
-            raise InputError("rows: expected a run that was kept, got none; give the attack a `run` to keep it in")
-        with store.Store(self.run / store.NAME, read_only=True) as results:
-            yield from results.rows(kind)
-
-    def to_pandas(self, kind: str | None = None) -> Any:
-        """Return these rows as a `pandas.DataFrame`; columns as in an export (docs/runs.md).
-
-        Raises:
-            InputError: the run was not kept, or pandas is not installed.
-        """
-        return to_pandas(self.rows(kind))
-
-    def plot(self, axes: Any = None) -> Any:
-        """Draw the objective over the search's evaluations, and return the matplotlib axes.
-
-        Args:
-            axes: to draw on; None makes new ones.
-        """
-        axes = new_axes() if axes is None else axes
-        searched = [record.objective for record in self.search.history] if self.search else []
-        search_axes({self.summary.policy: searched}, self.summary.objective, axes)
-        return axes
-
-    def __repr__(self) -> str:
-        summary, run = self.summary, None if self.run is None else str(self.run)
-        verified = f", verified {summary.brief}" if summary.verified else ""
-        controls = ",".join(summary.controls)
-        return f"AttackResult({summary.object!r}, {controls!r}, {summary.ending!r}{verified}, run={run!r})"
-
-    def _repr_html_(self) -> str:
-        pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
-        return attack_html(self.summary, pictures)
-
-    def _repr_png_(self) -> bytes:
-        return side_by_side([self.clean.numpy(), self.adversarial.numpy()])
-
-
 def summarise(
     asked: Question, problem: Problem, findings: Findings, recorder: Recorder, stages: Stages, warnings: Sequence[str]
 ) -> AttackResult:
@@ -192,7 +114,14 @@ def summarise(
         if not findings.interrupted:
             run.finish()
     return AttackResult(
-        summary, None if run is None else run.path, u, clean.picture, adversarial.picture, artifacts, search
+        summary,
+        None if run is None else run.path,
+        u,
+        clean.picture,
+        adversarial.picture,
+        artifacts,
+        search,
+        tuple(recorder.rows),
     )
 
 
@@ -212,7 +141,7 @@ def _summary(
         run=None,
         object=asked.object,
         model=problem.model.name,
-        task=task.name,
+        task=task.title,
         environment=problem.environment,
         controls=list(budgets),
         policy=asked.policy,

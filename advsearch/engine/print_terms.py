@@ -27,31 +27,38 @@ WEIGHT = 10.0
 """Of either term, in the objective's unit (logits for a margin) per unit of sRGB."""
 
 
+LEAST = 2.0**-40
+"""Shortest step in sRGB that has a gradient."""
+
+
 def variation(colors: Tensor) -> Tensor:
     """Return the mean length of the step from a pixel (h, w, 3) to its right and lower neighbours, by channel; of a
     picture (h, w, 4) only between pixels that its last channel has."""
-    if colors.shape[-1] == 3:
-        colors = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=-1)
-    padded = F.pad(colors.permute(2, 0, 1)[None], (0, 1, 0, 1), mode="replicate")[0]
-    here = padded[:, :-1, :-1]
-    steps = torch.stack([(one - here)[:3] * one[3:] for one in (padded[:, :-1, 1:], padded[:, 1:, :-1])])
-    length: Tensor = torch.linalg.vector_norm(steps, dim=0)[:, here[3] > 0.0].mean()
-    return length
+    colors, there = colors[..., :3], colors[..., 3:]
+    right, down = colors.diff(dim=1), colors.diff(dim=0)
+    if there.shape[-1]:
+        right, down = right * there[:, 1:], down * there[1:]
+    squared = F.pad(right.square(), (0, 0, 0, 1)) + F.pad(down.square(), (0, 0, 0, 0, 0, 1))
+    length = squared.clamp(min=LEAST**2).sqrt() - LEAST
+    return length[there[..., 0] > 0.0].mean() if there.shape[-1] else length.mean()
 
 
-def off_print(colors: Tensor) -> Tensor:
-    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest printable colour; of a picture
-    (h, w, 4) of those that its last channel has."""
+def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
+    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest printable colour, of a palette
+    (P, 3) where one is given; of a picture (h, w, 4) of those that its last channel has."""
     colors = colors if colors.shape[-1] == 3 else colors[colors[..., 3] > 0][:, None, :3]
-    nearest = (LOW + STEP * ((colors.detach() - LOW) / STEP).round()).clamp(LOW, HIGH)
+    if palette is None:
+        nearest = (LOW + STEP * ((colors.detach() - LOW) / STEP).round()).clamp(LOW, HIGH)
+    else:
+        palette = palette.to(colors)
+        nearest = palette[torch.cdist(colors.detach().reshape(-1, 3), palette).argmin(dim=1)].reshape(colors.shape)
     distance: Tensor = torch.linalg.vector_norm(colors - nearest, dim=2).mean()
     return distance
 
 
 def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
     """Both terms, summed over what is to be printed."""
-    slices = zip(space.controls, u.split(space.sizes), strict=True)
-    found = [colors for control, part in slices if (colors := control.printed(part)) is not None]
+    found = list(space.printed(u).values())
     if not found:
         raise InputError(
             "printable: expected a search over the colours of a texture or a patch, got "

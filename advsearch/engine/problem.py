@@ -16,7 +16,9 @@ from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, 
 from advsearch.controls import Space
 from advsearch.described import Value
 from advsearch.engine.answers import Described, Looked
+from advsearch.engine.asked import Asked
 from advsearch.engine.domains import domain_of
+from advsearch.engine.metrics import Metrics, mean_metrics, measured
 from advsearch.models import Model
 from advsearch.runs.results.plan import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
@@ -62,6 +64,7 @@ class Problem:
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
         printable: whether searches prefer colours that can be printed; see `print_terms`.
+        metrics: numbers of every picture that rows have beside what the task says.
         aovs: layers of ground truth that are kept of the clean scene and the answer (`scene.surfaces.AOVS`).
         domain: where a search may look: the searched controls.
         conditions: where the others are drawn from; None where there are none.
@@ -80,6 +83,7 @@ class Problem:
     search_depth: int | None = None
     printable: bool = False
     aovs: tuple[str, ...] = ()
+    metrics: Metrics = field(default_factory=dict)
     domain: Domain = field(init=False)
     conditions: Domain | None = field(init=False)
 
@@ -168,8 +172,9 @@ class Problem:
         `whole`."""
         with torch.no_grad():
             output, truth = self.model(picture), self.truth(whole)
-            objective = float(self.objective(output, picture[None], truth)[0])
-            return replace(self.task.judge(output, truth)[0], objective=objective)
+            objective = float(self.objective(output, picture[None], truth, self.asked(whole))[0])
+            judgement = replace(self.task.judge(output, truth)[0], objective=objective)
+            return measured(judgement, self.metrics, picture, output, truth)
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
         """Return what shows the model's answer to a picture (H, W, 3) of the whole space at `whole`."""
@@ -181,6 +186,10 @@ class Problem:
         if whole is None or not self.task.varies:
             return self._start_truth
         return self.task.truth(self._facts(whole))
+
+    def asked(self, *wholes: Tensor) -> Asked:
+        """Return what gives the objective more than pictures, at configurations of the whole space."""
+        return Asked(self.space, self.searched_space, wholes)
 
     def _facts(self, whole: Tensor) -> Facts:
         return self.facts(lambda: self.space.describe(whole), lambda: self.renderer.surfaces(whole))
@@ -252,16 +261,24 @@ class Problem:
         renderer = self.renderer if renderer is None else renderer
         before, renders, truth = renderer.non_finite, renderer.renders, self.truth(whole)
         seen: list[tuple[Tensor, Output]] = []
+        at = whole.detach().clone().requires_grad_(bool(gradient))
+        asked, slope = self.asked(at), torch.zeros(())
 
         def loss(image: Tensor) -> Tensor:
+            nonlocal slope
             output = self.model(image)
             seen.append((image.detach(), output))
-            return self.objective(output, image[None], truth)[0]
+            value = self.objective(output, image[None], truth, asked)[0]
+            if asked.used and len(seen) == 1 and value.requires_grad:  # exact, whatever the plan does with the picture
+                (found,) = torch.autograd.grad(value, at, retain_graph=True, allow_unused=True)
+                slope = slope if found is None else found
+            return value
 
         spp, derivative = self.spp * samples, None
         with renderer.scene.shorter(self.search_depth):
             if gradient:
                 value, derivative = renderer.gradient(loss, whole, noise, spp, free=gradient == "free")
+                derivative = derivative + slope if asked.used else derivative
             else:
                 with torch.no_grad():
                     value = loss(renderer(whole, seed=noise, spp=spp))
@@ -269,7 +286,7 @@ class Problem:
         if on_image is not None and on_image.wants(index):
             on_image.tell(index, image)
         with torch.no_grad():
-            judgement = self.task.judge(output, truth)[0]
+            judgement = measured(self.task.judge(output, truth)[0], self.metrics, image, output, truth)
         evaluation = Evaluation(
             objective=float(value),
             gradient=derivative,
@@ -301,14 +318,18 @@ class Problem:
             outputs = self.model(pictures)
             each = [outputs[number : number + 1] for number in range(len(wholes))]
             truths = [self.truth(whole) for whole in wholes]
+            places = [torch.cat([at, whole[len(at) :]]) for whole in wholes]
             if self.task.varies:
-                of_each = zip(each, pictures.split(1), truths, strict=True)
-                values = torch.cat([self.objective(output, picture, truth) for output, picture, truth in of_each])
+                of_each = zip(each, pictures.split(1), truths, map(self.asked, places), strict=True)
+                values = torch.cat([self.objective(*one) for one in of_each])
             else:
-                values = self.objective(outputs, pictures, truths[0])
+                values = self.objective(outputs, pictures, truths[0], self.asked(*places))
             derivative = torch.autograd.grad(values.sum(), at)[0] if values.requires_grad else None
         with torch.no_grad():
-            said = [self.task.judge(output, truth)[0] for output, truth in zip(each, truths, strict=True)]
+            said = [
+                measured(self.task.judge(output, truth)[0], self.metrics, picture, output, truth)
+                for output, truth, picture in zip(each, truths, pictures, strict=True)
+            ]
         evaluations = [
             Evaluation(float(value), None, judgement.success, judgement=judgement)
             for value, judgement in zip(values.detach(), said, strict=True)
@@ -333,6 +354,7 @@ class Problem:
             with torch.no_grad():
                 output = self.task.average([output for _, output in found])
                 judgement = self.task.judge(output, self.truth())[0]
+        judgement = replace(judgement, metrics=mean_metrics([one.judgement for one in each]))
         return Evaluation(
             objective=sum(one.objective for one in each) / count,
             gradient=torch.stack(gradients).mean(dim=0) if gradients else gradient,
@@ -351,4 +373,5 @@ class Problem:
 
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""
-        return self.objective(self.model(image), image[None], self.truth())[0]
+        start = self.asked(self.whole(self.domain.start))
+        return self.objective(self.model(image), image[None], self.truth(), start)[0]

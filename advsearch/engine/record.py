@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from torch import Tensor
@@ -19,7 +20,7 @@ from advsearch.engine.rows import judged, trial_row
 from advsearch.engine.transport import Predictor
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import Row
+from advsearch.runs.store import Row, Told
 from advsearch.tasks import Judgement
 
 MEASURED = ("centre", "region", "map")
@@ -125,19 +126,23 @@ class Stages:
 
 
 class Recorder:
-    """Writes what is evaluated to the run's store; without a run directory it does nothing.
+    """Writes what is evaluated to the run's store, or holds it in memory.
 
     Args:
         run: the open run directory, or None.
         problem: names labels and describes configurations.
         memory: what the store has already, which is not written again.
         ahead: knows on which machine a picture was made.
+
+    Attributes:
+        rows: what was evaluated, where there is no run directory.
     """
 
     def __init__(self, run: RunDirectory | None, problem: Problem, memory: Memory, ahead: Ahead | None = None) -> None:
         self.run = run
         self.ahead = ahead or Ahead()
         self.machines = Machines(run)
+        self.rows: list[Row] = []
         self._problem = problem
         self._memory = memory
         self._renders: dict[str, int] = {}
@@ -146,7 +151,7 @@ class Recorder:
         """Keep one evaluation of a search."""
         renders = record.renders - self._renders.get(kind, 0)
         self._renders[kind] = record.renders
-        if self.run is None or self._memory.holds(kind, record.step):
+        if self._memory.holds(kind, record.step):
             return
         problem = self._problem
         row = Row(
@@ -159,10 +164,11 @@ class Recorder:
             values=problem.describe(u),
             seconds=record.seconds,
             renders=renders * problem.draws,
+            phase=record.phase,
             machine=self._machine(),
         )
         row = row if evaluation.judgement is None else judged(row, evaluation.judgement)
-        self.run.record(row, told=self._memory.told(kind, record.index, u, evaluation))
+        self._keep(row, lambda: self._memory.told(kind, record.index, u, evaluation))
 
     def trial(
         self,
@@ -188,12 +194,19 @@ class Recorder:
             described: whether to say u, which the trials of one kind may have in common, beside the conditions.
             drawn: whether it had conditions of its own, where they vary by chance.
         """
-        if self.run is None or self._memory.holds(kind, number):
+        if self._memory.holds(kind, number):
             return
         told = self._problem.describe(u, seed) if described else {}
         told = {**told, **(self._problem.conditions_of(u, seed) if drawn else {})}
         made = self._machine()
-        self.run.record(trial_row(kind, number, seed, spp, trial, told, sought=kind not in MEASURED, machine=made))
+        self._keep(trial_row(kind, number, seed, spp, trial, told, sought=kind not in MEASURED, machine=made))
+
+    def _keep(self, row: Row, told: Callable[[], Told] | None = None) -> None:
+        """Store a row, and what its evaluation told a search; hold the row where there is no store."""
+        if self.run is None:
+            self.rows.append(replace(row, id=len(self.rows) + 1, time=time.time()))
+        else:
+            self.run.record(row, told=None if told is None else told())
 
     def _machine(self) -> str | None:
         """The machine on which the picture of this row was made, if that is not like this one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +13,19 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
-from advsearch.controls import Control, compose
+from advsearch.controls import Control, Space, compose
 from advsearch.controls.clean import sentences
 from advsearch.described import Value
-from advsearch.engine.loading import Controls, Scene, as_controls, framed, load_scene, make_renderer
+from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
 from advsearch.models.switches import plainly
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import Watched, watcher
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked
 from advsearch.report.phrases import seen_text
 from advsearch.runs.files import placed_by
-from advsearch.runs.images import write_exr, write_layers, write_png
+from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
@@ -38,7 +38,7 @@ MOST_ANSWERS = 5
 """Answers of the model that are kept of a picture."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class View:
     """A scene from one direction.
 
@@ -62,8 +62,12 @@ class View:
     output: Any = None
     truth: Any = None
 
+    def __repr__(self) -> str:
+        said = self.answers[0].label if self.answers else None
+        return f"View(azimuth={self.azimuth:g}, {said!r})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Rendering:
     """Pictures of a scene. Made by `render`.
 
@@ -103,9 +107,8 @@ class Rendering:
             if file.suffix.lower() == ".exr":
                 write_exr(file, self.views[0].linear)
                 return self.formation.resolution
-            sheet = self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
-            write_png(file, sheet)
-        return sheet.shape[0], sheet.shape[1]
+            write_png(file, self._shown)
+        return self._shown.shape[0], self._shown.shape[1]
 
     def save_aov(self, path: str | Path, aovs: Sequence[str]) -> Path:
         """Write ground truth of the view as layers of one EXR, whole or not at all, and return the path.
@@ -147,6 +150,20 @@ class Rendering:
         with placed_by("out"):
             write_png(file, contact_sheet(drawn, self._captions) if len(drawn) > 1 else drawn[0])
         return file
+
+    @cached_property
+    def _shown(self) -> Any:
+        """The picture, or the sheet of several views."""
+        return self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
+
+    def __repr__(self) -> str:
+        said = [view.answers[0].label if view.answers else None for view in self.views]
+        height, width = self.formation.resolution
+        of = f"{self.scene.object_name!r}, {self.scene.environment_name!r}, {self.model!r}"
+        return f"Rendering({of} says {', '.join(map(repr, said))}, {height} x {width} pixels)"
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(self._shown)
 
     @property
     def _captions(self) -> list[list[str]]:
@@ -190,37 +207,42 @@ def render(
     label: str | None = None,
     controls: Controls = (),
     around: int | None = None,
+    texture: Texture | None = None,
     resolution: int | tuple[int, int] | None = None,
     spp: int = PICTURE_SPP,
     denoise: str = "oidn",
     sampler: str = SAMPLER,
     seed: int = 0,
     aov: bool = False,
-    progress: Progress | None = None,
+    at: Tensor | None = None,
+    progress: Watched = None,
 ) -> Rendering:
     """Render a scene and ask the model what it sees.
 
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
-        task: what says the model's answers: a name, a mapping with a `name` and options, or an instance.
+        task: what says the model's answers: a name, a mapping with a `name` and options, an instance, or a function.
         label: the right answers, for a task that draws what is true; None for the object's own.
         controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
             a range stays where a search would start.
         around: number of views, from azimuths all around the object; None for one, from the scene's own camera.
+        texture: of the object in place of its own, as `load_scene` takes it.
         resolution: side, or (height, width), in pixels; None for what the model takes.
         spp: samples a pixel.
         denoise: "oidn" or "none".
         sampler: "multijitter" or "independent".
         seed: root of the noise.
         aov: keep what is seen in each pixel, for `Rendering.save_aov`.
-        progress: told how far it is.
+        at: (d,) in [0, 1], the configuration of `controls` in place of their start: `result.u`, say.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, a value is out of range, or the scene cannot take a
             control.
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    scene = scene if texture is None else scene.with_texture(texture)
     made = make_task(task)
     model = load_model(model, task=made)
     asked = made.on(model)
@@ -228,7 +250,7 @@ def render(
     if around is not None and any(_turns(one) for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
     size = as_python(resolution) or (model.input_size[0], model.input_size[1])
-    progress = progress or NullProgress()
+    progress = watcher(progress)
     progress.stage("rendering", around or 1)
     formation = None
     views = []
@@ -239,12 +261,13 @@ def render(
         space = compose(instances, description)
         renderer = make_renderer(description, space, size, denoise, seed, sampler=sampler)
         formation = renderer.formation  # the same for all, exposure included
+        u = space.start if at is None else _configuration(at, space)
         with torch.no_grad():
-            radiance = renderer.radiance(space.start, seeds.stream(seed, "pictures"), spp)
-            picture = to_8_bit(space.picture(space.start, formation.display(radiance)))
+            radiance = renderer.radiance(u, seeds.stream(seed, "pictures"), spp)
+            picture = to_8_bit(space.picture(u, formation.display(radiance)))
             output, truth = model(picture), None
             if asked.varies:
-                facts = _facts(description, label, partial(renderer.surfaces, space.start), space.describe(space.start))
+                facts = _facts(description, label, partial(renderer.surfaces, u), space.describe(u))
                 try:
                     truth = asked.truth(facts)
                 except InputError as error:
@@ -254,7 +277,7 @@ def render(
             marks = () if truth is None else tuple(asked.marks(output, truth)[0])
         remarks = remarks or asked.remarks
         azimuth = description.number("camera.azimuth")
-        surfaces = renderer.surfaces(space.start) if aov else None
+        surfaces = renderer.surfaces(u) if aov else None
         views.append(View(azimuth, picture, radiance * formation.gain, answers, marks, surfaces, output, truth))
         progress.advance(1)
     assert formation is not None
@@ -262,6 +285,16 @@ def render(
     warnings = (*(space.scene or own).notes, *sentences(space.moved), *untold, *remarks)
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
+
+
+def _configuration(at: Tensor, space: Space) -> Tensor:
+    """A configuration that was given for a space."""
+    u = torch.as_tensor(at, dtype=torch.float32)
+    if u.shape != space.start.shape:
+        raise InputError(
+            f"at: expected ({len(space.start)},) numbers, as `controls` have in this scene, got {tuple(u.shape)}"
+        )
+    return u
 
 
 def _facts(
@@ -275,7 +308,7 @@ def _facts(
 
 def sight_of(surfaces: Surfaces) -> Sight:
     """Return what a task judges by, of what the camera sees."""
-    return Sight(surfaces.seen(OBJECT), surfaces.depth)
+    return Sight(surfaces.seen(OBJECT), surfaces.depth, surfaces.z_depth)
 
 
 def writable(path: str | Path, views: int) -> Path:

@@ -78,6 +78,7 @@ def _said(judgement: Judgement) -> dict[str, Any]:
         "label_index": answer.index,
         "probability": answer.probability,
         "payload": judgement.payload,
+        "metrics": judgement.metrics or {},
     }
 
 
@@ -93,7 +94,7 @@ def judgement_of(row: Row) -> Judgement:
     score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
     right = score <= 0.0 if row.correct is None else row.correct
     answer = Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability)
-    return Judgement(score, margin, right, answer, row.payload, row.objective)
+    return Judgement(score, margin, right, answer, row.payload, row.objective, row.metrics or None)
 
 
 def verified_rate(checked: Verification) -> VerifiedRate:

@@ -8,7 +8,7 @@ from typing import Any
 
 from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
 from advsearch.controls.values import is_number
-from advsearch.engine.loading import Controls, as_controls, lent_control, settings_of
+from advsearch.engine.loading import CONTROL, Controls, as_controls, lent, settings_of
 from advsearch.errors import InputError, UnknownNameError
 
 
@@ -43,7 +43,7 @@ class RunSettings:
             ready = tuple(one for one in controls if isinstance(one, Control))
             controls = [one for one in controls if isinstance(one, str)]
         named = settings_of(controls)
-        for one in (*ready, *(lent for lent in map(lent_control, named) if lent)):
+        for one in (*ready, *(found for name in named if (found := lent(CONTROL, name)))):
             for choice in _counting(type(one), one.settings()):
                 if choice.run_setting and getattr(self, choice.run_setting) is not None:
                     raise InputError(

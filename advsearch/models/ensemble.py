@@ -44,12 +44,12 @@ def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Mo
         labels=(),
         preprocessing=Preprocessing(size or (high, wide), layout="NHWC"),
         differentiable=all(model.differentiable for model in models),
-        read=_each,
+        read=by_picture,
     )
 
 
-def _each(answer: list[Any], count: int) -> list[Outputs]:
-    """From outputs by model to outputs by picture."""
+def by_picture(answer: list[Any], count: int) -> list[Outputs]:
+    """Return the outputs by picture of `count` pictures, from those by model."""
     return [tuple(output[k : k + 1] for output in answer) for k in range(count)]
 
 

@@ -120,13 +120,16 @@ def _loaded(
 ) -> Model:
     read = read or (task and task.reader)
     names, origin = None if labels is None else read_labels(labels), labels_origin(labels)
+    if names is not None and task and task.names_from:
+        raise InputError(f"labels: the names of task {task.name} are those of {task.names_from}; leave `labels` out")
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
     found = _find(spec)
     switches = turned_by_code()
     if prompts is not None and not (isinstance(found, Source) and found.reads_text):
         raise InputError(f"prompt: model {found.name} has classes of its own and reads no text; leave `prompt` out")
     if isinstance(found, Source) and found.finish is not None:
-        found = found.finish(Purpose(task.name if task else "classification", names, prompts))
+        purpose = Purpose(task.name if task else "classification", names, prompts, getattr(task, "tokens", 16))
+        found = found.finish(purpose)
     if isinstance(found, Source) and isinstance(found.module, nn.Module):
         called_under(found.module, switches)
     if isinstance(found, Model):
@@ -209,7 +212,10 @@ def _described(spec: object) -> str:
 
 def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
     """Return the source's own preprocessing with the caller's options on top."""
-    made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE)
+    made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE, processor=found.processor)
+    instead = [key for key in ("mean", "std", "value_range", "channels") if found.processor and key in given]
+    if instead:
+        raise InputError(f"{instead[0]}: model {found.name} has a processor that does all of this; leave it out")
     own = {"mean": found.mean, "std": found.std, **pre.parse_normalisation(given.get("mean"), given.get("std"))}
     made = dataclasses.replace(made, mean=own["mean"] or made.mean, std=own["std"] or made.std)
     made = dataclasses.replace(made, layout=found.layout or made.layout, channels=found.channels or made.channels)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, final
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import LabelSet, find_label_set
@@ -28,6 +31,8 @@ GIVEN_BY = {
     "classification": "a row of scores is what a classifier gives",
     "detection": "boxes are what a detector gives",
     "segmentation": "a score for each pixel is what a segmenter gives",
+    "depth": "a number for each pixel is what a model of depth gives",
+    "similarity": "features are what a network without a head gives",
 }
 """What networks of a task answer with, by task, for messages."""
 
@@ -49,6 +54,7 @@ class Model:
         batch_limits: (fewest, most) images that the network takes at once. Larger batches are cut, smaller ones padded.
         probabilities: the network answers with probabilities; their logarithm is returned: differences are log-odds.
         differentiable: a gradient of the logits reaches the image.
+        attached: its gradient is that of its answers only where `detach` does nothing, see `Detaching`.
         named: False if `labels` are placeholders.
         dtype: the type of the network's floating-point input.
         device: where the network lives. Images go there, the output comes back.
@@ -64,6 +70,7 @@ class Model:
     batch_limits: tuple[int, int] = (1, 64)
     probabilities: bool = False
     differentiable: bool = True
+    attached: bool = False
     named: bool = True
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
@@ -123,12 +130,44 @@ class Model:
 
     def ask(self, x: Tensor) -> Any:
         """Return the output for a batch as `batches` yields it."""
-        with torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
-            answer = self.module(x)
+        answer = self.answer(x)
         if self.read is not None:
             return read_by(self.read, answer, len(x), self.name)
         logits = logits_of(answer, len(x), self.classes, self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
+
+    def answer(self, x: Tensor) -> Any:
+        """Return what the network itself gives for a batch as `batches` yields it."""
+        mode = Detaching(ignored=True) if self.attached and torch.is_grad_enabled() else nullcontext()
+        with mode, torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
+            return self.module(x)
+
+
+class Detaching(TorchFunctionMode):
+    """Looks on as a network detaches something, which it may be kept from: then gradients are those of its answers.
+
+    RT-DETR and its like choose queries by the scores of their encoder, and cut these off from their decoder, in
+    evaluation too: that makes training stable (Zhu et al. 2020, arXiv 2010.04159, appendix A.4), and hides from a
+    search how the picture moves them.
+
+    Args:
+        ignored: whether `detach` does nothing.
+
+    Attributes:
+        seen: whether something with a gradient was to be detached.
+    """
+
+    def __init__(self, *, ignored: bool = False) -> None:
+        super().__init__()
+        self.ignored, self.seen = ignored, False
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call torch's function, or return what was to be detached as it is."""
+        if function is torch.Tensor.detach:
+            self.seen = self.seen or args[0].requires_grad
+            if self.ignored:
+                return args[0]
+        return function(*args, **(kwargs or {}))
 
 
 def checked_images(images: Tensor) -> Tensor:
@@ -158,10 +197,12 @@ def read_by(read: Read, answer: Any, count: int, name: str) -> Any:
         output = read(answer, count)
     except ValueError as error:
         meant, own = _task_of(answer), getattr(getattr(read, "__self__", None), "name", None)
-        advice = _other_task(meant) if meant and meant != own else "wrap the network, or ask for another task"
+        other = _other_task(meant) if meant and meant != own else "wrap the network, or ask for another task"
+        advice = _no_scores(answer) or other
         raise ModelError(f"model {name}: {error}, got {described(answer)}; {advice}") from None
     if len(output) != count:
         raise ModelError(f"model {name}: expected an output for each of {count} images, got {len(output)}")
+    mend_batch_norms(output)
     return output
 
 
@@ -199,8 +240,10 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
     """
     tensor = _tensor_in(output)
     expected = f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
+    if advice := _no_scores(output):
+        raise ModelError(f"{expected}, got {described(tensor if tensor is not None else output)}; {advice}")
     meant = _task_of(output)
-    if meant in ("detection", "segmentation") and (tensor is None or tensor.dim() != 4):
+    if meant in ("detection", "segmentation", "depth", "similarity") and (tensor is None or tensor.dim() != 4):
         raise ModelError(f"{expected}, got {described(output)}; {_other_task(meant)}")
     if tensor is None:
         raise ModelError(f"{expected}, got {type(output).__name__}; wrap the network so that it returns one tensor")
@@ -209,7 +252,41 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
         raise ModelError(f"{expected}, got {got}; {_advice(got)}")
     if not tensor.is_floating_point():
         raise ModelError(f"{expected} and floating type, got {tensor.dtype}; return scores, not the predicted class")
+    mend_batch_norms(tensor)
     return tensor.float()
+
+
+def mend_batch_norms(output: Any) -> None:
+    """Make gradients of an output right that pass batch norms: each is laid out in memory as its norm's input is.
+
+    Of a single picture torch 2.13 reads a gradient that comes from ``flatten(2).transpose(1, 2)``, as
+    in networks whose convolutions end in a transformer, in a wrong order on the CPU, without a word. Batches are right.
+    """
+    waiting: list[Any] = []
+
+    def keep(one: Tensor) -> Tensor:
+        waiting.append(one.grad_fn)
+        return one
+
+    each_tensor(output, keep)
+    seen = {None}
+    while waiting:
+        node = waiting.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        waiting.extend(before for before, _ in node.next_functions)
+        if node.name().startswith("NativeBatchNorm"):
+            node.register_prehook(partial(_laid_out, torch.empty_like(node._saved_input, device="meta").stride()))
+
+
+def _laid_out(strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
+    """Return gradients with the strides for the first of them."""
+    first, *others = gradients
+    if first is None or first.stride() == strides:
+        return gradients
+    laid = torch.empty_strided(first.shape, strides, dtype=first.dtype, device=first.device)
+    return laid.copy_(first), *others
 
 
 def _tensor_in(output: Any) -> Tensor | None:
@@ -222,10 +299,29 @@ def _tensor_in(output: Any) -> Tensor | None:
     return output if isinstance(output, Tensor) else None
 
 
+def _no_scores(answer: Any) -> str:
+    """What to do with an answer that has no scores: the classes that it chose, or losses; "" of any other."""
+    parts = list(answer.values()) if isinstance(answer, Mapping) else [answer]
+    if parts and all(isinstance(one, Tensor) and one.ndim == 0 for one in parts):
+        return "one number for all pictures is what a loss is: give the network as it answers outside of training"
+    tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
+    listed = isinstance(answer, (list, tuple))  # whose first part may be the labels of boxes
+    if tensor is None or listed or tensor.is_floating_point() or tensor.ndim not in (1, 3):
+        return ""
+    return f"these are the classes that it chose ({tensor.dtype}): return its scores, as they are before the argmax"
+
+
 def _task_of(answer: Any) -> str | None:
-    """Return the task whose networks answer like that: boxes, a score for each pixel, or rows of scores; else None."""
+    """Return the task whose networks answer like that: boxes, features, numbers for each pixel, or rows of scores.
+
+    None where it is none of these.
+    """
     if _has_boxes(answer):
         return "detection"
+    if isinstance(answer, Mapping) and any(word in str(key) for key in answer for word in ("depth", "disparity")):
+        return "depth"
+    if hasattr(answer, "last_hidden_state") and not hasattr(answer, "logits"):
+        return "similarity"
     tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
     kinds = {2: "classification", 4: "segmentation"}
     if (
@@ -237,10 +333,11 @@ def _task_of(answer: Any) -> str | None:
 
 
 def _has_boxes(output: Any) -> bool:
-    """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings with "boxes"."""
+    """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings or objects with "boxes"."""
     first = output[0] if isinstance(output, (tuple, list)) and output else output
-    if isinstance(first, Mapping):
-        return "boxes" in first or "pred_boxes" in first
+    names = first if isinstance(first, Mapping) else dir(first)
+    if not isinstance(first, Tensor) and ("boxes" in names or "pred_boxes" in names):
+        return True
     several = isinstance(output, (tuple, list)) and len(output) > 1
     return several and isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,8 @@ class Preprocessing:
     4. `x -> (x - mean) / std`, in the units of `value_range` and in the order of `channels`.
     5. Layout: NCHW (contiguous), or NHWC.
 
+    Where there is a `processor`, it stands for steps 2 to 4.
+
     Args:
         input_size: (height, width) in pixels.
         mean: three numbers, one per channel.
@@ -42,6 +44,7 @@ class Preprocessing:
         value_range: (low, high) that black and white are sent to.
         layout: ``"NCHW"`` or ``"NHWC"``.
         channels: ``"RGB"`` or ``"BGR"``.
+        processor: from pictures (N, 3, H, W) in [0, 1], RGB, to what the network takes, of the same shape.
     """
 
     input_size: tuple[int, int]
@@ -50,15 +53,14 @@ class Preprocessing:
     value_range: tuple[float, float] = (0.0, 1.0)
     layout: str = "NCHW"
     channels: str = "RGB"
+    processor: Callable[[Tensor], Tensor] | None = None
 
     def __call__(self, images: Tensor) -> Tensor:
         """Preprocess images (N, H, W, 3), display-referred sRGB in [0, 1], any floating dtype; differentiable."""
         x = images.permute(0, 3, 1, 2)
         if (x.shape[2], x.shape[3]) != self.input_size:
             x = F.interpolate(x, size=self.input_size, mode="bilinear", align_corners=False, antialias=True)
-        if self.channels == "BGR":
-            x = x.flip(1)
-        x = self._normalise(x)
+        x = self.processor(x) if self.processor else self._normalise(x.flip(1) if self.channels == "BGR" else x)
         return x.contiguous() if self.layout == "NCHW" else x.permute(0, 2, 3, 1).contiguous()
 
     def _normalise(self, x: Tensor) -> Tensor:

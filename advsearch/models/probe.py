@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import re
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from advsearch import files
 from advsearch.errors import ModelError
 from advsearch.models.deadline import TookTooLong, within
 from advsearch.models.labels import fitting_labels
-from advsearch.models.model import Model, ModelWarning, each_tensor, logits_of, read_by
+from advsearch.models.model import Detaching, Model, ModelWarning, each_tensor, logits_of, read_by
 
 #: Rows that are non-negative and sum to 1 within this are taken for probabilities.
 PROBABILITY_TOLERANCE = 1e-3
@@ -44,6 +46,9 @@ STEP = 1e-3
 MASKED = 0.9
 """Share of a change by which answers may miss what the gradient foretells: a sign that is wrong is a miss of 2, a step
 function one of 1; kinks of ordinary networks stay under a half."""
+
+AGREES = 0.5
+"""Share of a change by which answers may miss what a gradient foretells that takes the place of the network's own."""
 
 SMALLEST = 1e-5
 """Smallest change that is looked at, as a share of the answers: what is less may be rounding."""
@@ -107,12 +112,11 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
     if not repeatable:
         _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
     return dataclasses.replace(
-        model,
+        _with_gradient(model, noise, repeatable),
         labels=found,
         named=labels is not None,
         probabilities=probabilities,
         batch_limits=_batch_limits(model, torch.cat([grey, noise]), rows if repeatable else None),
-        differentiable=_gradient_reaches(model, noise, repeatable),
     )
 
 
@@ -146,7 +150,7 @@ def _answer(model: Model, images: Tensor) -> tuple[Any, int]:
     padded = torch.cat([images, images[-1:].expand(max(model.batch_limits[0] - len(images), 0), -1, -1, -1)])
     x = model.preprocessing(padded.to(model.device)).to(model.dtype)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
-        return _guarded(model, lambda: model.module(x)), len(padded)
+        return _guarded(model, lambda: model.answer(x)), len(padded)
 
 
 def _numbers(output: Any) -> Tensor:
@@ -175,11 +179,42 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
     except Exception as error:  # any network may raise anything
         height, width = model.input_size
         preprocessing = model.preprocessing
+        if why := _unlike_pictures(model.module, str(error)):
+            raise ModelError(f"model {model.name}: {why} ({first_line(error)})") from error
         raise ModelError(
             f"model {model.name}: cannot be run on a {preprocessing.channels} image of {height} x {width} pixels in "
             f"layout {preprocessing.layout} ({first_line(error)}). Give the `input_size` and "
             "`layout` that it was made for"
         ) from error
+
+
+TRUTHS = {"target", "targets", "label", "labels", "annotations", "ground_truth"}
+"""What a network in its form for training calls the right answers."""
+
+
+def _unlike_pictures(network: object, error: str) -> str:
+    """What a network that raised an error wants beside pictures or in place of them; "" where that does not show."""
+    if not isinstance(network, nn.Module):
+        return ""
+    try:
+        taken = list(inspect.signature(network.forward).parameters.values())[1:]
+    except (TypeError, ValueError):  # it is not written in Python
+        taken = []
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    needed = {one.name for one in taken if one.kind not in variable and one.default is inspect.Parameter.empty}
+    missed = TRUTHS & set(re.findall(r"\w+", error))
+    more = [one.name for one in taken if one.name in needed | missed]
+    if more:
+        return (
+            f"wants {' and '.join(more)} beside pictures; wrap it in an nn.Module that is called with pictures alone, "
+            "as it is used outside of training"
+        )
+    if any(isinstance(one, nn.Conv3d) for one in network.modules()):
+        return (
+            "is made for videos or volumes (it has an nn.Conv3d), and pictures (N, 3, H, W) are what is given; wrap it "
+            "in an nn.Module that makes one of each picture"
+        )
+    return ""
 
 
 def _probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:
@@ -241,44 +276,86 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
     return low, high
 
 
-def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
-    """Return whether a gradient of the logits reaches the image; warn if not, and if answers do not follow it."""
-    leaf = images.clone().requires_grad_()
+def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
+    """Return the model with `differentiable` and `attached` set; warn if no gradient of its answers reaches the image,
+    and if answers do not follow it."""
     try:
-        with torch.enable_grad():
-            logits = _run(model, leaf)
-            if model.read is not None and not bool(logits[:, 0].any()):
-                return True  # a detector that sees nothing in noise: its pictures will tell
-            weights = torch.linspace(-1.0, 1.0, logits.shape[1])
-            gradient = torch.autograd.grad((logits * weights).sum(), leaf)[0]
+        with Detaching() as detaching:
+            rows, gradient = _slope(model, images)
+        if model.read is not None and not bool(rows[:, 0].any()):
+            return dataclasses.replace(model, differentiable=True)  # it sees nothing in noise: its pictures will tell
+        if repeatable and detaching.seen:
+            whole = dataclasses.replace(model, attached=True)
+            with suppress(RuntimeError, ModelError):  # it may detach what must have no gradient, such as for numpy
+                slope = _slope(whole, images)[1]
+                if _is_better(model, images, slope, gradient):
+                    model, gradient = whole, slope
         reaches, why = bool((gradient != 0).any()), "it is zero everywhere"
         if reaches and repeatable:
-            _check_gradient(model, images, gradient, weights)
+            _check_gradient(model, images, gradient, detaching.seen and not model.attached)
     except (RuntimeError, ModelError) as error:
         reaches, why = False, first_line(error)
     if not reaches:
         _warn(f"no gradient of model {model.name} reaches its image ({why}): use `auto` or a policy without gradients")
-    return reaches
+    return dataclasses.replace(model, differentiable=reaches)
 
 
-def _check_gradient(model: Model, images: Tensor, gradient: Tensor, weights: Tensor) -> None:
-    """Warn if a network's answers do not move as its gradient says: it is masked, or not of this network."""
+def _slope(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what `_run` does of images, and the gradient of `_told` of it; zero where nothing is found."""
+    leaf = images.clone().requires_grad_()
+    with torch.enable_grad():
+        rows = _run(model, leaf)
+        if model.read is not None and not bool(rows[:, 0].any()):
+            return rows, torch.zeros_like(images)
+        return rows, torch.autograd.grad(_told(rows), leaf)[0]
+
+
+def _told(rows: Tensor) -> Tensor:
+    """Return one number of what `_run` returns, whose gradient is looked at."""
+    return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
+
+
+def _is_better(model: Model, images: Tensor, whole: Tensor, own: Tensor) -> bool:
+    """Return whether answers change as a gradient without `detach` says, and less so as the network's own does.
+
+    Changes are taken along the signs of the difference of the two. Networks that round behind a `detach` keep their
+    own: the other one is zero.
+    """
+    for size in (STEP, STEP / 8.0):
+        step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * (whole - own).sign()
+        ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
+        with torch.no_grad():
+            seen = float(_told(_run(model, ends[0]) - _run(model, ends[1])))
+        told, less = (float(((ends[0] - ends[1]) * slope).sum()) for slope in (whole, own))
+        if abs(seen - told) < min(abs(seen - less), AGREES * abs(told)):
+            return True
+    return False
+
+
+def _check_gradient(model: Model, images: Tensor, gradient: Tensor, detached: bool) -> None:
+    """Warn if a network's answers do not move as its gradient says: it is masked, cut off, or not of this network."""
     sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)  # what suppression leaves may jump in the first only
+    told_apart = ROUNDING * torch.finfo(model.dtype).eps
+    if told_apart > STEP:
+        sizes = (told_apart, told_apart / 8.0)  # a network in half precision bends in the first, and rounds the second
     for size in sizes:
-        step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * gradient.sign()
+        step = size * gradient.sign()
         ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
         with torch.no_grad():
             answers = [_run(model, end) for end in ends]
             if model.read is not None and len({_choices(model, one) for one in (images, *ends)}) > 1:
                 return  # nothing can be said of what jumps
-        seen = float(((answers[0] - answers[1]) * weights).sum())
+        seen = float(_told(answers[0] - answers[1]))
         expected = float(((ends[0] - ends[1]) * gradient).sum())
         change = max(abs(seen), abs(expected))
         if change <= SMALLEST * float(answers[0].abs().sum()) or abs(seen - expected) <= MASKED * change:
             return
+    why = "Steps that round, or a defence that masks gradients?"
+    if detached:
+        why = "It detaches a part of what it computes, where it rounds or for another reason."
     _warn(
         f"the gradient of model {model.name} does not say how its answers change: {expected:.3g} expected, "
-        f"{seen:.3g} seen for a small step along it. Steps that round, or a defence that masks gradients? A search "
+        f"{seen:.3g} seen for a small step along it. {why} A search "
         "that follows them may find nothing: try a policy without gradients beside it"
     )
 

@@ -14,6 +14,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import nn
+from torch.nn.parameter import is_lazy
 
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.files import open_regular
@@ -31,11 +32,13 @@ class Purpose:
         task: by name.
         names: of the classes, as the user gave them; None if they did not.
         prompts: the texts that the user gave; None if they gave none.
+        tokens: the most that a free answer has.
     """
 
     task: str = "classification"
     names: tuple[str, ...] | None = None
     prompts: tuple[str, ...] | None = None
+    tokens: int = 16
 
     def named(self, model: str, what: str) -> tuple[str, ...]:
         """Return the names, for a network that has no classes of its own.
@@ -63,6 +66,7 @@ class Source:
         module: the network, in evaluation mode, its parameters without gradients.
         name: what to call it.
         input_size, mean, std, layout, channels, labels: as in `load_model`; None where the source does not say.
+        processor: as in `Preprocessing`; None where `mean`, `std` and `channels` say it all.
         batch_limits: (fewest, most) images at once.
         dtype: floating type of the input.
         device: where its weights are.
@@ -78,6 +82,7 @@ class Source:
     layout: str | None = None
     channels: str | None = None
     labels: tuple[str, ...] | None = None
+    processor: Callable[[torch.Tensor], torch.Tensor] | None = None
     batch_limits: tuple[int, int] = (1, 64)
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
@@ -86,7 +91,18 @@ class Source:
 
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
-    """Return a source with the module frozen, its type and device read off its parameters; `fields` go to `Source`."""
+    """Return a source with the module frozen, its type and device read off its parameters; `fields` go to `Source`.
+
+    Raises:
+        ModelError: it has lazy layers that have no weights yet.
+    """
+    lazy = [key for key, weights in (*module.named_parameters(), *module.named_buffers()) if is_lazy(weights)]
+    if lazy:
+        layer = lazy[0].rpartition(".")[0]
+        raise ModelError(
+            f"model {name}: its layer {layer} ({type(module.get_submodule(layer)).__name__}) has no weights before it "
+            "has seen a picture; call the network once with one, load its weights, and give it then"
+        )
     placed = next((p for p in (*module.parameters(), *module.buffers()) if p.is_floating_point()), None)
     if placed is not None:
         fields = {"dtype": placed.dtype, "device": placed.device, **fields}

@@ -42,12 +42,17 @@ class Shape(Protocol):
     def mask(self) -> Any:
         """(h, w) bool over the whole picture, of any size; None for a box."""
 
+    @property
+    def map(self) -> Any:
+        """(h, w) numbers over the whole picture; None where there are none."""
+
 
 def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     """Return a picture with shapes drawn into it, magnified where it is small.
 
     The box or the outline of what is true is blue; a box of the model is orange, and its mask tinted so. The text of a
-    box stands at its upper left corner, that of the true one at the lower left.
+    box stands at its upper left corner, that of the true one at the lower left. Maps stand to the right of the picture,
+    what is true first, in greys of one range: that of what is true.
 
     Args:
         picture: (H, W, 3) display-referred sRGB in [0, 1].
@@ -70,8 +75,22 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     written: list[tuple[int, int, int, int]] = []
     for shape, ends in boxes:
         written.append(_write(draw, shape, ends, size, font, written))
-    found: Floats = np.asarray(image, dtype=np.float32) / np.float32(255.0)
+    maps = sorted((shape for shape in shapes if shape.map is not None), key=lambda one: not one.true)
+    panels = [image, *(_panel(shape, maps[0].map, size, font) for shape in maps)]
+    found: Floats = np.hstack([np.asarray(one, dtype=np.float32) for one in panels]) / np.float32(255.0)
     return found
+
+
+def _panel(shape: Shape, first: Any, size: tuple[int, int], font: Any) -> Image.Image:
+    """A map in greys, in the range that the first of them has."""
+    low, high = float(first.min()), float(first.max())
+    greys = np.clip((np.asarray(shape.map, dtype=np.float64) - low) / max(high - low, 1e-12), 0.0, 1.0)
+    panel = Image.fromarray(np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)).resize(
+        size, Image.Resampling.NEAREST
+    )
+    panel = panel.convert("RGB")
+    _write(ImageDraw.Draw(panel), shape, (0, 0, size[0] - 1, size[1] - 1), size, font, [])
+    return panel
 
 
 def _draw_mask(image: Image.Image, mask: npt.NDArray[np.bool_], true: bool) -> None:

@@ -8,36 +8,51 @@ from typing import Any, Protocol
 from advsearch.described import NOT_A_NUMBER
 
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
+DEPTH, SIMILARITY = "depth", "similarity"
 """Tasks whose answers have words of their own; others are quoted."""
 
 _MARGINS = {
     CLASSIFICATION: "how far the wrong answer leads the right one, in logits",
     DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
     SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
+    DEPTH: "the logarithm of the factor by which the object's distance is off, less that of the tolerance",
+    SIMILARITY: "how far the nearest wrong name leads the right one, in logits",
 }
 _MARKS = {
     DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
     SEGMENTATION: "Blue is the true outline, orange the pixels to which the model gives a right class.",
+    DEPTH: "Blue is the true outline, orange the object's pixels whose distance is right. Beside it is the inverse of "
+    "the true distance, and of the model's: light is near.",
 }
 _WANTED = {
     "mislabel": "makes the model take {} for something else",
     "displace": "makes the model see {} elsewhere",
     "create": "makes the model see beside {} what is not there",
+    "nearer": "makes the model judge {} nearer than it is",
+    "farther": "makes the model judge {} farther than it is",
+    "gone": "makes the model judge {} to be as far as what is behind it",
 }
 SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
 """Objectives that are over 0 exactly where an answer is what is sought."""
 
 _UNITS = {
     "logits": ("margin", "log_odds", "pixel_margin"),
+    "logarithm of a factor": ("nearer", "farther"),
     "log-odds": ("vanish", "mislabel", "displace", "create"),
     "nats": ("cross_entropy",),
     "lengths of the clean features": ("feature_distance",),
+    "1 - cosine": ("distance",),
 }
 
 MOST_DECIMALS = 4
 """Of a percentage."""
 PROBABILITY_DECIMALS = 1
 """Of a probability that a model gives."""
+
+_TAKES = (SEGMENTATION, SIMILARITY)
+"""Tasks of which an answer takes the object for something."""
+WHOLE = ("background", "itself", "something else")
+"""Answers without an article."""
 
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
@@ -131,6 +146,8 @@ def cells(task: str, answer: Said) -> list[str]:
     label, share = answer.label, answer.probability
     if share is None:
         return [label, ""]
+    if task == SIMILARITY:
+        return [label, _similar(percent(share, PROBABILITY_DECIMALS), getattr(answer, "payload", None))]
     if task == DETECTION:
         if label.startswith(_NONE):
             return [f"{label} found", f"best score of {label.removeprefix(_NONE)} {share:.2f}"]
@@ -176,7 +193,9 @@ def calls(task: str, thing: str, label: str) -> str:
         return f"calls {thing} {with_article(label)}"
     if task == DETECTION:
         return _detects("finds", "sees", "takes", thing, label)
-    return f"takes {thing} for {_stuff(label)}" if task == SEGMENTATION else f'answers "{label}" for {thing}'
+    if task == DEPTH:
+        return f"judges {thing} {label}"
+    return f"takes {thing} for {_stuff(label)}" if task in _TAKES else f'answers "{label}" for {thing}'
 
 
 def calling(task: str, label: str) -> str:
@@ -187,11 +206,22 @@ def calling(task: str, label: str) -> str:
         return f"calling it {with_article(label)}"
     if task == DETECTION:
         return _detects("finding", "seeing", "taking", "it", label)
-    return f"taking it for {_stuff(label)}" if task == SEGMENTATION else f'answering "{label}"'
+    if task == DEPTH:
+        return f"judging it {label}"
+    return f"taking it for {_stuff(label)}" if task in _TAKES else f'answering "{label}"'
 
 
 def _stuff(label: str) -> str:
-    return label if label == "background" else with_article(label)
+    return label if label in WHOLE else with_article(label)
+
+
+def _similar(share: str, kept: Any) -> str:
+    """Return how sure an answer of similarity is, and where the right one stands or how like the clean one it is."""
+    if not isinstance(kept, dict) or "cosine" not in kept:
+        return share
+    if "rank" not in kept:
+        return f"cosine {kept['cosine']:.2f}"
+    return f"{share}, right one at rank {kept['rank']} of {kept['references']}" if kept["rank"] > 1 else share
 
 
 def _detects(finds: str, sees: str, takes: str, thing: str, label: str) -> str:

@@ -94,6 +94,12 @@ MIGRATIONS = (
         height      INTEGER           -- of that, in pixels
     );
     """,
+    """
+    -- Of rows of a search: search, or ranking where a candidate was rendered again at its end. NULL in older rows.
+    ALTER TABLE evaluations ADD COLUMN phase TEXT;
+    -- {"feature": 0.31, ...}: numbers that the run's metrics say of the picture. NULL where there are none.
+    ALTER TABLE evaluations ADD COLUMN metrics_json TEXT;
+    """,
 )
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 

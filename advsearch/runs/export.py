@@ -1,9 +1,9 @@
 """A run's rows as a table for other programs: CSV, JSON or Parquet.
 
 One line for each evaluated configuration, in the order in which they were evaluated. The columns of the store come
-first; then one for each value, with its unit in its name: ``pose.yaw [degrees]``. A value of several numbers has a
-column for each: ``camera.target[0]``. What a task keeps of an answer (``payload``) is nested in JSON and a JSON text in
-the others. What a row has not is empty.
+first; then one for each of the run's metrics; then one for each value, with its unit in its name: ``pose.yaw
+[degrees]``. A value of several numbers has a column for each: ``camera.target[0]``. What a task keeps of an answer
+(``payload``) is nested in JSON and a JSON text in the others. What a row has not is empty.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FORMATS = ("csv", "json", "parquet")
 
 PAYLOAD = "payload"
 OWN = (
-    *("id", "kind", "step", "seed", "spp", "objective", "score", "success", "correct", "margin"),
+    *("id", "kind", "step", "phase", "seed", "spp", "objective", "score", "success", "correct", "margin"),
     *("label", "label_index", "probability", PAYLOAD),
 )
 AFTER = ("renders", "machine", "seconds", "time")
@@ -69,27 +69,36 @@ def export(store: Store, format: str, out: Path | None, stream: IO[bytes], kind:
 
 
 def columns(rows: Iterable[Row]) -> list[str]:
-    """Return the columns of a table of these rows; values in the order in which they first occur."""
+    """Return the columns of a table of these rows; metrics and values in the order in which they first occur."""
+    metrics: dict[str, None] = {}
     seen: dict[str, None] = {}
     for row in rows:
+        metrics |= dict.fromkeys(row.metrics)
         seen |= dict.fromkeys(_values(row.values))
-    return [*OWN, *seen, *AFTER]
+    return [*OWN, *metrics, *seen, *AFTER]
 
 
 def record(row: Row) -> JsonObject:
     """Return a row as column to value."""
-    own = {one.name: getattr(row, one.name) for one in fields(row) if one.name != "values"}
-    return own | _values(row.values)
+    own = {one.name: getattr(row, one.name) for one in fields(row) if one.name not in ("values", "metrics")}
+    return own | dict(row.metrics) | _values(row.values)
 
 
 def to_pandas(rows: Iterable[Row]) -> Any:
-    """Return rows as a `pandas.DataFrame` with the columns of an export.
+    """Return rows as a `pandas.DataFrame`, with the columns of an export under plain names.
+
+    A value is called ``pose.yaw``, and ``attrs["units"]["pose.yaw"]`` says its unit: "degrees".
 
     Raises:
         InputError: pandas is not installed.
     """
     pandas, listed = _pandas(), list(rows)
-    return pandas.DataFrame([record(row) for row in listed], columns=columns(listed))
+    names = {one: one.partition(" [")[0] for one in columns(listed)}
+    units = {plain: one.removeprefix(f"{plain} [").removesuffix("]") for one, plain in names.items() if plain != one}
+    records = [{names[name]: value for name, value in record(row).items()} for row in listed]
+    frame = pandas.DataFrame(records, columns=list(names.values()))
+    frame.attrs = {"units": units}
+    return frame
 
 
 def table_to_pandas(rows: Sequence[JsonObject]) -> Any:

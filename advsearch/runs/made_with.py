@@ -8,12 +8,17 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
+from itertools import islice
 from pathlib import Path
 
-from advsearch.files import opened_for
+from advsearch.errors import FileFormatError
+from advsearch.files import opened_for, read_bytes
 
 NOTE = "made with"
 """The note: a list, with an entry for each sitting."""
+
+MOST, LARGEST = 20_000, 1 << 28
+"""Files of a folder, and bytes of one, that a digest is taken of, at most."""
 
 PACKAGES = ("advsearch", "mitsuba", "drjit", "torch", "numpy")
 
@@ -54,7 +59,8 @@ def changed_file(before: Sequence[Mapping[str, object]], now: Mapping[str, str])
 
 def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of each file that settings name, in hexadecimal, and of each that was read for it: materials,
-    pictures and buffers that a mesh or a scene names. What is bundled or gone has none."""
+    pictures and buffers that a mesh or a scene names. A folder of a task's pictures has one for all. What is bundled
+    or gone has none."""
     from advsearch.settings.configuration import FILES
 
     found: dict[str, str] = {}
@@ -63,6 +69,8 @@ def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
             with suppress(OSError, ValueError):
                 own = os.path.abspath(path)
                 parts = opened_for(own)
+                if name == "task" and os.path.isabs(path) and Path(path).is_dir():
+                    found[path] = _digest_of_folder(Path(path))
                 if (parts or name in FILES) and Path(path).is_file():
                     found[path] = _digest(Path(path))
                 for part in parts:
@@ -86,6 +94,16 @@ def _paths(value: object) -> Iterator[str]:
             yield from dict.fromkeys(
                 one.strip() for one in (name, name.rpartition("@")[2], name.partition("#")[0]) if one.strip()
             )
+
+
+def _digest_of_folder(folder: Path) -> str:
+    """Return the SHA-256 of the names and contents of the files in the folders of a folder, as far as they are read."""
+    digest = hashlib.sha256()
+    for path in sorted(islice(folder.glob("*/*"), MOST)):
+        digest.update(f"{path.relative_to(folder).as_posix()}\n".encode())
+        with suppress(OSError, FileFormatError):
+            digest.update(hashlib.sha256(read_bytes(path, "a picture", LARGEST)).digest())
+    return digest.hexdigest()
 
 
 def _digest(path: Path) -> str:

@@ -60,6 +60,9 @@ class Row:
         values: parameter to ``{"value": ..., "unit": ...}``.
         seconds: that the evaluation took.
         renders: pictures that it took; None where that was not counted.
+        phase: of a search: ``"search"``, or ``"ranking"`` where a candidate was rendered again at the end; None of
+            trials, and in rows of older runs.
+        metrics: numbers that the run's metrics say of the picture, by name; None where one is not a number.
         machine: what it was evaluated on, by its name in the note "machines"; None for the machine that wrote the row.
         time: when it was written, seconds since 1970; set by the store.
         id: place in the file, from 1; set by the store where it is not given.
@@ -81,6 +84,8 @@ class Row:
     values: Mapping[str, Value] = field(default_factory=dict)
     seconds: float | None = None
     renders: int | None = None
+    phase: str | None = None
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
     machine: str | None = None
     time: float | None = None
     id: int | None = None
@@ -109,7 +114,7 @@ class Told:
 
 
 _TOLD = "number, u, non_finite, cost, gradient, picture, height"
-_AS_JSON = ("payload", "values")
+_AS_JSON = ("payload", "values", "metrics")
 _COLUMNS = tuple(f"{one.name}_json" if one.name in _AS_JSON else one.name for one in fields(Row))
 _INSERT = (
     f"INSERT INTO evaluations ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) ON CONFLICT DO NOTHING"
@@ -302,17 +307,20 @@ class Store:
 
 _FIELDS = tuple(one.name for one in fields(Row))
 _NAMES = _FIELDS[:-1]  # without the id
-_FRONT = _NAMES[: _NAMES.index("payload")]
-_BACK = _NAMES[_NAMES.index("values") + 1 : -1]  # the last is the time
+_OTHERS = _NAMES[:-1]  # without the time
 _SIMPLE = frozenset({str, int, bool, type(None)})
 _JSON = json.JSONEncoder(allow_nan=False)
 
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     """Return the row's columns. Numbers of numpy and torch become Python's."""
-    front = [_column(getattr(row, name)) for name in _FRONT]
-    payload = None if row.payload is None else _json(row.payload)
-    return (*front, payload, _json(row.values), *(_column(getattr(row, name)) for name in _BACK), stamp, row.id)
+    return (*(_held(name, getattr(row, name)) for name in _OTHERS), stamp, row.id)
+
+
+def _held(name: str, value: Any) -> Any:
+    if name not in _AS_JSON:
+        return _column(value)
+    return None if value is None or (name == "metrics" and not value) else _json(value)
 
 
 def _column(value: Any) -> Any:
@@ -332,7 +340,7 @@ def _column_types() -> dict[str, tuple[type, ...]]:
     held: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}
     hints = {name: get_args(hint) or (hint,) for name, hint in get_type_hints(Row).items() if name not in _AS_JSON}
     types = {name: tuple(kind for part in parts for kind in held.get(part, (part,))) for name, parts in hints.items()}
-    return {**types, "payload": (str, type(None)), "values": (str,)}
+    return {**types, "payload": (str, type(None)), "metrics": (str, type(None)), "values": (str,)}
 
 
 _TYPES = _column_types()
@@ -344,6 +352,9 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     if not wrong:
         given["values"] = _values(given["values"])
         wrong = ["values_json"] if given["values"] is None else []
+    if not wrong:
+        given["metrics"] = {} if given["metrics"] is None else _metrics(given["metrics"])
+        wrong = ["metrics_json"] if given["metrics"] is None else []
     if not wrong and given["payload"] is not None:
         try:
             given["payload"] = parse_json(given["payload"])
@@ -386,3 +397,10 @@ def _values(text: str) -> dict[str, Value] | None:
     except (ValueError, RecursionError):
         return None
     return values if isinstance(values, dict) else None
+
+
+def _metrics(text: str) -> dict[str, float | None] | None:
+    """Return the metrics of a row, None where they are not numbers by name."""
+    found: Any = _values(text)
+    numbers = found is not None and all(one is None or type(one) in (int, float) for one in found.values())
+    return dict(found) if numbers else None

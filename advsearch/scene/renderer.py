@@ -12,19 +12,23 @@ get their derivative from a second one, which is the identity in the forward pas
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+import io
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, Protocol
 
+import numpy as np
+import numpy.typing as npt
 import torch
+from PIL import Image
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.description import OBJECT
-from advsearch.scene.formation import ImageFormation
+from advsearch.scene.formation import ImageFormation, levels_of
 from advsearch.scene.gradients.differences import central, one_sided, random_directions
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.motion import Motion, steps_for
@@ -34,6 +38,9 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536
+
+Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]
+"""A point of the unit box."""
 
 Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 """From scene inputs, seed and samples a pixel to linear radiance (H, W, 3)."""
@@ -106,6 +113,19 @@ class Renderer:
     def start(self) -> Tensor:
         return self.space.start
 
+    def __repr__(self) -> str:
+        height, width = self.formation.resolution
+        numbers = ", ".join(f"{group.name} ({group.size})" for group in self.space.groups)
+        return f"Renderer({len(self.start)} numbers: {numbers}; {height} x {width} pixels)"
+
+    def _repr_png_(self) -> bytes:
+        """The start as a notebook shows it; it does not count as a render."""
+        with torch.no_grad():
+            levels = levels_of(self.like()(self.start))
+        held = io.BytesIO()
+        Image.fromarray(levels.numpy()).save(held, "PNG")
+        return held.getvalue()
+
     def like(self, scene: MitsubaScene | None = None, **formation: Any) -> Renderer:
         """Return a renderer of the same space with another scene, or other fields of the image formation.
 
@@ -122,22 +142,25 @@ class Renderer:
         other._source = source
         return other
 
-    def __call__(self, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
-        """Render a configuration as the model would see it.
+    def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
+        """Render a configuration as the model would see it, or several.
 
         Args:
-            u: (d,) float in [0, 1].
+            u: (d,) in [0, 1], a tensor or an array; or (N, d), rendered one after the other with the same seed.
             seed: number of the noise; the same seed gives the same bytes.
             spp: independent samples a pixel, 1 to 65,536.
 
         Returns:
-            (H, W, 3) float32, display-referred sRGB in [0, 1]; differentiable with respect to u, in
+            (H, W, 3) float32, display-referred sRGB in [0, 1], or (N, H, W, 3); differentiable with respect to u, in
             `torch.inference_mode` too (not in `torch.no_grad`).
 
         Raises:
             InputError: u has another shape, or values outside [0, 1], or spp is out of range; or u requires a
                 gradient and was made in `torch.inference_mode`.
         """
+        u = _tensor(u)
+        if u.ndim == 2 and len(u):
+            return torch.stack([self(one, seed, spp) for one in u])
         self._check(u, spp)
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
             u = u.clone() if u.is_inference() else u
@@ -147,31 +170,31 @@ class Renderer:
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
             return image
 
-    def radiance(self, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
+    def radiance(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render linear radiance, denoised if the formation says so; arguments as for a call; (H, W, 3) float32.
 
         Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not.
         """
-        self._check(u, spp)
+        u = self._check(_tensor(u), spp)
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
             through = self._through(u.clone() if u.is_inference() else u)
             return self._formed(self.scene.assembly(self.space.inputs(through)), seed, spp)
 
-    def mask(self, u: Tensor) -> Tensor:
+    def mask(self, u: Configuration) -> Tensor:
         """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.
 
         It is asked for at the middle of each pixel. What controls do to the finished picture moves nothing in it.
         """
         return self.surfaces(u).seen(OBJECT)
 
-    def surfaces(self, u: Tensor, fineness: int = 1) -> Surfaces:
+    def surfaces(self, u: Configuration, fineness: int = 1) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; as of `mask`.
 
         Args:
             u: (d,) in [0, 1].
             fineness: into how many parts each side of a pixel is cut, to be looked at each.
         """
-        self._check(u, 1)
+        u = self._check(_tensor(u), 1)
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
         return self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE}, fineness)
@@ -210,7 +233,7 @@ class Renderer:
                     central(lambda at: loss(self._picture(at, noise, count)), group, u.detach(), derivative)
         return value.detach(), derivative
 
-    def _check(self, u: Tensor, spp: int) -> None:
+    def _check(self, u: Tensor, spp: int) -> Tensor:
         if u.shape != self._shape:
             raise InputError(f"render: expected u of shape {tuple(self._shape)}, got {tuple(u.shape)}")
         if not 1 <= spp <= MAX_SPP:
@@ -223,6 +246,7 @@ class Renderer:
                 "render: u was made in `torch.inference_mode()`, so that nothing can be differentiated with respect to "
                 "it; make it outside, or pass `u.detach()` for the picture alone"
             )
+        return u
 
     # ---- from u to the picture --------------------------------------------------------------------------------------
 
@@ -375,6 +399,14 @@ class Renderer:
                     if reached is not None and bool(reached[group.coordinates].any()):
                         routes[group.name].add(name)
         return {name: frozenset(found) for name, found in routes.items()}
+
+
+def _tensor(u: Configuration) -> Tensor:
+    """u as float32, with its graph if it has one."""
+    try:
+        return torch.as_tensor(u, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"render: expected u as a tensor or an array of numbers, got {type(u).__name__}") from None
 
 
 class _Radiance(torch.autograd.Function):

@@ -43,6 +43,7 @@ class Surfaces:
         names: of the shapes.
         id: (H, W) int64: 1 for the first of the names and so on, 0 where there is nothing.
         depth: (H, W) distance from the camera, object sizes; infinite where there is nothing.
+        z_depth: (H, W) the part of it that lies along the camera's axis.
         normal: (H, W, 3) unit shading normal in world space.
         uv: (H, W, 2) texture coordinates; v = 0 is the bottom row.
         face: (H, W) int64 number of the triangle in its mesh.
@@ -51,6 +52,7 @@ class Surfaces:
     names: tuple[str, ...]
     id: Tensor
     depth: Tensor
+    z_depth: Tensor
     normal: Tensor
     uv: Tensor
     face: Tensor

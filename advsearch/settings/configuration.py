@@ -136,7 +136,7 @@ class Config(BaseModel):
             other: gives the settings that are `shared`.
             **changes: settings that are different.
         """
-        return cls(**{**cls.shared(other), **changes})
+        return cls(**{**cls.shared(other), **changes}).with_only_here(other.only_here)
 
     @property
     def only_here(self) -> tuple[str, ...]:

@@ -57,6 +57,8 @@ class Judgement:
         answer: what the model says.
         payload: what else is kept of it in the run's rows, as JSON values (boxes, masks); None where there is nothing.
         objective: what a search maximises, of this picture; None where nothing is searched.
+        metrics: numbers that the run's metrics say of this picture, by name, or None in the place of one that is none;
+            None where there are no metrics.
     """
 
     score: float
@@ -65,6 +67,7 @@ class Judgement:
     answer: Answer
     payload: JsonValue = None
     objective: float | None = None
+    metrics: Mapping[str, float | None] | None = None
 
     @classmethod
     def of(cls, score: float, margin: float, answer: Answer, payload: JsonValue = None) -> Judgement:
@@ -93,12 +96,14 @@ class Mark:
         true: whether it is what is true of the scene; otherwise it is what the model says.
         box: x0, y0, x1, y1 in pixels of the picture, from the top left.
         mask: (h, w) bool over the whole picture, of any size.
+        map: (h, w) numbers over the whole picture, which are shown beside it, larger ones lighter.
     """
 
     text: str
     true: bool
     box: tuple[float, float, float, float] | None = None
     mask: Tensor | None = None
+    map: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +113,12 @@ class Sight:
     Attributes:
         mask: (H, W) bool, where it is the object.
         depth: (H, W) float, how far it is, see `Facts.depth`.
+        z_depth: (H, W) float, see `Facts.z_depth`.
     """
 
     mask: Tensor
     depth: Tensor
+    z_depth: Tensor
 
 
 @dataclass(frozen=True)
@@ -168,6 +175,15 @@ class Facts:
         """
         return self.sight.depth
 
+    @property
+    def z_depth(self) -> Tensor:
+        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives.
+
+        Raises:
+            InputError: as for `sight`.
+        """
+        return self.sight.z_depth
+
     @cached_property
     def box(self) -> tuple[int, int, int, int] | None:
         """The smallest box round what is seen of the object: x0, y0, x1, y1 in pixels from the top left.
@@ -213,12 +229,16 @@ class Task(ABC):
         objective: name of the objective where none is asked for; "score" is the task's own score.
         reads_logits: whether its models answer with logits (N, classes). Then their answers are checked as such, and
             the objectives of classification take them.
+        labelled: whether it takes a label; with one that takes none, others get it (`together`).
+        names_from: where its names come from, if neither from the model nor from the setting `labels`.
         varies: whether the truth depends on the configuration; it is asked for at each one then.
     """
 
     name: ClassVar[str]
     objective: ClassVar[str] = "score"
     reads_logits: ClassVar[bool] = False
+    labelled: ClassVar[bool] = True
+    names_from: ClassVar[str] = ""
     varies: ClassVar[bool] = False
 
     minimise: bool = field(default=False, metadata=FROM_RUN)
@@ -338,6 +358,11 @@ class Task(ABC):
     def average(self, outputs: Sequence[Output]) -> Output:
         """Return one output for several pictures of a configuration; each is of one picture, as is the result."""
         return torch.stack(list(outputs)).mean(dim=0)
+
+    @property
+    def title(self) -> str:
+        """What the task is called in results."""
+        return self.name
 
     @property
     def goal(self) -> str:

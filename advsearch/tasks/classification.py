@@ -100,12 +100,12 @@ def target_lead(logits: Tensor, targets: Labels) -> Tensor:
     return largest(logits, inside) - largest(logits, ~inside)
 
 
-def members(logits: Tensor, labels: Labels, setting: str = "label") -> Tensor:
+def members(logits: Tensor, labels: Labels | Tensor, setting: str = "label") -> Tensor:
     """Return (C,) bool, true for the classes of a label set; checks the logits and the labels.
 
     Args:
         logits: (N, C).
-        labels: class indices.
+        labels: class indices, which are right for all N.
         setting: what an error names.
 
     Raises:
@@ -114,6 +114,7 @@ def members(logits: Tensor, labels: Labels, setting: str = "label") -> Tensor:
     if logits.ndim != 2:
         raise InputError(f"model output: expected logits of shape (N, classes), got {tuple(logits.shape)}")
     classes = logits.shape[1]
+    labels = tuple(dict.fromkeys(labels.flatten().tolist())) if isinstance(labels, Tensor) else labels
     if not labels or not all(0 <= label < classes for label in labels):
         raise InputError(f"{setting}: expected class indices from 0 to {classes - 1}, got {tuple(labels)}")
     found = torch.zeros(classes, dtype=torch.bool, device=logits.device)

@@ -21,6 +21,7 @@ from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
+from advsearch.models.labels import names_nothing
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
 from advsearch.tasks.box_readings import UNITS, Reading, strongest_boxes, unit_in
@@ -28,6 +29,7 @@ from advsearch.tasks.boxes import FORMS, left_over, overlap, share_inside, stron
 from advsearch.tasks.classes import NO, ClassTask, Labels
 from advsearch.tasks.detector_answers import (
     ORDERS,
+    QUERIES,
     Detections,
     as_option,
     ask_order,
@@ -95,7 +97,8 @@ class Detection(ClassTask):
             boxes in a picture of noise look like, or in a clean picture of the scene where it finds none in noise.
         order: of outputs without names, or of the columns of rows: "boxes labels scores", say, with "batch" for the
             number of the picture; of YOLO's heads "boxes scores" or "boxes objectness scores", with "channels first" or
-            "channels last" after it; "" for what types and numbers show.
+            "channels last" after it; of DETR's "boxes logits", or "boxes logits nothing" where the last class is no
+            thing; "" for what types and numbers show.
         seek: what an attack is after, one of `GOALS`.
         input_size: (height, width) of the model's input in pixels.
         seen_unit, seen_order: what the model's own answers show; "" where they have not yet.
@@ -184,11 +187,14 @@ class Detection(ClassTask):
     def _having_seen(self, output: Sequence[Detections]) -> Detection:
         """The task with what an answer of its model shows of orders and units."""
         grids = [one["raw"] for one in output if "raw" in one]
+        last = any("logits" in one for one in output) and self.named and names_nothing(self.labels[-1])
         try:
-            order = order_in(output, len(self.labels) if self.named else None, self._head)
+            order = order_in(
+                output, len(self.labels) if self.named else None, self._head or (QUERIES[1] if last else "")
+            )
         except ValueError as error:
             what = f"the model's answer is {tuple(grids[0].shape)}: " if grids else ""
-            asked = "" if grids else f"; {ask_order()}"
+            asked = f"; {ask_order()}" if any("either" in one for one in output) else ""
             raise InputError(f"task detection: {what}{error}{asked}") from None
         found = replace(
             self,
@@ -212,8 +218,8 @@ class Detection(ClassTask):
         return length > len(self.labels) + next(start for head, start in HEADS.items() if order.startswith(head))
 
     def _boxed(self, output: Sequence[Detections]) -> Sequence[Detections]:
-        """What the model answered, with the boxes of YOLO's heads found."""
-        return self._settled(output) if any("raw" in one for one in output) else output
+        """What the model answered, with the boxes of YOLO's heads and the scores of DETR's found."""
+        return self._settled(output) if any("raw" in one or "logits" in one for one in output) else output
 
     @property
     def unsaid(self) -> str:
@@ -236,6 +242,8 @@ class Detection(ClassTask):
             said.append(
                 f"The detector's answer of {self.shape} is read as a YOLO's: {as_option(f'order: {self.seen_order}')}."
             )
+        if self.seen_order in QUERIES and not self.order:
+            said.append(f"The detector's answer is read as a DETR's: {as_option(f'order: {self.seen_order}')}.")
         if self.masks:
             said.append("The detector's masks are left out: its boxes and scores are read.")
         if self.undecided and self.seen_order and not self.order:
@@ -249,16 +257,21 @@ class Detection(ClassTask):
 
     @property
     def _reading(self) -> Reading:
-        middle = names_head(self._head or self.seen_order)
+        middle = self._told_by_classes(self._head or self.seen_order)
         return Reading(
             self.boxes or ("cxcywh" if middle else FORMS[0]), self.unit or self.seen_unit or UNITS[1], self.input_size
         )
 
     @property
     def _head(self) -> str:
-        """The head of `yolo_heads.HEADS` that `order` says; "" where it says none."""
+        """The head of `yolo_heads.HEADS`, or the one of `QUERIES`, that `order` says; "" where it says none."""
         order = " ".join(checked_order(self.order)) if self.order else ""
-        return order if names_head(order) else ""
+        return order if self._told_by_classes(order) else ""
+
+    @staticmethod
+    def _told_by_classes(order: str) -> bool:
+        """Whether an order is of answers that the number of classes explains; their boxes have a middle and sides."""
+        return names_head(order) or order in QUERIES
 
     def seeking(self, objective: str) -> Detection:
         """See `Task.seeking`: the objectives of detection say what counts as success."""

@@ -4,18 +4,21 @@ Detections of one picture are a mapping with `boxes` (D, 4) as they came and `sc
 with `labels` (D,), the class of each box. Where types, names and shapes leave open which of two numbers of a box is its
 score and which its class, these stand as `either` (D, 2) in place of both. One tensor that only the number of classes
 explains stands as `raw` (A, B) in place of all, with the channels of maps that came with it as `beside` (K,), see
-`yolo_heads`. Rows that only fill up are gone; how many of them were NaN throughout is said as `blank` (1,), if any.
+`yolo_heads`. Logits that only that number explains stand as `logits` (D, K) in place of scores, see `QUERIES`. Rows
+that only fill up are gone; how many of them were NaN throughout is said as `blank` (1,), if any.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from advsearch.models.labels import sets_of
 from advsearch.models.model import each_tensor
 from advsearch.tasks.yolo_heads import HEADS, LAYOUTS, TOLERANCE, head_in, names_head, split
 
@@ -29,6 +32,13 @@ EXPECTED = (
 
 ORDERS = ("boxes scores labels", "boxes labels scores")
 """What two numbers of a box may be."""
+
+QUERIES = ("boxes logits", "boxes logits nothing")
+"""What DETR's networks answer: logits that judge each class by itself, with a sigmoid (Zhu et al. 2021, section 4), or
+of which a softmax chooses one, the last of which stands for nothing (Carion et al. 2020, section 3.1)."""
+
+QUERY_LOGITS = ("pred_logits", "logits")
+"""What these are called where the boxes are `pred_boxes`."""
 
 NAMES = {
     "boxes": ("boxes", "pred_boxes", "detection_boxes", "bboxes", "xyxy", "box", "bbox"),
@@ -46,18 +56,19 @@ NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 def checked_order(text: str) -> tuple[str, ...]:
     """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture.
 
-    Of one of YOLO's heads these are the words of `yolo_heads.HEADS`, and of a layout.
+    Of one of YOLO's heads these are the words of `yolo_heads.HEADS`, and of a layout; of DETR's one of `QUERIES`.
 
     Raises:
         ValueError: it names others.
     """
     parts = tuple(text.replace(",", " ").split())
-    if names_head(" ".join(parts)):
+    if names_head(" ".join(parts)) or " ".join(parts) in QUERIES:
         return parts
     if sorted(parts) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
         raise ValueError(
-            f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', or of a YOLO's head "
-            f"{' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or '{LAYOUTS[1]}' after it, got {text!r}"
+            f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', of a YOLO's head "
+            f"{' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or '{LAYOUTS[1]}' after it, or of a DETR's "
+            f"{' or '.join(map(repr, QUERIES))}, got {text!r}"
         )
     return parts
 
@@ -76,6 +87,11 @@ def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
     parts = checked_order(order) if order else ()
     if isinstance(answer, (list, tuple)) and answer and all(isinstance(one, Tensor) and one.ndim > 3 for one in answer):
         raise ValueError("expected boxes, and not the maps of a head from which they are made: export it in .eval()")
+    if (queries := _queries(answer, " ".join(parts))) is not None:
+        boxes, logits = queries
+        if boxes.ndim != 3 or boxes.shape[2] != 4 or logits.ndim != 3 or boxes.shape[:2] != logits.shape[:2]:
+            raise ValueError("expected boxes (N, D, 4) and logits (N, D, classes)")
+        return [{"boxes": b.float(), "logits": one.float()} for b, one in zip(boxes, logits, strict=True)]
     answer, channels = _first(answer)
     beside = torch.tensor(sorted(channels), dtype=torch.long)
     grid = isinstance(answer, Tensor) and answer.ndim == 3 and answer.shape[0] == count and answer.shape[2] != 4
@@ -98,6 +114,19 @@ def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
             raise ValueError(EXPECTED)
         found = [{name: part[k] for name, part in together.items()} for k in range(count)]
     return [_one(one) for one in found]
+
+
+def _queries(answer: Any, order: str) -> tuple[Tensor, Tensor] | None:
+    """The boxes and logits of an answer as DETR's networks give it, or that is said to be one; None of any other."""
+    if order in QUERIES and isinstance(answer, (list, tuple)):  # boxes are shares, which logits are not
+        tensors = [one for one in answer if isinstance(one, Tensor)]
+        boxes = [one for one in tensors if one.shape[-1] == 4 and bool(((one >= 0.0) & (one <= 1.0)).all())][:1]
+        logits = [one for one in tensors if not any(one is box for box in boxes)][:1]
+        return (boxes[0], logits[0]) if boxes and logits else None
+    part = answer.get if isinstance(answer, Mapping) else partial(getattr, answer)
+    found = [[one] if isinstance(one := part(name, None), Tensor) else [] for name in ("pred_boxes", *QUERY_LOGITS)]
+    boxes, logits = found[0], [*found[1], *found[2]][:1]
+    return (boxes[0], logits[0]) if boxes and logits and order in ("", *QUERIES) else None
 
 
 def _first(answer: Any) -> tuple[Any, set[int]]:
@@ -241,7 +270,10 @@ def _one(one: Mapping[str, Tensor]) -> Detections:
     filling = filling if labels is None else filling | (labels < 0)
     outside = best[~filling]
     if bool(((outside < -TOLERANCE) | (outside > 1.0 + TOLERANCE) & outside.isfinite()).any()):
-        raise ValueError("expected scores that are probabilities in [0, 1]; apply a sigmoid or a softmax to them")
+        said = f", or say {' or '.join(as_option(f'order: {order}') for order in QUERIES)}" if labels is None else ""
+        raise ValueError(
+            f"expected scores that are probabilities in [0, 1]; apply a sigmoid or a softmax to them{said}"
+        )
     found = {"boxes": boxes, "scores": scores} if labels is None else {
         "boxes": boxes, "scores": scores, "labels": labels.long()
     }  # fmt: skip
@@ -281,7 +313,7 @@ def settled(one: Detections, order: str = "", classes: int | None = None) -> Det
 
     Args:
         one: of `detections_in`.
-        order: one of `ORDERS`, or of `yolo_heads.HEADS` with a layout; "" for what its rows show.
+        order: one of `ORDERS` or `QUERIES`, or of `yolo_heads.HEADS` with a layout; "" for what its rows show.
         classes: that there are; None where nobody says.
 
     Raises:
@@ -293,6 +325,12 @@ def settled(one: Detections, order: str = "", classes: int | None = None) -> Det
         order = order or order_in([one], classes)
         boxes, scores = split(one["raw"], classes, order)
         return _one({"boxes": boxes, "scores": scores})
+    if "logits" in one:
+        if classes is None:
+            raise ValueError(EXPECTED)
+        choose = (order or order_in([one], classes)) == QUERIES[1]
+        scores = one["logits"].softmax(dim=1)[:, :classes] if choose else one["logits"].sigmoid()
+        return _one({"boxes": one["boxes"], "scores": scores})
     if "either" not in one:
         return {name: part for name, part in one.items() if name != "beside"}
     rows = counted(one) | one["either"].isnan().any(dim=1)
@@ -308,6 +346,18 @@ def settled(one: Detections, order: str = "", classes: int | None = None) -> Det
     return _one({**said, "scores": scores, "labels": labels})
 
 
+def _order_of_queries(logits: int, classes: int, said: str) -> str:
+    """Which of `QUERIES` has so many logits of a box; ValueError where none has."""
+    order = said or QUERIES[logits == classes + 1]
+    if logits in ((classes, classes + 1) if order == QUERIES[1] else (classes,)):
+        return order
+    fitting = [f"`labels={name}`" for name in dict.fromkeys([*sets_of(logits), *sets_of(logits - 1)])]
+    raise ValueError(
+        f"expected {classes} logits of a box for {classes} classes, or {classes + 1} with one for nothing, got "
+        f"{logits}; {' or '.join(fitting) + ' would fit' if fitting else 'give the `labels` of its classes'}"
+    )
+
+
 def ask_order() -> str:
     """What to say where scores and classes cannot be told apart."""
     return f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
@@ -319,7 +369,9 @@ def as_option(options: str) -> str:
 
 
 def order_in(found: Sequence[Detections], classes: int | None = None, head: str = "") -> str:
-    """Return which of `ORDERS`, or of `yolo_heads.HEADS` with its layout, detections show; "" where they leave it open.
+    """Return which order detections show; "" where they leave it open.
+
+    It is one of `ORDERS`, of `QUERIES`, or of `yolo_heads.HEADS` with its layout.
 
     A class is a whole number, a score lies in [0, 1]; and what suppression leaves comes by falling scores. Two numbers
     of which none is a class are the scores of two classes, or objectness and the score of the only one.
@@ -327,11 +379,15 @@ def order_in(found: Sequence[Detections], classes: int | None = None, head: str 
     Args:
         found: of any pictures.
         classes: that there are; None where nobody says.
-        head: of `yolo_heads.HEADS`, what is said of answers in one tensor; "" for nothing.
+        head: of `yolo_heads.HEADS`, what is said of answers in one tensor, or of `QUERIES`; "" for nothing.
 
     Raises:
-        ValueError: no number can be a score, or none a class; or a grid of boxes has none or several of its orders.
+        ValueError: no number can be a score, or none a class; or a grid of boxes has none or several of its orders; or
+            there are more or fewer logits than classes.
     """
+    logits = {one["logits"].shape[1] for one in found if "logits" in one}
+    if logits and classes is not None:
+        return _order_of_queries(logits.pop(), classes, head)
     grids = [one for one in found if "raw" in one]
     if grids and classes is not None:
         heads = set.intersection(*(set(head_in(one["raw"], one["beside"].tolist(), classes, head)) for one in grids))

@@ -1,4 +1,4 @@
-"""One task for several models at once: an answer counts where it is one for each of them."""
+"""Several models at once, each with a task of its own: an answer counts where it is one for each of them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.models.ensemble import Outputs, of_each
-from advsearch.options import FROM_RUN
+from advsearch.models.ensemble import Ensemble, Outputs, by_picture, of_each
+from advsearch.options import FROM_RUN, JOINED
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task, Truth
 
 Truths = tuple[Truth, ...]
@@ -20,34 +21,89 @@ Truths = tuple[Truth, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class Together(Task):
-    """A task of several models, each of which judges by labels of its own.
+    """Several models, each of which judges by a task and labels of its own.
 
     An answer is right where all models are right, and a success where it is one for every model. So the margin is the
     largest of the models' margins, and the score the least of their scores.
 
     Args:
-        task: of each model.
-        models: that are asked, in the order of the outputs of `advsearch.models.ensemble.together`.
-        tasks: of each model, by `on`.
+        parts: the task of each model, in the order of the outputs of `advsearch.models.ensemble.together`.
+        models: that are asked.
+        tasks: the parts on these, by `on`.
     """
 
     name = "ensemble"
+    objective = "each"
     varies = True
 
-    task: Task
-    models: tuple[Model, ...]
+    parts: tuple[Task, ...]
+    models: tuple[Model, ...] = field(default=(), metadata=FROM_RUN)
     tasks: tuple[Task, ...] = field(default=(), metadata=FROM_RUN)
 
+    @property
+    def title(self) -> str:
+        """See `Task.title`: of different tasks, their names."""
+        names = [one.title for one in self.parts]
+        return JOINED.join(names) if len(set(names)) > 1 else self.name
+
+    def read(self, answer: Any, count: int) -> list[Outputs]:
+        """See `advsearch.models.ensemble.by_picture`."""
+        return by_picture(answer, count)
+
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Together:
-        """See `Task.on`."""
-        tasks = tuple(self.task.on(one, target=target, minimise=minimise) for one in self.models)
+        """See `Task.on`; a target is for the tasks that take a label, where some do and some do not.
+
+        Raises:
+            InputError: it is no model of `together`, or one of fewer or more than there are tasks.
+        """
+        models = model.module.models if isinstance(model.module, Ensemble) else ()
+        if len(models) != len(self.parts):
+            raise InputError(f"model: expected {len(self.parts)}, one for each task, got {len(models) or 1}")
+        pairs = list(zip(self.parts, models, strict=True))
+        takes = [self._takes_label(part) for part in self.parts]
+        tasks = tuple(
+            part.on(one, target=target if label else None, minimise=minimise)
+            for (part, one), label in zip(pairs, takes, strict=True)
+        )
         wanted = None if target is None else tuple(one.target for one in tasks)
-        return replace(self, tasks=tasks, target=wanted, minimise=minimise)
+        return replace(self, models=models, tasks=tasks, target=wanted, minimise=minimise)
+
+    def seeking(self, objective: str) -> Together:
+        """See `Task.seeking`: of every task."""
+        return replace(self, parts=tuple(one.seeking(objective) for one in self.parts))
+
+    def told(self, one: Task, facts: Facts) -> Facts:
+        """Return the facts for one of the tasks: without a label that is for others."""
+        return facts if self._takes_label(one) else replace(facts, label=None)
+
+    def _takes_label(self, one: Task) -> bool:
+        return one.labelled or not any(part.labelled for part in self.parts)
 
     def check(self, facts: Facts) -> None:
         """See `Task.check`: of every model."""
         for one in self.tasks:
-            one.check(facts)
+            one.check(self.told(one, facts))
+
+    @property
+    def looks(self) -> bool:
+        """See `Task.looks`."""
+        return any(one.looks for one in self.tasks)
+
+    def seeing(self, output: Sequence[Outputs], truth: Truths | None) -> Together:
+        """See `Task.seeing`."""
+        each = zip(self.tasks, of_each(output), truth or [None] * len(self.tasks), strict=True)
+        return replace(self, tasks=tuple(one.seeing(own, true) for one, own, true in each))
+
+    @property
+    def unsaid(self) -> str:
+        """See `Task.unsaid`."""
+        pairs = zip(self.models, self.tasks, strict=True)
+        return "; ".join(f"{model.name}: {one.unsaid}" for model, one in pairs if one.unsaid)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `Task.remarks`."""
+        return tuple(dict.fromkeys(remark for one in self.tasks for remark in one.remarks))
 
     def truth(self, facts: Facts) -> Truths:
         """Return what is true for each model."""
@@ -88,11 +144,11 @@ class Together(Task):
         return Judgement.of(min(one.score for one in each), margin, *said)
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
-        """See `Task.marks`: what is true once, and what each model says under its name."""
+        """See `Task.marks`: what is true of the first, maps of all, and what each model says under its name."""
         found: list[list[Mark]] = [[] for _ in output]
         for number, (one, *own) in enumerate(self._each(output, truth)):
             for listed, marks in zip(found, one.marks(*own), strict=True):
-                listed += [mark for mark in marks if mark.true and not number]
+                listed += [mark for mark in marks if mark.true and (not number or mark.map is not None)]
                 name = self.models[number].name
                 listed += [replace(mark, text=f"{name}: {mark.text}") for mark in marks if not mark.true]
         return found

@@ -117,14 +117,14 @@ def test_the_same_seed_gives_the_same_numbers_when_deterministic(scene: advsearc
 
 
 def test_a_custom_objective_is_an_ordinary_function(scene: advsearch.Scene, level: float) -> None:
-    seen: list[tuple[torch.Size, torch.Size, tuple[int, ...]]] = []
+    seen: list[tuple[torch.Size, torch.Size, list[int]]] = []
 
-    def darkest(logits: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
-        seen.append((logits.shape, images.shape, labels))
+    def darkest(logits: Tensor, images: Tensor, labels: Tensor) -> Tensor:
+        seen.append((logits.shape, images.shape, labels.tolist()))
         return -images.mean(dim=(1, 2, 3))
 
     result = advsearch.attack(scene, model(level + 0.03), objective=darkest, baseline=False, **FAST)
-    assert seen[0] == ((1, 2), (1, SIZE, SIZE, 3), (0,))
+    assert seen[0] == ((1, 2), (1, SIZE, SIZE, 3), [0])
     assert float(result.adversarial.mean()) < float(result.clean.mean())
     assert result.summary.objective == "darkest"
 

@@ -194,7 +194,7 @@ def test_objectives_are_put_together(way: Any, value: float, slopes: tuple[float
 def test_an_answer_counts_where_it_does_for_each_model(logits: list[list[float]], score: float, right: bool) -> None:
     """One model that errs is neither a success nor a right answer."""
     tasks = (Classification(labels=("mug", "vase")), Classification(labels=("cup", "jar")))
-    task = Together(task=tasks[0], models=(easy(), hard()), tasks=tasks)
+    task = Together(parts=tasks, models=(easy(), hard()), tasks=tasks)
     output = [tuple(torch.tensor([one]) for one in logits)]
     (judged,) = task.judge(output, ((0,), (0,)))
     assert (judged.score, judged.right, judged.success) == (score, right, score > 0.0)

@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from conftest import ROOT
 from torch import Tensor, nn
 
-from advsearch.attacks import OBJECTIVES, get_objective, margin
+from advsearch import losses
+from advsearch.attacks import OBJECTIVES, get_objective, logit_objectives, margin
 from advsearch.attacks.feature_distance import NEARBY, feature_distance
 from advsearch.attacks.logit_objectives import (
     RELIEF,
@@ -25,10 +27,12 @@ from advsearch.attacks.logit_objectives import (
     targeted_log_odds,
     targeted_margin,
 )
-from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective, objective_summaries
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective, objective_summaries
+from advsearch.engine import print_terms
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import load_model
 from advsearch.tasks import Classification
+from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS
 
 IMAGES = torch.zeros(2, 4, 4, 3)
@@ -201,7 +205,7 @@ every_form_of_logits = pytest.mark.parametrize(("name", "chosen"), [one for one 
 def test_the_battery_knows_every_objective() -> None:
     known = {"margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score"}
     assert {name for name, _ in all_forms()} == known, "a new objective needs a test of its values above"
-    assert set(OBJECTIVE_KINDS) - known == {*GOALS, "pixel_margin"}
+    assert set(OBJECTIVE_KINDS) - known == {*GOALS, *DEPTH_GOALS, "pixel_margin", "distance", "each"}
     assert set(OBJECTIVES) == {name for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None}
     for name, kind in OBJECTIVE_KINDS.items():
         assert kind.name == name and kind.unit and kind.summary == objective_summaries()[name]
@@ -414,8 +418,8 @@ def test_unknown_objectives_name_their_neighbours() -> None:
         get_objective("margins")
     with pytest.raises(InputError, match="expected a name or a function"):
         get_objective(3.0)  # type: ignore[arg-type]
-    assert get_objective("margin") is margin
-    assert get_objective(margin) is margin
+    for same in ("margin", margin):
+        assert torch.equal(get_objective(same)(LOGITS, IMAGES, (0,)), margin(LOGITS, IMAGES, (0,)))
 
 
 def test_forms_are_called_with_the_right_answers() -> None:
@@ -429,7 +433,7 @@ def test_forms_are_called_with_the_right_answers() -> None:
 
 
 def test_a_users_function_gets_the_target_and_is_negated_too() -> None:
-    def score(logits: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
+    def score(logits: Tensor, images: Tensor, labels: Tensor) -> Tensor:
         return logits[:, labels[0]]
 
     assert get_objective(score)(LOGITS, IMAGES, (0,)).tolist() == [3.0, 0.0]
@@ -440,6 +444,80 @@ def test_a_users_function_gets_the_target_and_is_negated_too() -> None:
 def test_a_users_function_may_return_a_scalar_for_one_image() -> None:
     objective = get_objective(lambda logits, images, labels: logits[0, 1] + images.sum())
     assert objective(LOGITS[:1], IMAGES[:1], (0,)).tolist() == [1.0]
+    assert objective(LOGITS, IMAGES, (0,)).tolist() == [1.0, 5.0], "for each of several"
+
+
+LOSSES = [F.cross_entropy, nn.CrossEntropyLoss(), lambda z, x, y: F.cross_entropy(z, y), losses.cross_entropy]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_loss_of_torch_is_an_objective(loss: Callable[..., Tensor]) -> None:
+    """By itself, or in a function; one right answer comes as torch takes it, for each picture."""
+    found = get_objective(loss)(LOGITS, IMAGES, (2,))
+    assert torch.allclose(found, -LOGITS.log_softmax(dim=1)[:, 2])
+
+
+def test_several_right_answers_are_a_tuple_and_no_loss_of_torch_takes_them() -> None:
+    seen: list[Any] = []
+
+    def keeps(logits: Tensor, images: Tensor, labels: Any) -> Tensor:
+        seen.append(labels)
+        return logits[:, 0]
+
+    for labels in ((0, 2), (2,)):
+        get_objective(keeps)(LOGITS, IMAGES, labels)
+    assert seen[0] == (0, 2) and seen[1].tolist() == [2, 2] and seen[1].dtype == torch.int64
+    with pytest.raises(InputError, match=r"one right answer for a loss of torch, got 2 \(indices \(0, 2\)\); use"):
+        get_objective(F.cross_entropy)(LOGITS, IMAGES, (0, 2))
+
+
+@pytest.mark.parametrize(("named", "tuple_of"), [((0,), torch.tensor([0, 0])), ((0, 2), (0, 2))])
+def test_ours_take_right_answers_in_every_form(named: tuple[int, ...], tuple_of: Any) -> None:
+    for name in ("margin", "cross_entropy", "log_odds", "dlr", "targeted_margin", "targeted_dlr"):
+        by_name = getattr(losses, name)(LOGITS, tuple_of)
+        assert torch.equal(by_name, getattr(logit_objectives, name)(LOGITS, IMAGES, named)), name
+    assert torch.equal(margin(LOGITS, IMAGES, tuple_of), margin(LOGITS, IMAGES, named))
+
+
+def test_rows_may_have_right_answers_of_their_own() -> None:
+    assert losses.margin(LOGITS, torch.tensor([0, 1])).tolist() == [-1.0, -1.0]
+    assert losses.carlini_wagner(LOGITS, torch.tensor([0, 0]), confidence=2.0).tolist() == [-1.0, 2.0]
+    assert losses.targeted_carlini_wagner(LOGITS, (1,)).tolist() == [-2.0, 0.0]
+    with pytest.raises(InputError, match="labels: expected 2, one for each row of logits, got 3"):
+        losses.margin(LOGITS, torch.tensor([0, 1, 2]))
+
+
+def test_the_losses_of_colours_are_those_of_the_print_terms() -> None:
+    colors = torch.rand(2, 5, 5, 3, generator=torch.Generator().manual_seed(0))
+    assert losses.total_variation(colors).tolist() == [float(print_terms.variation(one)) for one in colors]
+    assert losses.non_printability(colors).tolist() == [float(print_terms.off_print(one)) for one in colors]
+    assert losses.total_variation(colors[0]).shape == (1,)
+    ink = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    leaf = torch.full((1, 2, 2, 3), 0.25, requires_grad=True)
+    off = losses.non_printability(leaf, ink)
+    off.sum().backward()
+    assert (
+        float(off.detach()) == pytest.approx(0.25 * 3**0.5) and leaf.grad is not None and float(leaf.grad.min()) > 0.0
+    )
+    with pytest.raises(InputError, match=r"colors: expected \(N, h, w, 3\), got \(5, 3\)"):
+        losses.total_variation(colors[0, 0])
+
+
+def test_a_function_asks_for_more_by_name() -> None:
+    def more(name: str) -> Any:
+        return {"u": torch.tensor([[1.0], [2.0]]), "configuration": {"pose.yaw": torch.tensor([10.0, 20.0])}}[name]
+
+    def asks(logits: Tensor, images: Tensor, labels: Tensor, u: Tensor, *, configuration: Any) -> Any:
+        return u[:, 0] + configuration["pose.yaw"]
+
+    assert asked_by(asks) == ("u", "configuration") and asked_by("margin") == ()
+    assert get_objective(asks)(LOGITS, IMAGES, (0,), more).tolist() == [11.0, 22.0]
+    one_number = get_objective(lambda z, labels, u, configuration: (u[0, 0] + configuration["pose.yaw"]).sum())
+    assert one_number(LOGITS, IMAGES, (0,), more).tolist() == [11.0, 22.0], "one picture at a time"
+    old = get_objective(lambda outputs, inputs, targets: inputs.sum(dim=(1, 2, 3)) + outputs[:, 0])
+    assert old(LOGITS, IMAGES, (0,)).tolist() == [3.0, 0.0], "its pictures may be called so"
+    with pytest.raises(InputError, match="asks for `u`, and there is no configuration here"):
+        get_objective(asks)(LOGITS, IMAGES, (0,))
 
 
 @pytest.mark.parametrize(
@@ -447,7 +525,7 @@ def test_a_users_function_may_return_a_scalar_for_one_image() -> None:
     [
         (lambda z, x, y: float(z.detach().sum()), r"expected a torch tensor of shape \(2,\), got float; .*\.item\(\)"),
         (lambda z, x, y: None, "got NoneType"),
-        (lambda z, x, y: z.sum(), r"expected one value per image, shape \(2,\), got \(\)"),
+        (lambda z, x, y: z[0], r"expected one value per image, shape \(2,\), got \(4,\)"),
         (lambda z, x, y: z, r"expected one value per image, shape \(2,\), got \(2, 4\)"),
         (lambda z, x, y: z.argmax(dim=1), "expected floating-point values, got torch.int64"),
         (lambda z, x, y: z.detach().sum(dim=1), "does not depend on the output or the images differentiably"),
@@ -459,9 +537,11 @@ def test_a_users_mistakes_are_explained(function: object, message: str) -> None:
         objective(LOGITS.clone().requires_grad_(), IMAGES, (0,))
 
 
-@pytest.mark.parametrize("function", [lambda logits, labels: logits.sum(), lambda *, logits, images, labels: logits])
-def test_a_function_that_cannot_take_the_three_arguments_is_refused_at_once(function: Callable[..., Tensor]) -> None:
-    with pytest.raises(InputError, match=r"expected a function that takes \(output, images, truth\), by position: "):
+@pytest.mark.parametrize("function", [lambda logits, images: logits.sum(), lambda *, logits, images, labels: logits])
+def test_a_function_that_cannot_take_the_arguments_is_refused_at_once(function: Callable[..., Tensor]) -> None:
+    with pytest.raises(
+        InputError, match=r"\(output, images, truth\) or \(output, labels\), and beside them any of u, "
+    ):
         check_objective(function)
 
 

@@ -26,12 +26,13 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 
 import advsearch
 from advsearch import __version__
+from advsearch.api.watching import BarProgress, LineProgress
 from advsearch.cli import list as listing
 from advsearch.cli.attack import answer
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import columns
-from advsearch.cli.progress import BarProgress, LineProgress, watching
+from advsearch.cli.progress import watching
 from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
@@ -919,7 +920,7 @@ class Clock:
 
 def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
     stream, clock = io.StringIO(), Clock()
-    progress = LineProgress(stream, clock)
+    progress = LineProgress(stream, clock, with_flags)
     progress.stage("searching", 40, hint="40 pictures; `steps` shortens it", at_most=True)
     for _ in range(12):
         clock.now += 1.0
@@ -945,7 +946,7 @@ def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
 def test_lines_come_where_nothing_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr("sys.stderr", stream)
-    monkeypatch.setattr("advsearch.cli.progress.PATIENCE", 0.0)
+    monkeypatch.setattr("advsearch.api.watching.PATIENCE", 0.0)
     with watching() as progress:
         progress.stage("compiling")
         for _ in range(100):

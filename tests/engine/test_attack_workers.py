@@ -21,7 +21,7 @@ from advsearch.attacks.search import Line
 from advsearch.cli.attack import answer
 from advsearch.config import AttackConfig
 from advsearch.engine.ahead import Ahead, TrialAhead, line_of
-from advsearch.engine.outcome import AttackResult
+from advsearch.engine.attack_result import AttackResult
 from advsearch.errors import InputError
 from advsearch.runs.store import Row, Store
 

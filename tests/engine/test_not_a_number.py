@@ -68,7 +68,7 @@ def test_a_clean_scene_without_a_number_is_said_as_such() -> None:
     clean["control"] = {**clean["control"], "correct": 17, "not_a_number": 2}
     (first, *_) = wording.remarks(samples.attack(clean=clean))
     assert "fails 3 of its 20 trials; in 2 the answer is not a number." in first
-    for task in ("classification", "detection", "segmentation"):
+    for task in ("classification", "detection", "segmentation", "depth"):
         assert calls(task, "this mug", "not a number") == "answers nothing for this mug, for its answer is not a number"
         assert cells(task, Answer("not a number")) == ["not a number", ""]
     assert calls("segmentation", "this bottle", "no bottle") == "finds no bottle"

@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from advsearch.errors import ModelError
-from advsearch.models import ModelWarning, load_model
+from advsearch.errors import InputError, ModelError
+from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.zoo import timm as timm_networks
+from advsearch.tasks import Detection, Similarity
+from advsearch.tasks.detection import Place
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -104,7 +107,54 @@ def test_what_comes_without_a_processor_is_said(tmp_path: Path) -> None:
     assert (model.preprocessing.mean, model.preprocessing.std) == ((0.5,) * 3, (0.25,) * 3)
 
 
-def test_a_processor_that_is_no_gain_and_offset_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+class Weighs(transformers.BaseImageProcessor):  # type: ignore[misc,name-defined]
+    """Resizes, bends values and mixes channels, with torch throughout."""
+
+    do_resize = True
+    weights = ((0.6, 0.3, 0.1), (0.2, 0.7, 0.1), (0.1, 0.2, 0.7))
+
+    def __call__(self, images: Any, return_tensors: str, do_resize: bool = True) -> Any:
+        x = images if isinstance(images, Tensor) else torch.from_numpy(np.array(images)).movedim(-1, 0).float()
+        if do_resize:
+            x = nn.functional.interpolate(x[None], (SIDE, SIDE), mode="bilinear", antialias=True)[0]
+        x = torch.einsum("kc,chw->khw", torch.tensor(self.weights), (x / 255.0) ** 1.5) - 0.4
+        return transformers.BatchFeature({"pixel_values": x[None]}, tensor_type=return_tensors)
+
+
+def given_by(monkeypatch: pytest.MonkeyPatch, processor: Any) -> None:
+    monkeypatch.setattr(transformers.AutoImageProcessor, "from_pretrained", lambda *_, **__: processor)
+
+
+def test_a_processor_that_is_no_gain_and_offset_is_called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec, processor_ = published(tmp_path, "ViTForImageClassification", processor("ViTImageProcessor")), Weighs()
+    given_by(monkeypatch, processor_)
+    model = load_model(spec)
+    assert model.input_size == (SIDE, SIDE) and model.preprocessing.processor is not None
+    network = transformers.AutoModelForImageClassification.from_pretrained(tmp_path)
+    library = transformers.pipeline("image-classification", model=network, image_processor=processor_)
+    for one in PICTURES:
+        Image.fromarray(np.asarray(one.mul(255).round(), np.uint8)).save(tmp_path / "one.png")
+        theirs = {found["label"]: found["score"] for found in library(str(tmp_path / "one.png"))}
+        ours = dict(zip(NAMES, model(one)[0].softmax(dim=0).tolist(), strict=True))
+        assert ours == pytest.approx(theirs, abs=1e-4) and max(ours.values()) < 0.99
+    assert_gradient(model)
+    with pytest.raises(InputError, match=r"std: model .* has a processor that does all of this; leave it out"):
+        load_model(spec, std=0.5)
+
+
+def assert_gradient(model: Model) -> None:
+    """A step along the gradient changes the answer as the gradient says."""
+    x = PICTURES[:1].clone().requires_grad_()
+    gradient = torch.autograd.grad(model(x)[0, 0], x)[0]
+    step = 1e-3 * gradient / gradient.abs().max()
+    with torch.no_grad():
+        seen = (model(x + step)[0, 0] - model(x - step)[0, 0]) / 2.0
+    assert float(seen) == pytest.approx(float((gradient * step).sum()), rel=0.01)
+
+
+def test_a_processor_that_can_be_neither_measured_nor_called_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec = published(tmp_path, "ViTForImageClassification", processor("ViTImageProcessor"))
 
     def bent(picture: Any) -> Any:
@@ -116,13 +166,27 @@ def test_a_processor_that_is_no_gain_and_offset_is_refused(tmp_path: Path, monke
     def patches(picture: Any) -> Any:
         return np.zeros((1, 9, 64))
 
-    cases = ((bent, "something else than a gain"), (mixed, "mixes the channels"), (patches, r"shape \(1, 9, 64\)"))
+    def padded(picture: Any) -> Any:
+        return np.pad(bent(picture) + 1.0, ((0, 0), (0, 0), (0, 4), (0, 4)))
+
+    def rounded(picture: Any) -> Any:
+        if isinstance(picture, Tensor):
+            return picture[None].sqrt()
+        return np.sqrt(np.asarray(picture, np.float64).transpose(2, 0, 1)[None]).round()
+
+    cases = (
+        (bent, "something else than a gain and an offset, and lets no gradient through"),
+        (mixed, "mixes the channels .* and lets no gradient through"),
+        (patches, r"shape \(1, 9, 64\)"),
+        (padded, "pads a square picture"),
+        (rounded, "rounds or answers otherwise where a gradient goes"),
+    )
     for does, text in cases:
 
         def processed(images: Any, does: Callable[[Any], Any] = does, **_: Any) -> Any:
             return {"pixel_values": does(images)}
 
-        monkeypatch.setattr(transformers.AutoImageProcessor, "from_pretrained", lambda *_, **__: processed)
+        given_by(monkeypatch, processed)
         with pytest.raises(ModelError, match=text):
             load_model(spec)
 
@@ -152,6 +216,34 @@ def test_it_finds_objects(tmp_path: Path) -> None:
     assert bool((boxes[:, :2] <= boxes[:, 2:]).all())
     assert scores.shape == (5, 3)
     assert 0.0 <= float(scores.min()) <= float(scores.max()) <= 1.0
+
+
+class Asked(nn.Module):
+    """A network of transformers in a module of one's own, which answers with the library's own output."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> Any:
+        return self.network(pixel_values=x)
+
+
+def test_the_output_of_a_detector_is_read_as_the_library_reads_it(tmp_path: Path) -> None:
+    more = {"image_size": [SIDE, SIDE], "num_detection_tokens": 5}
+    prepared = processor("YolosImageProcessor")
+    published(tmp_path, "YolosForObjectDetection", prepared, **more)
+    network = transformers.YolosForObjectDetection.from_pretrained(tmp_path)
+    model = load_model(Asked(network), input_size=SIDE, labels=NAMES, read=Detection(iou=0.5).reader)
+    task = Detection(suppression=1.0, confidence=1e-6).on(model)
+    with torch.no_grad():
+        answer = network(pixel_values=PICTURES[:1].permute(0, 3, 1, 2))
+        theirs = prepared.post_process_object_detection(answer, threshold=0.0, target_sizes=[(SIDE, SIDE)])[0]
+    ours: Any = task.judge(model(PICTURES[:1]), Place((0,), (0, 0, SIDE, SIDE), (SIDE, SIDE)))[0].payload
+    best = int(theirs["scores"].argmax())
+    (found,) = [one for one in ours["found"] if one["score"] == round(float(theirs["scores"][best]), 3)]
+    assert found["label"] == NAMES[int(theirs["labels"][best])]
+    assert found["box"] == [pytest.approx(x, abs=0.06) for x in theirs["boxes"][best].tolist()]
 
 
 def test_names_that_are_no_heads_at_the_end(tmp_path: Path) -> None:
@@ -185,6 +277,25 @@ def test_other_kinds_are_named(tmp_path: Path) -> None:
 def test_a_folder_that_is_not_there_is_no_repository(spec: str) -> None:
     with pytest.raises(ModelError, match="no such folder; a repository is written hf:OWNER/NAME"):
         load_model(spec)
+
+
+def test_a_folder_with_nearly_that_name_is_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise OSError("We couldn't connect to the hub")
+
+    (tmp_path / "some" / "folder").mkdir(parents=True)
+    (tmp_path / "some" / "model.safetensors").touch()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelError, match=r"no such folder \(did you mean 'hf:some/folder'\?\); a repository is"):
+        load_model("hf:./some/folderr")
+    monkeypatch.setattr(transformers.utils, "cached_file", away)
+    meant = r"some/folderr is no folder here \(did you mean 'hf:some/folder'\?\), and no repository of that name"
+    with pytest.raises(ModelError, match=meant):
+        load_model("hf:some/folderr")
+    with pytest.raises(ModelError, match=r"model hf:another: another is no folder here, and no repository .*connect"):
+        load_model("hf:another")
+    with pytest.raises(ModelError, match="is a file; give the folder in which it is"):
+        load_model("hf:some/model.safetensors")
 
 
 def test_it_never_unpickles(tmp_path: Path) -> None:
@@ -223,8 +334,14 @@ class OfTimm(nn.Module):
         self.num_classes, self.pretrained_cfg = classes, {"label_names": list(NAMES)}
         self.head = nn.Linear(3, max(classes, 8))
 
+    def forward_features(self, x: Tensor) -> Tensor:
+        return x.mean(dim=(2, 3))
+
+    def forward_head(self, x: Tensor, pre_logits: bool = False) -> Tensor:
+        return x if pre_logits else self.head(x)
+
     def forward(self, x: Tensor) -> Tensor:
-        answer: Tensor = self.head(x.mean(dim=(2, 3)))
+        answer = self.forward_head(self.forward_features(x))
         return answer[:, : self.num_classes] if self.num_classes else answer
 
 
@@ -254,6 +371,10 @@ def test_a_repository_of_timm_goes_to_timm(tmp_path: Path, timm: list[str]) -> N
 def test_a_network_of_timm_from_python_brings_its_own(timm: list[str]) -> None:
     model = load_model(OfTimm())
     assert (model.labels, model.preprocessing.mean, model.input_size) == (NAMES, (0.4,) * 3, (SIDE, SIDE))
-    with pytest.raises(ModelError, match=r"OfTimm: has no classes \(num_classes is 0\): it answers with features"):
+    with pytest.raises(ModelError, match=r"is a network without a head \(num_classes is 0\), .* use `task=similarity`"):
         load_model(OfTimm(0))
+    assert load_model(OfTimm(0), task=Similarity())(PICTURES).shape == (2, 8)
+    before = load_model(OfTimm(), task=Similarity())
+    assert before.labels == ()
+    torch.testing.assert_close(before(PICTURES), (PICTURES.mean(dim=(1, 2)) - 0.4) / 0.2)
     assert timm == [] and timm_networks.of_network(nn.Linear(3, 3)) is None

@@ -110,6 +110,8 @@ def torchvision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     library.models.segmentation, library.models.detection = object(), object()
     names = {library.models: ["tiny_net", "vgg11"], library.models.segmentation: ["tiny_pixels"]}
     names[library.models.detection] = ["tiny_rcnn", "tiny_fcos", "tiny_ssd"]
+    library.models.video, library.models.quantization = object(), object()
+    names |= {library.models.video: ["tiny_3d"], library.models.quantization: ["quantized_tiny_net"]}
     library.models.list_models = lambda module: names.get(module, [])
     library.models.get_model = get_model
     library.models.get_model_weights = lambda name: types.SimpleNamespace(
@@ -170,6 +172,18 @@ def test_what_a_library_unpickles_is_refused(torchvision: Any, tmp_path: Path) -
 def test_torchvision_has_no_such_network(torchvision: Any) -> None:
     with pytest.raises(UnknownNameError, match=r"unknown torchvision network 'tinynet'. Did you mean 'tiny_net'"):
         load_model("torchvision:tinynet")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("tiny_3d", "is made for videos, .* name a network for pictures"),
+        ("quantized_tiny_net", "is quantised: .* name torchvision:tiny_net, which it was made of"),
+    ],
+)
+def test_what_torchvision_has_beside_is_named(torchvision: Any, name: str, text: str) -> None:
+    with pytest.raises(ModelError, match=f"model torchvision:{name}: {text}"):
+        load_model(f"torchvision:{name}")
 
 
 @pytest.fixture

@@ -31,6 +31,16 @@ def test_a_box_frames_the_pixels_that_it_says() -> None:
     assert not where(drawn, TRUE).any()
 
 
+def test_maps_stand_beside_the_picture_in_one_range() -> None:
+    """That of what is true, which comes first; what is no number is black."""
+    true, said = torch.tensor([[0.0, 1.0], [2.0, 4.0]]), torch.tensor([[4.0, 8.0], [-1.0, torch.nan]])
+    drawn = marked(GREY, [Mark("near", False, map=said), Mark("near", True, map=true)])
+    assert drawn.shape == (SMALLEST, 3 * SMALLEST, 3) and float(np.abs(drawn[:, :SMALLEST] - 0.5).max()) < 0.01
+    columns = [SMALLEST * panel + 192 + 128 * side for panel in (1, 2) for side in (0, 1)]
+    assert drawn[192, columns, 0].tolist() == pytest.approx([0.0, 0.25, 1.0, 1.0], abs=0.01)
+    assert drawn[320, columns, 0].tolist() == pytest.approx([0.5, 1.0, 0.0, 0.0], abs=0.01)
+
+
 def test_what_is_true_is_written_below_and_both_can_be_seen() -> None:
     box = (16.0, 24.0, 48.0, 56.0)
     drawn = marked(GREY, [Mark("cup", True, box=box), Mark("cup 0.76", False, box=box)])
@@ -108,7 +118,7 @@ def test_what_a_model_does_in_words(task: str, label: str, does: str, doing: str
 
 
 def test_margins_and_objectives_in_words() -> None:
-    assert len({margin_text(task) for task in ("classification", "detection", "segmentation", "yaw")}) == 4
+    assert len({margin_text(task) for task in ("classification", "detection", "segmentation", "depth", "yaw")}) == 5
     assert len({marks_text(task) for task in ("detection", "segmentation", "yaw")}) == 3
     assert wanted("vanish", "this mug") == "makes the model miss this mug"
     assert wanted("displace", "this mug") == "makes the model see this mug elsewhere"

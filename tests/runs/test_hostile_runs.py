@@ -76,6 +76,8 @@ STORES: dict[str, Callable[[Path], object]] = {
     "values that are bytes": statement("UPDATE evaluations SET values_json = x'ff00'"),
     "a payload that is no JSON": statement("UPDATE evaluations SET payload_json = '{'"),
     "a payload that is nested": statement(f"UPDATE evaluations SET payload_json = '{'[' * 100_000}'"),
+    "metrics that are no numbers": statement('UPDATE evaluations SET metrics_json = \'{"light": "much"}\''),
+    "metrics that are no mapping": statement("UPDATE evaluations SET metrics_json = '[1]'"),
     "a payload that is bytes": statement("UPDATE evaluations SET payload_json = x'ff00'"),
     "a step that is text": statement("UPDATE evaluations SET step = 'one' WHERE id = 1"),
     "an objective that is text": statement("UPDATE evaluations SET objective = 'much'"),

@@ -262,7 +262,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
     with sqlite3.connect(path) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(FileFormatError, match=r"expected version 7 of the results, got 99; use a newer advsearch"):
+    with pytest.raises(FileFormatError, match=r"expected version 8 of the results, got 99; use a newer advsearch"):
         Store(path)
 
 
@@ -700,8 +700,8 @@ def filled(run: RunDirectory) -> Store:
 
 
 COLUMNS = [
-    "id", "kind", "step", "seed", "spp", "objective", "score", "success", "correct", "margin", "label", "label_index",
-    "probability", "payload",
+    "id", "kind", "step", "phase", "seed", "spp", "objective", "score", "success", "correct", "margin",
+    "label", "label_index", "probability", "payload",
     "pose.yaw [degrees]", "camera.target[0] [sizes]", "camera.target[1] [sizes]", "backdrop.which",
     "renders", "machine", "seconds", "time",
 ]  # fmt: skip

@@ -30,6 +30,7 @@ def made() -> Surfaces:
         names=("ground", "object"),
         id=torch.tensor([[2, 0]]),
         depth=torch.tensor([[1.5, torch.inf]]),
+        z_depth=torch.tensor([[1.4, torch.inf]]),
         normal=torch.tensor([[[0.0, 0.6, 0.8], [0.0, 0.0, 0.0]]]),
         uv=torch.tensor([[[0.25, 0.75], [0.0, 0.0]]]),
         face=torch.tensor([[7, 0]]),
@@ -59,11 +60,19 @@ def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tu
     eye = scene.base("camera.to_world")[:3, 3]
     corners = faces[found.face[there]]
     for low, high, value in (
-        (vertices[corners].sub(eye).norm(dim=2).amin(1) - 0.1, vertices[corners].sub(eye).norm(dim=2).amax(1), "depth"),
+        (
+            vertices[corners].sub(eye).norm(dim=2).amin(1) - 2e-3,
+            vertices[corners].sub(eye).norm(dim=2).amax(1),
+            "depth",
+        ),
         (uvs[corners].amin(1), uvs[corners].amax(1), "uv"),
     ):
         at = getattr(found, value)[there]
         assert bool(((at >= low - 1e-4) & (at <= high + 1e-4)).all()), value
+    ahead = scene.base("camera.to_world")[:3, 2]
+    along = (vertices[corners] - eye) @ (ahead / ahead.norm())
+    assert bool(((found.z_depth[there] >= along.amin(1) - 1e-4) & (found.z_depth[there] <= along.amax(1) + 1e-4)).all())
+    assert bool((found.z_depth[there] < found.depth[there]).all()) and bool(found.z_depth[found.id == 0].isinf().all())
     facing = (found.normal[there] * (vertices[corners].mean(1) - eye)).sum(1)
     assert float((facing < 0.0).float().mean()) > 0.9
     nothing = found.id == 0

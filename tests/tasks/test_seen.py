@@ -61,7 +61,7 @@ class Middle(nn.Module):
 
 
 def seen(rows: list[list[int]]) -> Facts:
-    return Facts("mug", look=lambda: Sight(torch.tensor(rows).bool(), torch.tensor(rows).float()))
+    return Facts("mug", look=lambda: Sight(torch.tensor(rows).bool(), *2 * [torch.tensor(rows).float()]))
 
 
 def test_a_box_holds_what_is_seen() -> None:
@@ -73,13 +73,13 @@ def test_a_box_holds_what_is_seen() -> None:
 
 
 def test_without_a_configuration_there_is_nothing_to_see() -> None:
-    for name in ("box", "mask", "depth"):
+    for name in ("box", "mask", "depth", "z_depth"):
         with pytest.raises(InputError, match="needs to see mug, which depends on the configuration; set `varies = Tr"):
             getattr(Facts("mug"), name)
 
 
 def test_the_camera_looks_once_for_all_that_is_seen() -> None:
-    looks = iter([Sight(torch.ones(2, 2).bool(), torch.full((2, 2), 3.0))])
+    looks = iter([Sight(torch.ones(2, 2).bool(), torch.full((2, 2), 3.0), torch.full((2, 2), 2.5))])
     facts = Facts("mug", look=lambda: next(looks))
     assert facts.box == (0, 0, 2, 2) and facts.depth.tolist() == [[3.0, 3.0]] * 2 and bool(facts.mask.all())
 
@@ -160,12 +160,12 @@ class Flat(nn.Module):
 
 def depth_task() -> Any:
     (page,) = (
-        text for text in (DOCS / "extending.md").read_text("utf-8").split("`my_package/")[1:] if text[:6] == "depth."
+        text for text in (DOCS / "extending.md").read_text("utf-8").split("`my_package/")[1:] if text[:9] == "distance."
     )
-    module = types.ModuleType("my_package.depth")
-    sys.modules["my_package.depth"] = module  # where a dataclass looks for its types
+    module = types.ModuleType("my_package.distance")
+    sys.modules["my_package.distance"] = module  # where a dataclass looks for its types
     exec(re.findall(r"```python\n(.*?)```", page, re.S)[0], vars(module))
-    return module.Depth
+    return module.Distance
 
 
 def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> None:
@@ -192,4 +192,4 @@ def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> N
         "measure": "no",
     }
     found = advsearch.attack("banana", model, run=str(tmp_path / "attack"), baseline=False, **attack, **fast)
-    assert found.summary.task == "depth" and found.summary.label_set[0].endswith(" away")
+    assert found.summary.task == "distance" and found.summary.label_set[0].endswith(" away")

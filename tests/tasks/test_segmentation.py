@@ -144,7 +144,7 @@ def test_a_task_learns_names_from_its_model() -> None:
     model = load_model(Mapped(), input_size=4, read=Segmentation().reader, labels=NAMES)
     task = Segmentation().on(model, target="chair")
     assert (task.labels, task.target) == (NAMES, (2,)) and model.differentiable
-    facts = Facts("bottle", None, "bottle", look=lambda: Sight(MASK, torch.ones(MASK.shape)))
+    facts = Facts("bottle", None, "bottle", look=lambda: Sight(MASK, *2 * [torch.ones(MASK.shape)]))
     assert task.truth(facts) == TRUTH and task.truth_names(TRUTH) == ("bottle",)
     with pytest.raises(InputError, match="target: the model has no label 'table'"):
         Segmentation().on(model, target="table")

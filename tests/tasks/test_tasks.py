@@ -24,6 +24,7 @@ from advsearch.models import load_model
 from advsearch.options import as_setting
 from advsearch.tasks import TASKS, Answer, Classification, Facts, Judgement, Task, make_task
 from advsearch.tasks.base import typical
+from advsearch.tasks.together import Together
 
 LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 4.0], [2.0, 2.0, 0.0], [math.nan, 0.0, 1.0]])
 NAMED = Classification(labels=("mug", "bowl", "vase"))
@@ -190,7 +191,7 @@ def test_an_objective_of_another_task_is_refused() -> None:
         InputError, match=r"expected one of task yaw \(score\), got margin, which takes outputs of class"
     ):
         check_objective("margin", "yaw")
-    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, None}
+    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, Together.name, None} - {"answer"}
 
 
 def test_a_model_of_a_task_answers_with_what_the_task_reads() -> None:
@@ -247,10 +248,8 @@ def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch
 
 
 def test_tasks_have_names() -> None:
-    assert (
-        list(TASKS) == ["classification", "detection", "segmentation"]
-        and make_task("classification") == Classification()
-    )
+    assert list(TASKS) == ["classification", "detection", "segmentation", "depth", "similarity", "answer"]
+    assert make_task("classification") == Classification()
     mine = Yaw(tolerance=5.0)
     assert make_task(mine) is mine
     with pytest.raises(UnknownNameError, match="classification"):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,7 +22,7 @@ from advsearch.report.notebook import side_by_side
 from advsearch.report.studies import search_axes, sweep_axes
 from advsearch.report.tables import CurveTable, GapTable
 
-NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
+NOTEBOOK, LOSSES = ROOT / "docs" / "notebook.ipynb", ROOT / "docs" / "own-loss.ipynb"
 
 
 def code() -> list[str]:
@@ -45,9 +47,22 @@ def test_the_notebook_of_the_docs_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         plt.close("all")
 
 
-def test_the_notebook_is_kept_without_outputs() -> None:
-    for cell in json.loads(NOTEBOOK.read_text("utf-8"))["cells"]:
+@pytest.mark.parametrize("notebook", [NOTEBOOK, LOSSES], ids=lambda path: path.stem)
+def test_the_notebook_is_kept_without_outputs(notebook: Path) -> None:
+    for cell in json.loads(notebook.read_text("utf-8"))["cells"]:
         assert not cell.get("outputs") and cell.get("execution_count") is None
+
+
+def test_the_notebook_about_losses_is_its_page() -> None:
+    """Whose blocks run in tests/test_docs.py; run `python docs/make_notebook.py` after a change."""
+    spec = importlib.util.spec_from_file_location("make_notebook", LOSSES.with_name("make_notebook.py"))
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    made = module.notebook()
+    assert json.loads(LOSSES.read_text("utf-8")) == made
+    code = ["".join(cell["source"]) for cell in made["cells"] if cell["cell_type"] == "code"]
+    assert len(code) > 6 and sum(cell.endswith("\nresult") for cell in code) == 6
 
 
 def test_a_search_is_drawn_with_its_best() -> None:

@@ -44,7 +44,9 @@ class SweepResult:
             yield from results.rows(KIND)
 
     def to_pandas(self) -> Any:
-        """Return every configuration as a row of a `pandas.DataFrame`; columns as in an export (docs/runs.md).
+        """Return every configuration as a row of a `pandas.DataFrame`.
+
+        Columns are those of an export (docs/runs.md) under plain names; `attrs["units"]` has the units.
 
         Raises:
             InputError: pandas is not installed.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -15,6 +15,7 @@ from advsearch.described import Value
 from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import PictureSettings, Scene, framed
+from advsearch.engine.metrics import Metrics
 from advsearch.engine.sweeps.axes import Axis, on_grid
 from advsearch.engine.sweeps.points import Drawn, Points
 from advsearch.errors import InputError
@@ -81,6 +82,7 @@ class Job:
         specialise: whether pictures that differ in light alone may be predicted.
         aovs: layers of ground truth that are kept of every picture of the first model (`scene.surfaces.AOVS`).
         surface: whether it is counted which parts of the surface, when seen, go with wrong answers.
+        metrics: numbers of every picture that rows have beside what the task says.
     """
 
     object: str
@@ -105,6 +107,7 @@ class Job:
     specialise: bool = True
     aovs: tuple[str, ...] = ()
     surface: bool = False
+    metrics: Metrics = field(default_factory=dict)
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:

@@ -12,6 +12,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.described import Value
 from advsearch.engine.loading import framed, make_renderer
+from advsearch.engine.metrics import measured
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.light import Shown, SweptLight
 from advsearch.engine.sweeps.points import Picks, Points
@@ -19,7 +20,7 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Judgement, Mark
-from advsearch.tasks.base import Truth
+from advsearch.tasks.base import Output, Truth
 
 Values = dict[str, Value]
 
@@ -174,9 +175,16 @@ class SweptScene:
         with torch.no_grad():
             output = self._job.models[number](pictures)
             if not task.varies:
-                return [_finite(one) for one in task.judge(output, self._truths[number])]
+                truth = self._truths[number]
+                said = [_finite(one) for one in task.judge(output, truth)]
+                return [self._measured(one, k, pictures, output, truth) for k, one in enumerate(said)]
             truths = [self.truth(number, *one) for one in zip(u, values, strict=True)]
-            return [_finite(task.judge(output[k : k + 1], one)[0]) for k, one in enumerate(truths)]
+            said = [_finite(task.judge(output[k : k + 1], one)[0]) for k, one in enumerate(truths)]
+            return [self._measured(said[k], k, pictures, output, one) for k, one in enumerate(truths)]
+
+    def _measured(self, judgement: Judgement, k: int, pictures: Tensor, output: Output, truth: Truth) -> Judgement:
+        """What is said of the picture with the number k among some."""
+        return measured(judgement, self._job.metrics, pictures[k], output[k : k + 1], truth)
 
 
 def _finite(seen: Judgement) -> Judgement:

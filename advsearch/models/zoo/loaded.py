@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from advsearch.models.model import ModelWarning
 from advsearch.models.source import Source, source_of
@@ -56,3 +57,11 @@ class Loaded:
     def source(self, module: nn.Module, **fields: Any) -> Source:
         """Return the source of a module that is given pictures as the network wants them; `fields` go to `Source`."""
         return source_of(module, self.name, **{**self.described, **fields})
+
+
+def in_pixels(boxes: Tensor, images: Tensor) -> Tensor:
+    """Return boxes (N, K, 4), middle and size as shares of images (N, 3, H, W), as corners x0 y0 x1 y1 in pixels."""
+    height, width = images.shape[2:]
+    middle, size = boxes.split(2, dim=-1)
+    corners = torch.cat([middle - size / 2, middle + size / 2], dim=-1)
+    return corners * corners.new_tensor([width, height, width, height])

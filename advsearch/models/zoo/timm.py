@@ -1,17 +1,21 @@
-"""``timm:NAME``: classifiers of PyTorch Image Models."""
+"""``timm:NAME``: classifiers of PyTorch Image Models, and their features."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
 
-from advsearch.errors import ModelError, UnknownNameError
+from advsearch.errors import UnknownNameError
 from advsearch.models.imported import near_names, split_weights
-from advsearch.models.source import Source, load_weights, source_of
+from advsearch.models.source import Purpose, Source, load_weights, source_of
+from advsearch.models.zoo import features
 from advsearch.models.zoo.library import library, reading
+from advsearch.models.zoo.loaded import Loaded
 
 
 def load(spec: str) -> Source:
@@ -56,20 +60,61 @@ def of_network(network: nn.Module) -> Source | None:
     return _source(timm, network, type(network).__name__)
 
 
-def _source(timm: Any, module: Any, name: str) -> Source:
-    if module.num_classes == 0:
-        raise ModelError(
-            f"model {name}: has no classes (num_classes is 0): it answers with features. Give a network with a head"
-        )
-    asked = timm.data.resolve_model_data_config(module)
+def of_wrapped(loaded: Loaded, labels: tuple[str, ...]) -> Source:
+    """Return the source of a network of timm inside one of transformers, whose ``config`` may tell more than timm.
+
+    Args:
+        loaded: of a `TimmWrapperForImageClassification`.
+        labels: that transformers knows; none where it only numbers them.
+    """
+    timm = library("timm", loaded.spec, "timm")
+    network: Any = loaded.network
+    told = getattr(network.config, "pretrained_cfg", None)
+    return _source(timm, network.timm_model, loaded.name, told, labels)
+
+
+def _source(
+    timm: Any, module: Any, name: str, told: Mapping[str, Any] | None = None, labels: tuple[str, ...] = ()
+) -> Source:
+    """Return the source of a network, which is asked for its classes or for its features.
+
+    Args:
+        timm: the library.
+        module: the network.
+        name: what to call it.
+        told: what stands for its ``pretrained_cfg``.
+        labels: names of its classes that go before timm's.
+    """
+    return Source(module, name, finish=partial(_finished, timm, module, name, told, labels))
+
+
+def _finished(
+    timm: Any, module: Any, name: str, told: Mapping[str, Any] | None, labels: tuple[str, ...], purpose: Purpose
+) -> Source:
+    compared = purpose.task == features.TASK
+    if module.num_classes == 0 and not compared:
+        raise features.no_classes(name, "is a network without a head (num_classes is 0)")
+    asked = timm.data.resolve_model_data_config(module, **({"pretrained_cfg": dict(told)} if told else {}))
     return source_of(
-        module,
+        _Headless(module) if compared and module.num_classes else module,
         name,
         input_size=(int(asked["input_size"][1]), int(asked["input_size"][2])),
         mean=tuple(float(number) for number in asked["mean"]),
         std=tuple(float(number) for number in asked["std"]),
-        labels=_labels(timm, module),
+        labels=None if compared else labels or _labels(timm, module),
     )
+
+
+class _Headless(nn.Module):
+    """Features (N, D): what the head of a network of timm reads."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> Tensor:
+        found: Tensor = self.network.forward_head(self.network.forward_features(images), pre_logits=True)
+        return found
 
 
 def _labels(timm: Any, module: Any) -> tuple[str, ...] | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from advsearch.errors import UnknownNameError
+from advsearch.errors import ModelError, UnknownNameError
 from advsearch.models.imported import near_names, split_weights
 from advsearch.models.preprocessing import PRESETS, Triple
 from advsearch.models.source import Source, load_weights, source_of
@@ -25,7 +25,8 @@ def load(spec: str) -> Source:
     normalise by themselves, and resize too: their size is the one that they would resize a square picture to.
 
     Raises:
-        ModelError: torchvision is missing or broken, its weights cannot be had, or those that were given do not fit.
+        ModelError: torchvision is missing or broken, its weights cannot be had, those that were given do not fit, or
+            it is quantised or for videos.
         UnknownNameError: torchvision has no such network.
     """
     name, weights = split_weights(spec.partition(":")[2])
@@ -34,6 +35,7 @@ def load(spec: str) -> Source:
         models.list_models(module=m) for m in (models, models.segmentation, models.detection)
     )
     if name not in (*classifies, *segments, *finds):
+        _check_for_pictures(models, spec, name)
         raise UnknownNameError("torchvision network", name, near_names(name, (*classifies, *segments, *finds)))
     default = getattr(models.get_model_weights(name), "DEFAULT", None)
     parts = {} if name in classifies else {"weights_backbone": None}
@@ -45,6 +47,24 @@ def load(spec: str) -> Source:
         return _detector(module, name, default)
     source = source_of(_FromDictionary(module) if name in segments else module, name)
     return _with_defaults(source, default, module if name in classifies else None)
+
+
+NOT_FOR_PICTURES = {
+    "video": "is made for videos, and pictures are what is given here; name a network for pictures, or wrap it in an "
+    "nn.Module that makes a video of each picture and give that from Python",
+    "optical_flow": "compares two pictures of a video, and one at a time is given here; name a network for one picture",
+    "quantization": "is quantised: it rounds as it runs, and no gradient goes through it; name {plain}, which it was "
+    "made of, or give it from Python and search with a policy without gradients, such as nes",
+}
+"""What torchvision's other networks are, by its module, and the way on."""
+
+
+def _check_for_pictures(models: Any, spec: str, name: str) -> None:
+    """Raise a ModelError that says what a network of torchvision is that is none of those which are read."""
+    for part, what in NOT_FOR_PICTURES.items():
+        if name in (models.list_models(module=getattr(models, part)) if hasattr(models, part) else ()):
+            plain = f"torchvision:{name.removeprefix('quantized_')}"
+            raise ModelError(f"model {spec}: {what.format(plain=plain)}")
 
 
 def _detector(module: nn.Module, name: str, default: Any | None) -> Source:

@@ -11,15 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from advsearch.errors import ModelError
+from advsearch.errors import ModelError, resembling
+from advsearch.models.probe import first_line
 from advsearch.models.source import Source
-from advsearch.models.zoo import timm, zero_shot
+from advsearch.models.zoo import depth_maps, features, language, mask_queries, open_vocabulary, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
-from advsearch.models.zoo.loaded import Loaded
+from advsearch.models.zoo.loaded import Loaded, in_pixels
+from advsearch.models.zoo.memory import check_fits
 from advsearch.models.zoo.processors import processor_of
 
 
@@ -30,7 +31,7 @@ class Kind:
     Args:
         ours: whether a network is of it, by the name of its architecture (``DeiTForImageClassificationWithTeacher``)
             and the network or its class.
-        loader: the class of transformers that builds it.
+        loader: the class of transformers that builds it; "" for the architecture itself.
         source: makes the model's source of it.
     """
 
@@ -49,15 +50,15 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `KINDS`.
 
-    One that compares pictures with texts gets its classes from its user (`zero_shot`).
+    One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`, `language`).
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
     image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
-    alone. A repository of timm goes to timm.
+    alone. A repository that timm has saved goes to timm.
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
-            kind, or its processor does what `advsearch.models.preprocessing` can't.
+            kind or larger than the memory, or its processor does what `advsearch.models.preprocessing` can't.
 
     Warns:
         ModelWarning: it has no image processor.
@@ -66,23 +67,25 @@ def load(spec: str) -> Source:
     transformers = library("transformers", spec, "hf")
     if Path(name).is_dir():
         name = str(Path(name).resolve())
+    elif Path(name).is_file():
+        raise ModelError(f"model {spec}: is a file; give the folder in which it is with its config.json")
     elif name.startswith((".", "/", "~")) or name.count("/") > 1:
-        raise ModelError(f"model {spec}: no such folder; a repository is written hf:OWNER/NAME")
+        raise ModelError(f"model {spec}: no such folder{_near_folders(name)}; a repository is written hf:OWNER/NAME")
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
     where = {"revision": revision} if revision else {}
     with reading(spec, ADVICE):
-        _check_not_open_clips(transformers, name, spec, where)
-        told, _ = transformers.PretrainedConfig.get_config_dict(name, **where)
-        if told.get("model_type") == "timm_wrapper":
+        told = _config(transformers, name, spec, where)
+        if told.get("model_type") == "timm_wrapper" and "architectures" not in told:  # which timm itself has saved
             return timm.load_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
-        network, found = getattr(transformers, kind.loader).from_pretrained(
+        check_fits(transformers, name, where, spec)
+        network, found = getattr(transformers, kind.loader or architecture).from_pretrained(
             name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
         )
-        _check_whole(found, spec)
+        _check_whole(network, found, spec)
         processor = processor_of(transformers, name, where)
     part = partial(_part, transformers, spec, name, where)
     return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part))
@@ -127,25 +130,54 @@ def _kind(architecture: str, network: Any, spec: str) -> Kind:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForSemanticSegmentation or ForObjectDetection in it, or one that compares pictures with texts, as CLIPModel. "
-        "Wrap another in an nn.Module whose answer a task can judge, your own too, and give that from Python"
+        "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, one that "
+        "compares pictures with texts, as CLIPModel, one that goes on in words, as LlavaForConditionalGeneration, or "
+        "one that has features, as Dinov2Model. Wrap another in an nn.Module whose answer a task can judge, your own "
+        "too, and give that from Python"
     )
 
 
-def _check_not_open_clips(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> None:
-    """Raise a ModelError for a repository that has the files of open_clip and none of transformers."""
+def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what is in the config.json of a repository or a folder.
+
+    Raises:
+        ModelError: it is neither there nor to be had, or it has the files of open_clip and none of transformers.
+    """
     has = partial(transformers.utils.cached_file, name, _raise_exceptions_for_missing_entries=False, **where)
-    if not has("config.json") and has("open_clip_config.json"):
+    try:
+        if not has("config.json") and has("open_clip_config.json"):
+            raise ModelError(
+                f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
+                "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
+            )
+        told: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(name, **where)[0]
+        return told
+    except OSError as error:
+        if Path(name).is_dir():
+            raise
         raise ModelError(
-            f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
-            "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
-        )
+            f"model {spec}: {name} is no folder here{_near_folders(name)}, and no repository of that name is in the "
+            f"cache or can be had ({first_line(error)})"
+        ) from error
 
 
-def _check_whole(told: Any, spec: str) -> None:
-    """Raise a ModelError where weights are not in the file: they would be random, and others at each load."""
+def _near_folders(name: str) -> str:
+    """Return the question whether a folder with nearly that name is meant; "" if there is none."""
+    place = Path(name).expanduser()
+    there = [one.name for one in place.parent.iterdir() if one.is_dir()] if place.parent.is_dir() else []
+    near = [f"'hf:{place.parent / one}'" for one in resembling(place.name, there)[:3]]
+    return f" (did you mean {' or '.join(near)}?)" if near else ""
+
+
+def _check_whole(network: Any, told: Any, spec: str) -> None:
+    """Raise a ModelError where weights are not in the file: they would be random, and others at each load.
+
+    A pooler that was never trained is left out: what it would read is the first token, and that is taken then.
+    """
     lacking = sorted({*told.get("missing_keys", ()), *(key for key, *_ in told.get("mismatched_keys", ()))})
-    if lacking:
+    if lacking and getattr(network, "pooler", None) and all(str(one).startswith("pooler.") for one in lacking):
+        network.pooler = None
+    elif lacking:
         shown = ", ".join(map(str, lacking[:3])) + (", ..." if len(lacking) > 3 else "")
         raise ModelError(
             f"model {spec}: its files lack {len(lacking)} of the network's weights ({shown}), which would be random. "
@@ -192,10 +224,7 @@ class _Detector(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         answer = self.network(pixel_values=images)
-        height, width = images.shape[2:]
-        middle, size = answer.pred_boxes.split(2, dim=-1)
-        corners = torch.cat([middle - size / 2, middle + size / 2], dim=-1)
-        boxes = corners * corners.new_tensor([width, height, width, height])
+        boxes = in_pixels(answer.pred_boxes, images)
         if answer.logits.shape[-1] > self.classes:
             return boxes, answer.logits.softmax(dim=-1)[..., :-1]
         return boxes, answer.logits.sigmoid()
@@ -208,9 +237,14 @@ def _with_names(make: Callable[[Any], nn.Module]) -> Callable[[Loaded], Source]:
 
 KINDS = (
     Kind(
+        _called("TimmWrapperForImageClassification"),
+        "AutoModelForImageClassification",
+        lambda loaded: timm.of_wrapped(loaded, names_of(loaded.network.config)),
+    ),
+    Kind(
         _called("ForImageClassification"),
         "AutoModelForImageClassification",
-        _with_names(_Classifier),
+        features.also(_with_names(_Classifier)),
     ),
     Kind(
         _called("ForSemanticSegmentation"),
@@ -218,10 +252,31 @@ KINDS = (
         _with_names(_Segmenter),
     ),
     Kind(
+        mask_queries.is_ours,
+        "AutoModelForUniversalSegmentation",
+        lambda loaded: mask_queries.source(loaded, names_of(loaded.network.config) or None),
+    ),
+    Kind(
+        lambda architecture, network: open_vocabulary.finds(architecture),
+        "AutoModelForZeroShotObjectDetection",
+        open_vocabulary.source,
+    ),
+    Kind(
         _called("ForObjectDetection"),
         "AutoModelForObjectDetection",
         _with_names(_Detector),
     ),
-    Kind(lambda architecture, network: zero_shot.compares(network), "AutoModel", zero_shot.source),
+    Kind(language.speaks, "AutoModelForImageTextToText", language.source),
+    Kind(
+        _called("ForDepthEstimation"),
+        "AutoModelForDepthEstimation",
+        depth_maps.source,
+    ),
+    Kind(
+        lambda architecture, network: zero_shot.compares(network),
+        "AutoModel",
+        features.also(zero_shot.source, reads_text=True),
+    ),
+    Kind(features.answers_with_features, "", features.source),
 )
 """Every kind that is read, the particular ones first."""

@@ -39,11 +39,7 @@ def source(loaded: Loaded) -> Source:
         ModelError: it takes patches in place of pictures.
     """
     network = loaded.network
-    if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
-        raise ModelError(
-            f"model {loaded.spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a "
-            "checkpoint of a fixed resolution, such as hf:google/siglip2-base-patch16-224"
-        )
+    check_takes_pictures(network, loaded.spec)
     tokenizer, described = loaded.part("AutoTokenizer"), loaded.described
     side = getattr(getattr(network.config, "vision_config", None), "image_size", None)
     if "input_size" not in described and isinstance(side, int):
@@ -53,32 +49,37 @@ def source(loaded: Loaded) -> Source:
     )
 
 
-def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
-    """Return the classifier of these names.
+def check_takes_pictures(network: Any, spec: str) -> None:
+    """Raise a ModelError for a network that takes patches in place of pictures; `spec` is for the message."""
+    if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
+        raise ModelError(
+            f"model {spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a "
+            "checkpoint of a fixed resolution, such as hf:google/siglip2-base-patch16-224"
+        )
 
-    The weights of a name are its texts: one of each prompt, embedded, normalised, averaged, and normalised again
-    (Radford et al. 2021, arXiv 2103.00020, section 3.1.4).
-    """
+
+def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
+    """Return the classifier of these names."""
     names = purpose.named(name, "compares a picture with texts")
     prompts = patterns(purpose.prompts)
     if len(names) < 2:
         raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
-    spoken, alone = _spoken(names), hasattr(network, "logit_bias")
+    words, alone = spoken(names), hasattr(network, "logit_bias")
     try:
         with torch.no_grad():
             network = sharing_copy(network).eval()
             scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
-            each = [_embedded(network, tokenizer, [one.replace("{}", word) for word in spoken]) for one in prompts]
-            head = nn.Linear(each[0].shape[1], len(names))
-            head.weight.copy_(scale.float() * functional.normalize(torch.stack(each).mean(dim=0), dim=-1))
+            rows = averaged(network, tokenizer, words, prompts)
+            head = nn.Linear(rows.shape[1], len(names))
+            head.weight.copy_(scale.float() * rows)
             head.bias.copy_(network.logit_bias.float() if alone else torch.zeros(()))
             compared = _Compared(network, head.to(network.device))
-            _check(network, compared, tokenizer, prompts[0].replace("{}", spoken[0]), described, name)
+            _check(network, compared, tokenizer, prompts[0].replace("{}", words[0]), described, name)
     except (InputError, ModelError):
         raise
     except Exception as error:  # any network may raise anything
         raise ModelError(f"model {name}: cannot embed the names of `labels` ({first_line(error)})") from error
-    _say_what_is_one(tokenizer, [prompts[0].replace("{}", word) for word in spoken], names, name)
+    say_what_is_one(tokenizer, [prompts[0].replace("{}", word) for word in words], names, name)
     if alone:
         warnings.warn(
             f"model {name} judges each name by itself, with a sigmoid of its logit: the scores that are shown are a "
@@ -89,7 +90,7 @@ def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose
     return source_of(compared, name, labels=names, dtype=network.dtype, **described)
 
 
-def _spoken(names: Sequence[str]) -> list[str]:
+def spoken(names: Sequence[str]) -> list[str]:
     """Return what stands for each name in a text: of synonyms with commas between them the first, if that is one's."""
     first = [one.partition(",")[0].strip() or one for one in names]
     return [short if first.count(short) == 1 else name for short, name in zip(first, names, strict=True)]
@@ -109,6 +110,15 @@ def _encoded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Mapping[str,
     given = tokenizer(list(texts), padding=padding, max_length=most, truncation=True, return_tensors="pt")
     taken = inspect.signature(network.forward).parameters
     return {key: value.to(network.device) for key, value in given.items() if key in taken}
+
+
+def averaged(network: Any, tokenizer: Any, words: Sequence[str], prompts: Sequence[str]) -> Tensor:
+    """Return one row (words, features) of length 1 for each word: its text in each prompt, embedded and averaged.
+
+    They are normalised before and after (Radford et al. 2021, arXiv 2103.00020, section 3.1.4).
+    """
+    each = [_embedded(network, tokenizer, [one.replace("{}", word) for word in words]) for one in prompts]
+    return functional.normalize(torch.stack(each).mean(dim=0), dim=-1)
 
 
 def _embedded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Tensor:
@@ -158,7 +168,7 @@ def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, describ
         )
 
 
-def _say_what_is_one(tokenizer: Any, texts: Sequence[str], names: Sequence[str], name: str) -> None:
+def say_what_is_one(tokenizer: Any, texts: Sequence[str], names: Sequence[str], name: str) -> None:
     """Warn of names that are the same to the network: in another case, say, or of words that it does not know."""
     seen: dict[tuple[int, ...], int] = {}
     for number, tokens in enumerate(tokenizer(list(texts), verbose=False)["input_ids"]):

@@ -18,8 +18,8 @@ import OpenEXR
 
 from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
+from advsearch.pictures import LARGEST_PIXELS, check_pixels
 from advsearch.scene.importing.files import damaged, looks_like, shown
-from advsearch.scene.importing.images import LARGEST_PIXELS, check_pixels
 
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from advsearch.pictures import FORMATS
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.gltf_buffers import Buffers
@@ -23,7 +24,6 @@ from advsearch.scene.importing.gltf_entries import (
     Sampler,
     TextureUse,
 )
-from advsearch.scene.importing.images import FORMATS
 from advsearch.scene.importing.normal_maps import normal_map
 from advsearch.scene.importing.pictures import Kind, Pictures
 from advsearch.scene.importing.references import References

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +11,7 @@ import numpy.typing as npt
 from PIL import Image
 from scipy import sparse
 
-from advsearch import files
-from advsearch.errors import FileFormatError
+from advsearch.pictures import check_decodable, opened, steps_of
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import LARGEST_FILE
 
@@ -23,37 +20,7 @@ Floats = npt.NDArray[np.float32]
 TEXTURE_LIMIT = 1024
 """Longest side of an imported texture, in texels; larger ones are averaged down."""
 
-FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
-"""Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs other programs."""
-
-LARGEST_PIXELS = 1 << 26
-"""Pixels that a picture may have (8192 x 8192), before `advsearch.files.scaled`; decoded they take 4 bytes each."""
-
-MOST_SCANS = 64
-"""Scans of a progressive JPEG, each of which takes as long to decode as a picture of its own; usual are ten."""
-
 _BAND = 1 << 22  # pixels of a large picture that are averaged at a time
-
-
-@contextlib.contextmanager
-def without_pillows_limit() -> Iterator[None]:
-    """Let Pillow open, but not decode, pictures of any size: what is decoded is up to `check_pixels`."""
-    kept, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
-        yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = kept
-
-
-def check_pixels(path: Path | str, width: int, height: int, limit: int = LARGEST_PIXELS) -> None:
-    """Refuse a picture with too many pixels before it is decoded.
-
-    Raises:
-        FileFormatError: it has more than `limit`, before `advsearch.files.scaled`.
-    """
-    if width * height > files.scaled(limit):
-        expected = f"a picture of at most {files.scaled(limit):,} pixels"
-        raise files.too_large(path, expected, f"{width} x {height}")
 
 
 def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = False) -> Floats:
@@ -62,15 +29,8 @@ def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = F
     Raises:
         FileFormatError: it is missing, no ordinary file, no picture, too large or damaged.
     """
-    try:
-        data = files.read_bytes(path, "a picture file such as PNG", LARGEST_FILE)
-        with warnings.catch_warnings(), without_pillows_limit():
-            warnings.simplefilter("ignore")  # of odd metadata
-            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                return display_image(image, limit, path, raw=raw)
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
-        reason = getattr(error, "strerror", None) or "one that cannot be read"
-        raise FileFormatError(f"{path}: expected a picture file such as PNG, got {reason}; check the path") from error
+    with opened(path, LARGEST_FILE) as image:
+        return display_image(image, limit, path, raw=raw)
 
 
 def display_image(
@@ -98,26 +58,22 @@ def display_image(
         FileFormatError: too many pixels, or a format that is not one of `FORMATS`.
         OSError, ValueError, SyntaxError: the file's pixels are truncated or damaged.
     """
+    check_decodable(image, path)
     width, height = image.size
-    check_pixels(path, width, height)
-    if image.format not in (None, "MPO", *FORMATS):  # an MPO is a JPEG with a second picture
-        raise FileFormatError(f"{path}: expected a picture such as PNG or JPEG, got {image.format}; convert it")
-    if image.format in ("JPEG", "MPO") and _scans(image) > files.scaled(MOST_SCANS):
-        raise files.too_large(path, f"a JPEG of at most {files.scaled(MOST_SCANS)} scans", f"{_scans(image)}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large pictures and odd metadata
         image.load()
         scale = 1.0 if limit is None else limit / max(height, width)
         display: Floats = np.arange(256, dtype=np.float32) / np.float32(255.0)
         if scale >= 1.0:
-            return np.asarray(display[_steps(image, alpha=alpha)])
+            return np.asarray(display[steps_of(image, alpha=alpha)])
         target = max(1, round(height * scale)), max(1, round(width * scale))
         linear = display if raw else srgb_to_linear(display)
 
         weighted = not raw and (alpha or image.has_transparency_data)
 
         def band(top: int, end: int) -> Floats:
-            steps = _steps(image.crop((0, top, width, end)), alpha=weighted)
+            steps = steps_of(image.crop((0, top, width, end)), alpha=weighted)
             colors, share = linear[steps[:, :, :3]], display[steps[:, :, 3:]]
             return np.concatenate([colors, share, colors * share] if weighted else [colors], axis=2)
 
@@ -128,31 +84,6 @@ def display_image(
         if weighted:
             colors = np.where(share > 0.0, averaged[:, :, 4:] / np.maximum(share, 1e-9), colors)
         return np.concatenate([linear_to_srgb(colors), share] if alpha else [linear_to_srgb(colors)], axis=2)
-
-
-def _scans(image: Image.Image) -> int:
-    """Return how many scans of an opened JPEG are still to be decoded."""
-    file = getattr(image, "fp", None)
-    if file is None:
-        return 0
-    place = file.tell()
-    file.seek(0)
-    count = int(file.read().count(b"\xff\xda"))
-    file.seek(place)
-    return count
-
-
-def _steps(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
-    """Return the (H, W, 3) colours of a decoded picture in 8 bits; with alpha, (H, W, 4)."""
-    if image.mode == "F" or image.mode.startswith("I"):  # grey in floats or 16 bits
-        grey = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(1.0 if image.mode == "F" else 65535.0)
-        steps: npt.NDArray[np.uint8] = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(np.uint8)
-        steps = steps[:, :, None].repeat(3, axis=2)
-    else:
-        steps = np.asarray(image.convert("RGBA" if alpha or "transparency" in image.info else "RGB"))
-    if alpha and steps.shape[2] == 3:
-        steps = np.concatenate([steps, np.full_like(steps[:, :, :1], 255)], axis=2)
-    return steps if alpha else steps[:, :, :3]
 
 
 def banded_average(band: Callable[[int, int], Floats], size: tuple[int, int], target: tuple[int, int]) -> Floats:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from advsearch.pictures import without_pillows_limit
 from advsearch.scene.importing.gltf_parts import read_gltf
-from advsearch.scene.importing.images import without_pillows_limit
 from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.ply import read_ply
 from advsearch.scene.importing.stl import read_stl

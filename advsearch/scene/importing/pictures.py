@@ -13,8 +13,9 @@ from PIL import Image
 
 from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_pixels
 from advsearch.scene.importing.files import shown
-from advsearch.scene.importing.images import FORMATS, LARGEST_PIXELS, TEXTURE_LIMIT, check_pixels, display_image
+from advsearch.scene.importing.images import TEXTURE_LIMIT, display_image
 from advsearch.scene.importing.references import plain_name
 
 Floats = npt.NDArray[np.float32]

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
+from advsearch.pictures import check_pixels
 from advsearch.scene.importing.files import damaged, looks_like, shown
-from advsearch.scene.importing.images import check_pixels
 
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]

@@ -29,10 +29,12 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
     pixel = dr.arange(mi.UInt32, count)
     place = mi.Point2f((pixel % width + 0.5) / width, (pixel // width + 0.5) / height)
     ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
-    eye = mi.Point3f(ray.o)
+    to_world = sensor.world_transform()
+    eye = to_world @ mi.Point3f(0.0)  # rays begin at the near clipping plane
+    ahead = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
     active = dr.full(mi.Bool, True, count)
     number, face = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
-    depth = dr.full(mi.Float, dr.inf, count)
+    depth, z_depth = dr.full(mi.Float, dr.inf, count), dr.full(mi.Float, dr.inf, count)
     normal, uv = dr.zeros(mi.Normal3f, count), dr.zeros(mi.Point2f, count)
     shapes = scene.shapes()
     while dr.any(active):
@@ -48,6 +50,7 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
             number[seen & (hit.shape == mi.ShapePtr(shape))] = mi.UInt32(place_of)
         face[seen] = hit.prim_index
         depth[seen] = dr.norm(hit.p - eye)
+        z_depth[seen] = dr.dot(hit.p - eye, ahead)
         normal[seen] = mi.Normal3f(hit.sh_frame.n)
         uv[seen] = mi.Point2f(hit.uv.x, 1.0 - hit.uv.y)  # Mitsuba's rows of a texture begin at the top
         ray, active = hit.spawn_ray(ray.d), passes
@@ -56,6 +59,7 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
         names=tuple(shape.id() for shape in shapes),
         id=number.torch().reshape(size).long().cpu(),
         depth=depth.torch().reshape(size).cpu(),
+        z_depth=z_depth.torch().reshape(size).cpu(),
         normal=torch.stack([one.torch().reshape(size).cpu() for one in normal], dim=-1),
         uv=torch.stack([one.torch().reshape(size).cpu() for one in uv], dim=-1),
         face=face.torch().reshape(size).long().cpu(),

@@ -1,0 +1,74 @@
+"""`load_run`: the answer of a run from its folder, as the call that asked had it."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.api.attack import parts_in
+from advsearch.engine.attack_result import AttackResult
+from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.files import read_bytes
+from advsearch.report.tables import CurveTable, GapTable
+from advsearch.runs.answer import read_answer
+from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
+from advsearch.runs.images import read_png
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.summary import read_result
+from advsearch.scene.importing.exr import read_exr
+from advsearch.scene.importing.files import LARGEST_FILE
+
+
+def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
+    """Return the answer of a run from its folder, of the type that the function of its question returns.
+
+    An attack's is an `AttackResult`, a sweep's a `SweepResult`, `gap`'s a `GapTable`, and so on; of several epsilons or
+    models, which only a command attacks, it is the table of them. `search` of a loaded attack is None: `rows("search")`
+    has its steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
+
+    Args:
+        run: its name, which stands for runs/NAME, or its folder.
+
+    Raises:
+        UnknownNameError: there is no such run.
+        FileFormatError: it has not ended, or its files are damaged.
+    """
+    path = find_run(run)
+    result = read_result(path)
+    if isinstance(result, AttackSummary):
+        return _attack(path, result)
+    if isinstance(result, SweepSummary):
+        return SweepResult(result, path)
+    for plain, table in ((GapResult, GapTable), (CurveResult, CurveTable)):
+        if isinstance(result, plain):
+            return table.of(result)
+    return result
+
+
+def _attack(path: Path, summary: AttackSummary) -> AttackResult:
+    clean, adversarial = (
+        torch.from_numpy(read_png(path / IMAGES / f"{name}.png")) for name in ("clean", "adversarial")
+    )
+    return AttackResult(
+        summary=summary,
+        run=path,
+        u=torch.from_numpy(read_answer(path)),
+        clean=clean,
+        adversarial=adversarial,
+        artifacts={one.stem: _layer(one) for one in sorted((path / ARTIFACTS).glob("*.exr"))},
+        search=None,
+        parts=cache(partial(parts_in, path)),
+    )
+
+
+def _layer(path: Path) -> Tensor:
+    """What a control handed over, (h, w, 3) float32."""
+    planes, _ = read_exr(path, read_bytes(path, "a picture of a run", LARGEST_FILE))
+    return torch.from_numpy(np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1))

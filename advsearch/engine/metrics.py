@@ -1,0 +1,154 @@
+"""Numbers of one's own for every picture: what `metrics` of a run names, beside what its task says."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from importlib import import_module
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError
+from advsearch.registry import check_import, current_directory_importable
+from advsearch.runs.export import AFTER, OWN
+from advsearch.tasks import Judgement
+from advsearch.tasks.base import Output, Truth, mean
+
+Metric = Callable[[Tensor, Any, Any], Any]
+"""f(image, output, truth), which returns a number, or numbers by name."""
+
+Metrics = Mapping[str, Metric]
+"""Metrics by the names of their columns."""
+
+MAIN = "__main__"
+"""The script that runs, which workers on this machine import too."""
+
+
+def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
+    """Return metrics as a file names them: "package.module:function"; one that cannot be named, by its bare name.
+
+    Raises:
+        InputError: one is no function, or its name is that of a column that rows have already.
+    """
+    if not isinstance(metrics, Mapping) or not all(isinstance(name, str) for name in metrics):
+        raise InputError(f"metrics: expected a mapping from names to functions, got {metrics!r:.80}")
+    for name, function in metrics.items():
+        if name in (*OWN, *AFTER) or not name:
+            raise InputError(f"metrics: {name!r} is a column that rows have already; choose another name")
+        if not (callable(function) or isinstance(function, str)):
+            raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {function!r:.80}")
+    return {name: one if isinstance(one, str) else _text(one) for name, one in metrics.items()}
+
+
+def _text(metric: Metric) -> str:
+    module, name = getattr(metric, "__module__", None), getattr(metric, "__qualname__", None)
+    found: Any = sys.modules.get(str(module))
+    for part in str(name).split("."):
+        found = getattr(found, part, None)
+    return f"{module}:{name}" if found is metric else str(getattr(metric, "__name__", type(metric).__name__))
+
+
+def only_here(settings: Mapping[str, str]) -> list[str]:
+    """Return the metrics, by name, that no file can name."""
+    return [name for name, text in settings.items() if ":" not in text or text.startswith(f"{MAIN}:")]
+
+
+def check_shared(settings: Mapping[str, str]) -> None:
+    """Refuse metrics that workers could not import.
+
+    Raises:
+        InputError: there is one.
+    """
+    notebook = not hasattr(sys.modules[MAIN], "__file__")
+    for name, text in settings.items():
+        if ":" not in text or (notebook and text.startswith(f"{MAIN}:")):
+            raise InputError(
+                f"metrics: {name}: workers import a metric by its name, and {text.rpartition(':')[2]} has none that "
+                "they could; write it as a function of a module, or leave `workers` and `cluster` out"
+            )
+
+
+def load_metrics(settings: Mapping[str, str], given: Mapping[str, str | Metric] | None = None) -> Metrics:
+    """Return the functions that settings name.
+
+    Args:
+        settings: "package.module:function" by name of the column.
+        given: functions that are there already, in their place.
+
+    Raises:
+        InputError: one cannot be imported, or must not be (`registry.only_named_code`).
+    """
+    return {
+        name: one if callable(one := (given or {}).get(name)) else _imported(name, text)
+        for name, text in settings.items()
+    }
+
+
+def _imported(name: str, text: str) -> Metric:
+    module, colon, attribute = text.partition(":")
+    if not colon or not attribute:
+        raise InputError(f"metrics: {name}: expected package.module:function, got {text!r}")
+    check_import(text)
+    try:
+        with current_directory_importable():
+            found: Any = import_module(module)
+            for part in attribute.split("."):
+                found = getattr(found, part)
+    except Exception as error:  # the user's code may raise anything
+        raise InputError(
+            f"metrics: {name}: {text} cannot be imported ({type(error).__name__}: {error}); a module is looked for on "
+            f"the Python path and in {os.getcwd()}"
+        ) from error
+    if not callable(found):
+        raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {found!r:.80}")
+    metric: Metric = found
+    return metric
+
+
+def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth) -> Judgement:
+    """Return the judgement of a picture with what metrics say of it.
+
+    Args:
+        judgement: of the task.
+        metrics: by name.
+        image: (H, W, 3) sRGB in [0, 1].
+        output: of the model, of one picture.
+        truth: as the task has it.
+
+    Raises:
+        InputError: a metric returns something else than numbers.
+    """
+    if not metrics:
+        return judgement
+    found: dict[str, float | None] = {}
+    with torch.no_grad():
+        for name, metric in metrics.items():
+            said = metric(image.detach(), output[0], truth)
+            if isinstance(said, Mapping):
+                found |= {f"{name}.{key}": _number(f"{name}.{key}", one) for key, one in said.items()}
+            else:
+                found[name] = _number(name, said)
+    return replace(judgement, metrics=found)
+
+
+def mean_metrics(judgements: Sequence[Judgement | None]) -> dict[str, float | None] | None:
+    """Return the mean of each metric over pictures of which it is a number; None where there are no metrics."""
+    each = [one.metrics for one in judgements if one is not None and one.metrics is not None]
+    names = dict.fromkeys(name for metrics in each for name in metrics)
+    numbers = {name: [one for metrics in each if (one := metrics.get(name)) is not None] for name in names}
+    return {name: mean(found) if found else None for name, found in numbers.items()} or None
+
+
+def _number(name: str, said: Any) -> float | None:
+    try:
+        number = float(said)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(
+            f"metrics: {name}: expected a number, or a dict from names to numbers, got {said!r:.80}"
+        ) from None
+    return number if math.isfinite(number) else None

@@ -1,0 +1,147 @@
+"""Losses for an objective or a loop of one's own, ready to be added up: `advsearch.losses`.
+
+    def smooth(logits, images, labels, texture):
+        return losses.margin(logits, labels) - 10.0 * losses.total_variation(texture)
+
+Those of logits are **maximised**: they rise as the answer gets worse, or nearer to a target. Each takes logits (N, C)
+and labels: (N,) int64, one right answer for each picture, or the indices of a label set of which every answer is right.
+Each is an objective by itself: `attack("mug", objective=losses.log_odds)`. Those of colours are a **cost**, which is
+subtracted. All return (N,) and are differentiable; formulas and sources stand in `advsearch.attacks.logit_objectives`
+and `advsearch.engine.print_terms`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from advsearch.attacks import logit_objectives as of_logits
+from advsearch.engine import print_terms
+from advsearch.errors import InputError
+
+__all__ = [
+    "carlini_wagner",
+    "cross_entropy",
+    "dlr",
+    "log_odds",
+    "margin",
+    "non_printability",
+    "targeted_carlini_wagner",
+    "targeted_cross_entropy",
+    "targeted_dlr",
+    "targeted_log_odds",
+    "targeted_margin",
+    "total_variation",
+]
+
+Labels = Tensor | Sequence[int]
+"""(N,) int64, the right answer of each picture; or indices, each of which is right for all pictures."""
+
+
+# ---- of logits (N, C), to be maximised ------------------------------------------------------------------------------
+
+
+def margin(logits: Tensor, labels: Labels) -> Tensor:
+    """The largest wrong logit minus the largest right one, (N,): over 0 exactly where the answer is wrong."""
+    return _by_label(of_logits.margin, logits, labels)
+
+
+def targeted_margin(logits: Tensor, target: Labels) -> Tensor:
+    """The largest logit of the target minus the largest other one, (N,): over 0 exactly where the answer is there."""
+    return _by_label(of_logits.targeted_margin, logits, target)
+
+
+def carlini_wagner(logits: Tensor, labels: Labels, *, confidence: float = 0.0) -> Tensor:
+    """`margin`, but no more than a confidence: beyond it, other terms alone are followed (Carlini and Wagner 2017, f_6
+    with its hinge)."""
+    return margin(logits, labels).clamp(max=confidence)
+
+
+def targeted_carlini_wagner(logits: Tensor, target: Labels, *, confidence: float = 0.0) -> Tensor:
+    """`targeted_margin`, but no more than a confidence; see `carlini_wagner`."""
+    return targeted_margin(logits, target).clamp(max=confidence)
+
+
+def cross_entropy(logits: Tensor, labels: Labels) -> Tensor:
+    """Minus the logarithm of the probability of the right answers, (N,), in nats; that of torch for one right answer,
+    but with a gradient where the model is sure."""
+    return _by_label(of_logits.cross_entropy, logits, labels)
+
+
+def targeted_cross_entropy(logits: Tensor, target: Labels) -> Tensor:
+    """The logarithm of the probability of the target, (N,), in nats."""
+    return _by_label(of_logits.targeted_cross_entropy, logits, target)
+
+
+def log_odds(logits: Tensor, labels: Labels) -> Tensor:
+    """The log-odds of a wrong answer over all classes, (N,)."""
+    return _by_label(of_logits.log_odds, logits, labels)
+
+
+def targeted_log_odds(logits: Tensor, target: Labels) -> Tensor:
+    """The log-odds of the target, (N,)."""
+    return _by_label(of_logits.targeted_log_odds, logits, target)
+
+
+def dlr(logits: Tensor, labels: Labels) -> Tensor:
+    """`margin` over a distance between logits, (N,): difference of logits ratio (Croce and Hein 2020, section 4)."""
+    return _by_label(of_logits.dlr, logits, labels)
+
+
+def targeted_dlr(logits: Tensor, target: Labels) -> Tensor:
+    """`targeted_margin` over a distance between logits, (N,) (Croce and Hein 2020, section 4)."""
+    return _by_label(of_logits.targeted_dlr, logits, target)
+
+
+# ---- of colours (N, h, w, 3), a cost --------------------------------------------------------------------------------
+
+
+def total_variation(colors: Tensor) -> Tensor:
+    """Mean length of the step from a pixel to its right and lower neighbours, by channel, (N,), in sRGB.
+
+    After Sharif et al. 2016, section 5.2.2, whose sum over pixels is a mean here, so that a weight means the same at
+    every resolution.
+
+    Args:
+        colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of which only pixels with a last
+            channel over 0 count.
+    """
+    return torch.stack([print_terms.variation(one) for one in _pictures(colors)])
+
+
+def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
+    """Mean Euclidean distance in sRGB of the pixels from the nearest colour that can be printed, (N,).
+
+    After the non-printability score of Sharif et al. 2016, section 5.2.3, which is a product of distances to all
+    printable colours: it is zero at the same colours.
+
+    Args:
+        colors: as for `total_variation`.
+        palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the 125 of `printable`.
+    """
+    return torch.stack([print_terms.off_print(one, palette) for one in _pictures(colors)])
+
+
+# ---- parts ----------------------------------------------------------------------------------------------------------
+
+
+def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
+    """A loss of a label set; row by row where rows have different right answers."""
+    if not isinstance(labels, Tensor):
+        return loss(logits, logits, tuple(labels))
+    each = [(int(one),) for one in labels.flatten()]
+    if len(each) not in (1, len(logits)):
+        raise InputError(f"labels: expected {len(logits)}, one for each row of logits, got {len(each)}")
+    if len(set(each)) == 1:
+        return loss(logits, logits, each[0])
+    return torch.cat([loss(row[None], row[None], label) for row, label in zip(logits, each, strict=True)])
+
+
+def _pictures(colors: Tensor) -> Tensor:
+    if colors.ndim == 3:
+        return colors[None]
+    if colors.ndim != 4 or colors.shape[-1] not in (3, 4):
+        raise InputError(f"colors: expected (N, h, w, 3), got {tuple(colors.shape)}")
+    return colors

@@ -1,0 +1,412 @@
+"""Networks that read a picture and a text and go on in words, as LLaVA and Qwen-VL do.
+
+They are classifiers of names that are given, or answer freely.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from advsearch.errors import InputError, ModelError
+from advsearch.models.model import ModelWarning
+from advsearch.models.probe import first_line
+from advsearch.models.source import Purpose, Source, source_of
+from advsearch.models.zoo.loaded import Loaded
+from advsearch.models.zoo.processors import Measured, measured
+from advsearch.models.zoo.zero_shot import spoken
+
+QUESTION = "What is this? Answer with its name only."
+"""What is asked where nothing else is said."""
+
+SIDE = 448
+"""Side in pixels of pictures for networks that take any size: a multiple of 28 and of 32, the cells of Qwen's."""
+
+TOLERANCE = 1e-4
+"""What a log-likelihood may be off from the network's own for the whole text, as a share of itself or of 1."""
+
+LEVELS = 0.05
+"""What values of pixels may be off from the processor's for 8-bit pictures, as a share of the largest: it rounds."""
+
+
+CHECKED = "a coffee mug"
+"""What is read after the prompt to see that a network which answers freely goes on as it reads."""
+
+LARGE = 500_000_000
+"""Weights from which on a run says how many there are, and how long an answer takes."""
+
+
+def speaks(architecture: str, network: Any) -> bool:
+    """Whether a network of transformers, by the name of its architecture, goes on in words after picture and text."""
+    transformers: Any = sys.modules["transformers"]
+    names = transformers.models.auto.modeling_auto.MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING_NAMES
+    return architecture in names.values()
+
+
+def source(loaded: Loaded) -> Source:
+    """Return the source of a network that is finished when names are there, or a free answer is asked for.
+
+    Raises:
+        ModelError: it has an encoder for texts of its own, or its processor can't be had.
+    """
+    if getattr(loaded.network.config, "is_encoder_decoder", False):
+        raise _another(loaded, "answers from an encoder of its own")
+    try:
+        processor = loaded.part("AutoProcessor")
+    except ModelError as error:
+        if importlib.util.find_spec("torchvision") is None:
+            raise ModelError(
+                f"model {loaded.spec}: its processor cannot be loaded, and most of such networks need torchvision for "
+                "that, which is not installed: pip install 'advsearch[torchvision]'"
+            ) from error
+        raise
+    return Source(loaded.network, loaded.name, finish=partial(_asked, loaded, processor), reads_text=True)
+
+
+def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
+    """Return the classifier of these names, or what answers freely."""
+    free, names = purpose.task == "answer", purpose.names
+    if free and names is not None:
+        raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")
+    if not free and (names is None or len(names) < 2):
+        raise InputError(
+            f"labels: expected two names at least, such as mug,cup,bowl, of which model {loaded.name} chooses one, got "
+            f"{'none' if names is None else repr(names[0])}; with `task=answer` it answers freely"
+        )
+    if len(purpose.prompts or ()) > 1:
+        raise InputError(f"prompt: expected one question for model {loaded.name}, got {len(purpose.prompts or ())}")
+    try:
+        text = _written(processor, (purpose.prompts or (QUESTION,))[0])
+        pixels, described = _pictures(loaded, processor, text)
+        reader = _Reader(loaded.network, partial(_inputs, processor, text), pixels)
+        side = described.get("input_size", (SIDE, SIDE))
+        prompt = reader.prompt(side)["input_ids"][0].tolist()
+        tokens = _tokens(processor, text, prompt, names or (CHECKED,), side)
+        _check_length(loaded, len(prompt) + max(purpose.tokens if free else 0, *map(len, tokens)))
+        named = _Named(reader, tokens)
+        module = _Free(reader, processor.tokenizer, _ends(loaded.network), purpose.tokens) if free else named
+        with torch.no_grad():
+            _check(loaded, named, side)
+            seconds = _seconds(module, side)
+    except (InputError, ModelError):
+        raise
+    except Exception as error:  # any network may raise anything
+        raise ModelError(
+            f"model {loaded.spec}: is a {type(loaded.network).__name__}, which can't be asked about a picture as LLaVA "
+            f"can ({first_line(error)})"
+        ) from error
+    if names is not None:
+        _say_what_begins_another(tokens, names, loaded.name)
+    weights = list(loaded.network.parameters())
+    if (count := sum(one.numel() for one in weights)) >= LARGE:
+        size = sum(one.nbytes for one in weights)
+        warnings.warn(
+            f"model {loaded.name} has {count / 1e9:.3g} billion weights, {size / 1e9:.3g} GB, and took {seconds:.2g} s "
+            "to answer one picture here; a gradient takes longer",
+            ModelWarning,
+            stacklevel=4,
+        )
+    return source_of(module, loaded.name, labels=names, batch_limits=(1, 1), **described)
+
+
+# ---- picture and prompt ---------------------------------------------------------------------------------------------
+
+
+def _written(processor: Any, question: str) -> str:
+    """Return the question with a place for the picture, as the network was trained on it: by its chat template."""
+    if getattr(processor, "chat_template", None):
+        content = [{"type": "image"}, {"type": "text", "text": question}]
+        text: str = processor.apply_chat_template([{"role": "user", "content": content}], add_generation_prompt=True)
+        return text
+    return f"{getattr(processor, 'image_token', None) or ''}{question}"
+
+
+def _inputs(processor: Any, text: str, picture: Any, **options: Any) -> dict[str, Tensor]:
+    """Return what the processor makes of a picture and a text, without what is for training."""
+    with warnings.catch_warnings():  # of how the library reads arrays
+        warnings.simplefilter("ignore")
+        given = processor(images=[picture], text=[text], return_tensors="pt", **options)
+    return {key: value for key, value in given.items() if isinstance(value, Tensor) and key != "labels"}
+
+
+Pixels = Callable[[Tensor], Tensor]
+
+
+def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measured]:
+    """Return what makes ``pixel_values`` of a picture (3, H, W), and what `advsearch.models.preprocessing` does before.
+
+    An affine map is measured and left to that. What cuts a picture into patches or tiles is called itself, which is
+    differentiable where the processor works with torchvision.
+
+    Raises:
+        ModelError: it does neither, or something else to values than to 8-bit pictures.
+    """
+    described, side = Measured(), _side(loaded.network.config)
+    with suppress(ModelError):  # it is called then
+        described = measured(lambda **given: processor(text=[text], **given), loaded.spec)
+    if "mean" in described:
+        described["input_size"] = described.get("input_size", side)
+        pixels: Pixels = _alone
+    elif importlib.util.find_spec("torchvision") is None:
+        raise ModelError(
+            f"model {loaded.spec}: its processor cuts pictures into patches or tiles, and lets gradients through with "
+            "torchvision only, which is not installed: pip install 'advsearch[torchvision]'"
+        )
+    else:
+        described, pixels = Measured(input_size=side), partial(_called, processor, text)
+    _check_pixels(loaded, processor, text, pixels, described)
+    return pixels, described
+
+
+def _side(config: Any) -> tuple[int, int]:
+    side = getattr(getattr(config, "vision_config", None), "image_size", None) or SIDE
+    height, width = side if isinstance(side, (list, tuple)) else (side, side)
+    return int(height), int(width)
+
+
+def _alone(image: Tensor) -> Tensor:
+    return image[None]
+
+
+def _called(processor: Any, text: str, image: Tensor) -> Tensor:
+    return _inputs(processor, text, image.float(), do_rescale=False)["pixel_values"]
+
+
+def _check_pixels(loaded: Loaded, processor: Any, text: str, pixels: Pixels, described: Measured) -> None:
+    """Raise a ModelError where a picture of slopes arrives otherwise than from 8-bit values by the processor."""
+    height, width = described["input_size"]
+    down, across = torch.linspace(0, 200, height)[:, None], torch.linspace(0, 200, width)
+    levels = torch.stack([(down + 0 * across), (across + 0 * down), (down + across) / 4 + 100]).round()
+    theirs = _inputs(processor, text, np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy()))["pixel_values"]
+    image = levels / 255.0
+    if "mean" in described:
+        mean, std = (image.new_tensor(described[key]).view(3, 1, 1) for key in ("mean", "std"))
+        image = ((image if described["channels"] == "RGB" else image.flip(0)) - mean) / std
+    ours = pixels(image)
+    off = float((ours - theirs).abs().max()) if ours.shape == theirs.shape else float("inf")
+    if not off <= LEVELS * float(theirs.abs().max()):
+        raise ModelError(
+            f"model {loaded.spec}: its processor {type(processor).__name__} does something else to numbers than to "
+            "8-bit pictures. Wrap network and processing in an nn.Module of yours, and give that from Python"
+        )
+
+
+# ---- names ----------------------------------------------------------------------------------------------------------
+
+
+def _tokens(
+    processor: Any, text: str, prompt: Sequence[int], names: Sequence[str], side: tuple[int, int]
+) -> list[list[int]]:
+    """Return the tokens of each name where it follows the prompt, with a blank between them unless one is there.
+
+    They are those that the whole text has more than the prompt; where it does not begin with the prompt's, as a
+    processor may end a text with a line's end, those of the name alone.
+    """
+    tokenizer = processor.tokenizer
+    gap = "" if text[-1:].isspace() or prompt[-1] in tokenizer.all_special_ids else " "
+    grey = np.full((*side, 3), 128, np.uint8)
+    begun = tokenizer(text, verbose=False)["input_ids"]
+    found: list[list[int]] = []
+    for name in spoken(names):
+        whole = tokenizer(f"{text}{gap}{name}", verbose=False)["input_ids"]
+        if not found:  # whether what the processor adds stands before or behind
+            asked = _inputs(processor, f"{text}{gap}{name}", grey)["input_ids"][0].tolist()
+            joined = asked[: len(prompt)] == list(prompt)
+        follows = joined and whole[: len(begun)] == begun
+        tokens = whole[len(begun) :] if follows else tokenizer(name, add_special_tokens=False)["input_ids"]
+        if not tokens:
+            raise InputError(f"labels: expected names that the network has tokens for, got {name!r}")
+        found.append(tokens)
+    return found
+
+
+def _check_length(loaded: Loaded, count: int) -> None:
+    most = getattr(loaded.network.config.get_text_config(), "max_position_embeddings", None)
+    if isinstance(most, int) and count > most:
+        raise InputError(
+            f"prompt: expected picture, prompt and name to have at most {most} tokens for model {loaded.name}, "
+            f"got {count}"
+        )
+
+
+def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[str], name: str) -> None:
+    """Warn of a name whose tokens begin another's: its likelihood is that of both."""
+    for first, short in enumerate(tokens):
+        for second, long in enumerate(tokens):
+            if first != second and list(long[: len(short)]) == list(short):
+                warnings.warn(
+                    f"model {name} reads {names[first]!r} (#{first}) as the beginning of {names[second]!r} "
+                    f"(#{second}): whoever says the second has said the first",
+                    ModelWarning,
+                    stacklevel=5,
+                )
+                return
+
+
+# ---- the network ----------------------------------------------------------------------------------------------------
+
+
+class _Reader(nn.Module):
+    """A network that reads a picture and a prompt, and goes on."""
+
+    def __init__(self, network: nn.Module, inputs: Callable[..., dict[str, Tensor]], pixels: Pixels) -> None:
+        super().__init__()
+        self.network, self._inputs, self._pixels = network, inputs, pixels
+        taken = inspect.signature(network.forward).parameters
+        self.cache = "cache" if "cache" in taken else "past_key_values"  # its older name
+        self._prompts: dict[tuple[int, int], dict[str, Tensor]] = {}
+
+    def prompt(self, side: tuple[int, int]) -> dict[str, Tensor]:
+        """Return what the network is given beside the values of a picture of (height, width) pixels, and grey ones."""
+        if side not in self._prompts:
+            self._prompts[side] = self._inputs(np.full((*side, 3), 128, np.uint8))
+        return self._prompts[side]
+
+    def given(self, image: Tensor) -> dict[str, Tensor]:
+        """Return what the network is given for a picture (3, H, W).
+
+        Raises:
+            ValueError: it is for pictures of another size.
+        """
+        height, width = image.shape[1:]
+        prompt, pixels = self.prompt((height, width)), self._pixels(image)
+        if pixels.shape != prompt["pixel_values"].shape:
+            expected = tuple(prompt["pixel_values"].shape)
+            raise ValueError(f"expected values of shape {expected}, got {tuple(pixels.shape)}")
+        placed = next(self.network.parameters())
+        given = {key: value.to(placed.device) for key, value in prompt.items()}
+        return {**given, "pixel_values": pixels.to(placed.device, placed.dtype)}
+
+    def begin(self, image: Tensor) -> tuple[Tensor, Any]:
+        """Return the logits (tokens,) float32 of what follows picture and prompt, and the keys and values so far.
+
+        Raises:
+            ValueError: the network keeps none.
+        """
+        answer = self.network(**self.given(image), use_cache=True)
+        past = answer.get(self.cache)
+        if past is None:
+            raise ValueError("it keeps no keys and values of what it has read")
+        return answer.logits[0, -1].float(), past
+
+    def go_on(self, tokens: Tensor, past: Any) -> Tensor:
+        """Return the logits (N, L, tokens) float32 of what follows each of N x L tokens; `past` is of one picture."""
+        past.batch_repeat_interleave(len(tokens))
+        logits: Tensor = self.network(input_ids=tokens, use_cache=True, **{self.cache: past}).logits.float()
+        return logits
+
+
+class _Named(nn.Module):
+    """Logits (N, names): the log-likelihood of each name after picture and prompt, summed over its tokens.
+
+    Picture and prompt are read once. What begins a name (all of its tokens but the last) is read after it, once for all
+    names that begin so, and all such beginnings at once: names of one token need nothing more.
+    """
+
+    def __init__(self, reader: _Reader, tokens: Sequence[Sequence[int]]) -> None:
+        super().__init__()
+        self.reader, self.tokens = reader, [list(one) for one in tokens]
+        begun = {tuple(one[:-1]) for one in tokens if len(one) > 1}
+        stems = sorted(one for one in begun if not any(other[: len(one)] == one for other in begun - {one}))
+        length, most = max(map(len, stems), default=0), max(map(len, tokens))
+        self.register_buffer("stems", torch.tensor([[*one, *[0] * (length - len(one))] for one in stems]).long())
+        rows = torch.zeros((len(tokens), most), dtype=torch.long)
+        columns, counts = torch.zeros_like(rows), torch.zeros_like(rows)
+        for number, one in enumerate(tokens):
+            stem = next((k for k, stem in enumerate(stems) if stem[: len(one) - 1] == tuple(one[:-1])), 0)
+            for place, token in enumerate(one):
+                rows[number, place] = 1 + stem * length + place - 1 if place else 0
+                columns[number, place], counts[number, place] = token, 1
+        for key, value in (("rows", rows), ("columns", columns), ("counts", counts)):
+            self.register_buffer(key, value)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return torch.stack([self._scores(image) for image in images])
+
+    def _scores(self, image: Tensor) -> Tensor:
+        first, past = self.reader.begin(image)
+        kept = (self.get_buffer(key).to(first.device) for key in ("stems", "rows", "columns", "counts"))
+        stems, rows, columns, counts = kept
+        likely = first.log_softmax(dim=-1)[None]
+        if len(stems):
+            likely = torch.cat([likely, self.reader.go_on(stems, past).log_softmax(dim=-1).flatten(0, 1)])
+        return (likely[rows, columns] * counts).sum(dim=1)
+
+
+class _Free(nn.Module):
+    """What is said of each picture, `advsearch.tasks.answers.Said`: the likeliest token after the other."""
+
+    def __init__(self, reader: _Reader, tokenizer: Any, ends: frozenset[int], most: int) -> None:
+        super().__init__()
+        self.reader, self.tokenizer, self.ends, self.most = reader, tokenizer, ends, most
+
+    def forward(self, images: Tensor) -> list[dict[str, Any]]:
+        return [self._said(image) for image in images]
+
+    def _said(self, image: Tensor) -> dict[str, Any]:
+        logits, past = self.reader.begin(image)
+        steps, tokens = [logits], [int(logits.argmax())]
+        while tokens[-1] not in self.ends and len(tokens) < self.most:
+            steps.append(self.reader.go_on(logits.new_tensor([tokens[-1:]], dtype=torch.long), past)[0, -1])
+            tokens.append(int(steps[-1].argmax()))
+        text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
+        return {"text": text, "logits": torch.stack(steps), "begins": self.begins}
+
+    def begins(self, word: str) -> list[int]:
+        """Return the tokens that begin a word, in small letters or with a capital, after a blank or without one."""
+        found: set[int] = set()
+        for form in {word, word.capitalize(), f" {word}", f" {word.capitalize()}"}:
+            numbers = self.tokenizer(form, add_special_tokens=False)["input_ids"]
+            found.update([one for one in numbers if self.tokenizer.decode([one]).strip()][:1])
+        return sorted(found - {self.tokenizer.unk_token_id})
+
+
+def _ends(network: Any) -> frozenset[int]:
+    """Return the tokens that end an answer."""
+    said = network.generation_config.eos_token_id
+    return frozenset(said if isinstance(said, (list, tuple)) else [said]) - {None}
+
+
+def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
+    """Raise a ModelError where the network itself finds the longest name otherwise likely, read with the prompt."""
+    reader, number = module.reader, max(range(len(module.tokens)), key=lambda one: len(module.tokens[one]))
+    image = torch.rand((3, *side), generator=torch.Generator().manual_seed(0))
+    given, name = reader.given(image), torch.tensor(module.tokens[number], device=loaded.network.device)
+    whole = {**given, "input_ids": torch.cat([given["input_ids"], name[None]], dim=1)}
+    for key, value in given.items():
+        if key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
+            # 1 is the picture in most, but what is to be said in PaliGemma, which marks nothing before
+            kind = 1 if key == "attention_mask" or (key == "token_type_ids" and not value.any()) else 0
+            whole[key] = torch.cat([value, torch.full_like(name, kind)[None]], dim=1)
+    logits = loaded.network(**whole).logits
+    if logits.shape[1] != whole["input_ids"].shape[1]:
+        raise _another(loaded, "answers with logits of another length than the text has")
+    likely = logits[0, -len(name) - 1 : -1].float().log_softmax(dim=-1)
+    own, ours = float(likely.gather(1, name[:, None]).sum()), float(module(image[None])[0, number])
+    size = max(TOLERANCE, 8.0 * torch.finfo(loaded.network.dtype).eps) * max(1.0, abs(own))
+    if not abs(own - ours) <= size:
+        raise _another(loaded, f"goes on otherwise after what it has kept ({ours:.6g} for {own:.6g})")
+
+
+def _seconds(module: nn.Module, side: tuple[int, int]) -> float:
+    begun = time.perf_counter()
+    module(torch.zeros((1, 3, *side)))
+    return time.perf_counter() - begun
+
+
+def _another(loaded: Loaded, what: str) -> ModelError:
+    return ModelError(
+        f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; expected one that goes on with the "
+        "text it is given, such as LlavaForConditionalGeneration or Qwen2_5_VLForConditionalGeneration"
+    )

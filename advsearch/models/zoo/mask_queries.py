@@ -1,0 +1,90 @@
+"""Networks that answer with masks and their classes, as Mask2Former does: segmenters by the class of each pixel."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from advsearch.models.model import SMALLEST_PROBABILITY, ModelWarning
+from advsearch.models.source import Source
+from advsearch.models.zoo.loaded import Loaded
+
+OURS = re.compile(r"(Mask2Former|OneFormer|Eomt\w*)ForUniversalSegmentation|MaskFormerForInstanceSegmentation")
+"""The architectures, by name."""
+
+FINE = (384, 384)
+"""Height and width to which transformers brings the masks of every Mask2Former before it adds them up."""
+
+SENTENCE = "the task is semantic"
+"""What OneFormer is told to do."""
+
+
+def is_ours(architecture: str, network: Any) -> bool:
+    """Whether an architecture answers with masks and their classes."""
+    return OURS.fullmatch(architecture) is not None
+
+
+def source(loaded: Loaded, labels: tuple[str, ...] | None) -> Source:
+    """Return the source of a network that answers with masks and their classes.
+
+    Args:
+        loaded: the network.
+        labels: names of its classes.
+
+    Warns:
+        ModelWarning: what its scores are.
+    """
+    warnings.warn(
+        f"model {loaded.name} gives a pixel a score of each class, summed over its masks, which is no logit: its "
+        "logarithm is used, so that margins are logarithms of a ratio of scores",
+        ModelWarning,
+        stacklevel=3,
+    )
+    told = None
+    if loaded.network.config.model_type == "oneformer":
+        told = _told(loaded.part("AutoTokenizer"), loaded.network.config.task_seq_len)
+    return loaded.source(_MaskQueries(loaded.network, told), labels=labels)
+
+
+def _told(tokenizer: Any, length: int) -> Tensor:
+    """Return `SENTENCE` as OneFormer reads it, (1, length): numbers of tokens, filled up with 0."""
+    given = tokenizer([SENTENCE], padding="max_length", max_length=length, truncation=True, return_tensors="pt")
+    return torch.as_tensor(given["input_ids"] * given["attention_mask"])
+
+
+class _MaskQueries(nn.Module):
+    """Logarithms of scores (N, classes, H, W) of each pixel of the input.
+
+    The score of a class is the sum over queries of the probability that it is a query's, times the probability that
+    the pixel is in that one's mask (Cheng et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Sizes are
+    changed where `post_process_semantic_segmentation` of each family changes them.
+
+    Args:
+        network: of transformers.
+        told: the task in tokens, (1, L); None of a network that has one task.
+    """
+
+    told: Tensor | None
+
+    def __init__(self, network: Any, told: Tensor | None) -> None:
+        super().__init__()
+        self.network, self.family = network, str(network.config.model_type)
+        self.register_buffer("told", told)
+
+    def forward(self, images: Tensor) -> Tensor:
+        size = (images.shape[2], images.shape[3])
+        tokens = {} if self.told is None else {"task_inputs": self.told.expand(len(images), -1)}
+        answer = self.network(pixel_values=images, **tokens)
+        masks, classes = answer.masks_queries_logits, answer.class_queries_logits.softmax(dim=-1)[..., :-1]
+        if self.family == "mask2former":
+            masks = functional.interpolate(masks, size=FINE, mode="bilinear")
+        elif self.family.startswith("eomt"):
+            masks = functional.interpolate(masks, size=size, mode="bilinear")
+        scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
+        scores = functional.interpolate(scores, size=size, mode="bilinear")
+        return scores.float().clamp_min(SMALLEST_PROBABILITY).log()

@@ -1,0 +1,135 @@
+"""Free answers: whether the text that a model says of a picture has one of the right words in it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypedDict
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.options import FROM_RUN
+from advsearch.tasks.base import Answer, Facts, Task
+
+Words = tuple[str, ...]
+
+SILENCE = "(nothing)"
+"""What an answer without a word is called."""
+
+MOST = 256
+"""Most tokens of an answer."""
+
+
+class Said(TypedDict):
+    """What a model says of one picture.
+
+    Attributes:
+        text: in words.
+        logits: (T, tokens) float32, of all that it could have said at each step; it took the largest.
+        begins: from a word to the numbers of the tokens that may begin it; empty where none does.
+    """
+
+    text: str
+    logits: Tensor
+    begins: Callable[[str], Sequence[int]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeAnswer(Task):
+    """A model's answer has one of the right words in it, as a whole word, in any case.
+
+    The truth is those words. The text alone says whether an answer is right; how nearly, the logits say. Let p be the
+    sigmoid of the lead that tokens which begin such a word have over all others, at the step where it is greatest: the
+    margin is log(1 - p) of a right answer and -log(p) of a wrong one.
+
+    Args:
+        tokens: the most that an answer has.
+
+    Raises:
+        InputError: less than one, or more than `MOST`.
+    """
+
+    name = "answer"
+    varies = True
+
+    tokens: int = 16
+    target: Words | None = field(default=None, metadata=FROM_RUN)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.tokens <= MOST:
+            raise InputError(f"task answer: tokens: expected a whole number from 1 to {MOST}, got {self.tokens!r}")
+
+    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> FreeAnswer:
+        """See `Task.on`: the target is a word, or several with commas between them, of which the answer has one."""
+        if model.read is None:
+            raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="{self.name}"')
+        if target is not None and minimise:
+            raise InputError("minimise: makes the right answer easier to give; leave `target` out")
+        return replace(self, target=None if target is None else _words("target", target), minimise=minimise)
+
+    def read(self, answer: Any, count: int) -> list[Said]:
+        """See `Task.read`: what `Said` describes, for each picture."""
+        keys = Said.__required_keys__
+        if isinstance(answer, (list, tuple)) and all(isinstance(one, Mapping) and keys <= one.keys() for one in answer):
+            return list(answer)
+        raise ValueError("expected a mapping with text, logits and begins for each picture, as answers in words have")
+
+    def check(self, facts: Facts) -> None:
+        """See `Task.check`: something has to be right."""
+        self.truth(facts)
+
+    def truth(self, facts: Facts) -> Words:
+        """Return the right words: what was said, or else the object's own label.
+
+        Raises:
+            InputError: there are none, or one is the target too.
+        """
+        text = facts.own_label if facts.label is None else facts.label
+        if text is None:
+            raise InputError(f"label: expected the right words for {facts.object}, got none")
+        right = _words("label", text)
+        if both := sorted(set(right) & set(self.target or ())):
+            raise InputError(f"target: expected words that are not right answers, got {both}, which `label` has too")
+        return right
+
+    def truth_names(self, truth: Words) -> Words:
+        """Return the right words."""
+        return truth
+
+    def margin(self, output: Sequence[Said], truth: Words) -> Tensor:
+        """See `FreeAnswer`, (N,): over 0 exactly where the text has none of the words."""
+        return torch.stack([_margin(one, truth) for one in output])
+
+    def answers(self, output: Sequence[Said], count: int = 1) -> list[tuple[Answer, ...]]:
+        """Return the text of each picture, in one line without signs that steer a terminal."""
+        shown = ("".join(sign if sign.isprintable() else " " for sign in one["text"]) for one in output)
+        return [(Answer(" ".join(text.split()) or SILENCE),) for text in shown]
+
+
+def _words(setting: str, text: str) -> Words:
+    found = tuple(dict.fromkeys(" ".join(part.split()).casefold() for part in text.split(",") if part.strip()))
+    if not found:
+        raise InputError(f"{setting}: expected words, separated by commas, got {text!r}")
+    return found
+
+
+def has_word(text: str, words: Words) -> bool:
+    """Whether a text has one of some words, or terms of several, in any case; "mug" is no word of "smug"."""
+    text = " ".join(text.split()).casefold()
+    return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)
+
+
+def _margin(one: Said, words: Words) -> Tensor:
+    logits, begin = one["logits"], sorted({number for word in words for number in one["begins"](word)})
+    if not begin:
+        raise InputError(f"label: the model has no token that begins one of {', '.join(words)}; name others")
+    inside = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
+    inside[begin] = True
+    low = -torch.inf
+    lead = (logits.masked_fill(~inside, low).amax(dim=1) - logits.masked_fill(inside, low).amax(dim=1)).max()
+    return functional.logsigmoid(-lead) if has_word(one["text"], words) else -functional.logsigmoid(lead)

@@ -1,0 +1,397 @@
+"""Depth: whether a model judges the object to be as far away as it is.
+
+Models mean the z-depth, the distance along the camera's axis, and so it is what they are compared with. Relative ones
+give it, or its inverse (disparity), up to a scale and a shift, which are found by least squares (Ranftl et al. 2020,
+"Towards robust monocular depth estimation", arXiv 1907.01341, sections 5 and 6). They are found on what is seen beside
+the object, so that the object has no say in how it is judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advsearch.described import NOT_A_NUMBER
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.options import FROM_RUN
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task
+
+DISPARITY, RELATIVE, METRIC = "relative disparity", "relative depth", "metric depth"
+
+KINDS = {
+    DISPARITY: "the inverse of the distance, up to a scale and a shift",
+    RELATIVE: "the distance, up to a scale and a shift",
+    METRIC: "the distance in metres",
+}
+"""What a model's numbers may be."""
+
+AS_FAR, NEARER, FARTHER, GONE = (
+    "as far as it is",
+    "nearer than it is",
+    "farther than it is",
+    "as far as what is behind it",
+)
+OUT_OF_SHAPE = "out of shape"
+
+GOALS = {
+    "nearer": "the object is judged nearer than it is",
+    "farther": "the object is judged farther than it is",
+    "gone": "the object is judged to be as far as what is behind it",
+}
+"""What an attack may be after, by the name of the objective."""
+
+LABELS = {"nearer": NEARER, "farther": FARTHER, "gone": GONE}
+
+FEWEST, SPREAD = 16, 1.1
+"""Pixels beside the object on which scale and shift are found, at least, and how many times as far as the nearest of
+them the farthest is."""
+LARGEST = 100.0
+"""The largest factor by which a pixel counts as too near or too far."""
+
+Map = Mapping[str, Tensor]
+"""What a model answers to one picture: (h, w), by one of `KINDS`, or by "" where it does not say."""
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """What is true of a picture: where the object is seen, and how far everything is.
+
+    Attributes:
+        mask: (H, W) bool, the pixels in which the object is seen.
+        z: (H, W) z-depth in object sizes; infinite where there is nothing.
+    """
+
+    mask: Tensor
+    z: Tensor
+
+    @property
+    def seen(self) -> bool:
+        """Whether there is anything of the object in the picture."""
+        return bool(self.mask.any())
+
+    @cached_property
+    def beside(self) -> Tensor:
+        """What is seen beside the object at a finite distance, (H, W) bool."""
+        return self.z.isfinite() & ~self.mask
+
+    @cached_property
+    def anchored(self) -> bool:
+        """Whether what is beside the object says scale and shift: enough pixels at distances that differ enough."""
+        there = self.z[self.beside]
+        return len(there) >= FEWEST and float(there.max()) >= SPREAD * float(there.min())
+
+    @property
+    def fitted(self) -> Tensor:
+        """Where scale and shift are found, (H, W) bool: beside the object, or in the whole picture where that says
+        nothing."""
+        return self.beside if self.anchored else self.z.isfinite()
+
+    @cached_property
+    def behind(self) -> Tensor:
+        """The disparity of what is behind the object, as far as it can be told, (H, W): NaN where it can't.
+
+        It is that of the nearest pixels beside the object in the same row, in a straight line between both: exact of a
+        plane. What is infinitely far has a disparity of 0.
+        """
+        height, width = self.mask.shape
+        inverse, column = self.z.reciprocal(), torch.arange(width).expand(height, width)
+        left = torch.where(self.mask, -1, column).cummax(dim=1).values
+        right = torch.where(self.mask, width, column).flip(1).cummin(dim=1).values.flip(1)
+        first, last = inverse.gather(1, left.clamp_min(0)), inverse.gather(1, right.clamp_max(width - 1))
+        between = first + (column - left) / (right - left).clamp_min(1) * (last - first)
+        found = torch.where(left < 0, last, torch.where(right == width, first, between))
+        return torch.where((left < 0) & (right == width), math.nan, found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Depth(Task):
+    """A model judges how far the object is: off by a factor of less than 1 + `tolerance`, its pixels' geometric mean.
+
+    Where nothing of the object is seen, every answer is right.
+
+    Args:
+        tolerance: 0.25 for a factor of 1.25, the first threshold of Eigen et al. 2014 (arXiv 1406.2283).
+        kind: of the model's numbers, one of `KINDS`; "" for what the network says.
+        size: of the real object, its longest side in metres, for a model that answers in metres.
+        seek: what an attack is after, one of `GOALS`; "" for any wrong distance.
+        seen_kind: what the network says; "" where it has not yet.
+        missing: what its user has to say before answers can be judged; empty where nothing is missing.
+
+    Raises:
+        InputError: a value that is none of these.
+    """
+
+    name = "depth"
+    labelled = False
+    varies = True
+
+    tolerance: float = 0.25
+    kind: str = ""
+    size: float = 0.0
+    seek: str = ""
+    seen_kind: str = field(default="", metadata=FROM_RUN)
+    missing: str = field(default="", metadata=FROM_RUN)
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("tolerance", 0.0, LARGEST), ("size", -1e-9, 1e6)):
+            value: object = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low < value < high:
+                raise InputError(f"task depth: {name}: expected a number over 0, under {high:g}, got {value!r}")
+        for name, known in (("kind", KINDS), ("seek", GOALS)):
+            if getattr(self, name) not in ("", *known):
+                raise InputError(f"task depth: {name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
+
+    # ---- what is read -----------------------------------------------------------------------------------------------
+
+    def read(self, answer: Any, count: int) -> list[Map]:
+        """Return the map (h, w) of each picture in what a network answered, by what its numbers are.
+
+        Raises:
+            ValueError: there is none.
+        """
+        kind = ""
+        if isinstance(answer, Mapping):
+            kind = next((one for one in KINDS if one in answer), "")
+            answer = answer[kind] if kind else answer.get("predicted_depth", answer.get("depth"))
+        elif hasattr(answer, "predicted_depth"):
+            answer = answer.predicted_depth
+        elif isinstance(answer, (list, tuple)) and answer:
+            answer = answer[0]
+        if isinstance(answer, Tensor) and answer.ndim == 4 and answer.shape[1] == 1:
+            answer = answer[:, 0]
+        if not isinstance(answer, Tensor) or answer.ndim != 3 or len(answer) != count or 0 in answer.shape:
+            raise ValueError(
+                "expected a number for each pixel, (N, height, width) or (N, 1, height, width), or a mapping with "
+                f"these under predicted_depth or {', '.join(KINDS)}"
+            )
+        return [{kind: one} for one in answer.float()]
+
+    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Depth:
+        """See `Task.on`.
+
+        Raises:
+            InputError: the model was loaded for another task or with names of classes, or there is a target.
+        """
+        if model.read is None:
+            raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="depth"')
+        if model.labels:
+            raise InputError("labels: task depth has no classes; leave it out")
+        return super().on(model, target=target, minimise=minimise)
+
+    def seeking(self, objective: str) -> Depth:
+        """See `Task.seeking`: the objectives of depth say what counts as success."""
+        return replace(self, seek=objective) if objective in GOALS else self
+
+    @property
+    def looks(self) -> bool:
+        """See `Task.looks`: at what the network says of its numbers, and at what is beside the object."""
+        return True
+
+    def seeing(self, output: Sequence[Map], truth: Distances | None) -> Depth:
+        """See `Task.seeing`."""
+        kind = self.kind or next(iter(output[0]))
+        return replace(self, seen_kind=kind, missing=self._missing(kind, truth))
+
+    def _missing(self, kind: str, truth: Distances | None) -> str:
+        if not kind:
+            return (
+                f"kind: expected what its numbers are, one of {', '.join(KINDS)}, and its network does not say it; "
+                f"give `task='depth={{kind: {DISPARITY}}}'`, say"
+            )
+        if kind == METRIC and not self.size:
+            return (
+                "size: it answers in metres, and scenes are in object sizes; give the longest side of the real object "
+                "in metres, `task='depth={size: 0.1}'`, say"
+            )
+        if kind != METRIC and truth is not None and truth.seen and not truth.anchored:
+            return (
+                "it answers up to a scale and a shift, which are found on what is seen beside the object: expected "
+                f"{FEWEST} pixels at distances that differ by a factor of {SPREAD:g}, got {int(truth.beside.sum())}; "
+                "give a scene with a ground or a room, and a camera that sees it from the side"
+            )
+        return ""
+
+    @property
+    def unsaid(self) -> str:
+        """See `Task.unsaid`."""
+        return self.missing
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """See `Task.remarks`: how answers are read."""
+        if not self.seen_kind:
+            return ()
+        text = f"The model's numbers are read as {self.seen_kind}: {KINDS[self.seen_kind]}"
+        if self.seen_kind == METRIC:
+            return (f"{text}, of an object of {self.size:g} m.",)
+        return (f"{text}, which are found by least squares on what is seen beside the object.",)
+
+    def check(self, facts: Facts) -> None:
+        """See `Task.check`.
+
+        Raises:
+            InputError: there is a label.
+        """
+        if facts.label is not None:
+            raise InputError("label: task depth has no classes; leave it out")
+
+    def truth(self, facts: Facts) -> Distances:
+        """Return where the object is seen, and how far everything is."""
+        return Distances(facts.mask, facts.z_depth)
+
+    def truth_names(self, truth: Distances) -> tuple[str, ...]:
+        """Return what is right, in words."""
+        return (AS_FAR,)
+
+    # ---- scores -----------------------------------------------------------------------------------------------------
+
+    def margin(self, output: Sequence[Map], truth: Distances) -> Tensor:
+        """Return by how much more than the tolerance the object's distance is off, (N,).
+
+        That is the mean over its pixels of |log(judged / true)|, less log(1 + tolerance).
+        """
+        return self._each(output, truth, lambda factors: factors.abs().mean() - self._bar)
+
+    def score(self, output: Sequence[Map], truth: Distances) -> Tensor:
+        """Return how near each of N outputs is to what is sought, (N,): over 0 where it is a success.
+
+        "nearer" and "farther" take the mean over pixels with its sign. "gone" is the lesser of the margin, and of how
+        far the share of the object's relief that is left lies under a half; see `_relief`.
+        """
+        if self.minimise or not self.seek:
+            margin = self.margin(output, truth)
+            return -margin if self.minimise else margin
+        if self.seek == "gone":
+            return self._each(
+                output, truth, lambda f: torch.minimum(f.abs().mean() - self._bar, 0.5 - self._relief(f, truth))
+            )
+        sign = 1.0 if self.seek == "farther" else -1.0
+        return self._each(output, truth, lambda factors: sign * factors.mean() - self._bar)
+
+    @property
+    def _bar(self) -> float:
+        return math.log1p(self.tolerance)
+
+    def _each(self, output: Sequence[Map], truth: Distances, value: Any) -> Tensor:
+        """A value of the logarithms of factors of the object's pixels, picture by picture, (N,)."""
+        if not truth.seen:
+            return torch.stack([next(iter(one.values())).sum() * 0.0 - 1.0 for one in output])
+        return torch.stack([value(self._factors(one, truth)) for one in output])
+
+    def _factors(self, one: Map, truth: Distances) -> Tensor:
+        """log(judged / true) of each of the object's pixels, (P,); none is larger than `LARGEST`."""
+        judged, inverse = self._judged(one, truth)
+        mask, z = truth.mask.to(judged.device), truth.z.to(judged.device)
+        ratio = judged[mask] * z[mask] if inverse else judged[mask] / z[mask]
+        logarithms = ratio.clamp(1.0 / LARGEST, LARGEST).log()
+        whole = judged.sum() * 0.0  # a number that is none anywhere in the map
+        return (-logarithms if inverse else logarithms) + whole
+
+    def _judged(self, one: Map, truth: Distances) -> tuple[Tensor, bool]:
+        """What the model says of every pixel, (H, W) z-depth in object sizes, or its inverse; and whether that is it.
+
+        A map is brought to the size of the picture as transformers does it in `post_process_depth_estimation`.
+        """
+        ((said, values),) = one.items()
+        kind = self.kind or said
+        size = (truth.mask.shape[0], truth.mask.shape[1])
+        if values.shape != size:
+            values = F.interpolate(values[None, None], size=size, mode="bicubic", align_corners=False)[0, 0]
+        z, at = truth.z.to(values.device), truth.fitted.to(values.device)
+        if kind == METRIC:
+            return values / self.size, False
+        return (_fitted(values, z.reciprocal(), at), True) if kind == DISPARITY else (_fitted(values, z, at), False)
+
+    def _relief(self, factors: Tensor, truth: Distances) -> Tensor:
+        """The share of the object's relief that is left, (): 1 where all is as it is, 0 where it is as far as what is
+        behind it, in disparity, by least squares over its pixels; 1 where nothing is known to be behind it."""
+        mask = truth.mask
+        inverse, behind = truth.z[mask].reciprocal().to(factors), truth.behind[mask].to(factors)
+        known = behind.isfinite()
+        true = (inverse - behind)[known]
+        size = true.square().sum()
+        if float(size) <= 1e-6 * float(inverse.square().sum()):
+            return factors.sum() * 0.0 + 1.0
+        said = (inverse * (-factors).exp() - behind)[known]
+        return (said * true).sum() / size
+
+    # ---- in words ---------------------------------------------------------------------------------------------------
+
+    def answers(self, output: Sequence[Map], count: int = 1) -> list[tuple[Answer, ...]]:
+        """Return between which numbers each map is."""
+        return [(self._range(one),) for one in output]
+
+    def _range(self, one: Map) -> Answer:
+        ((said, values),) = one.items()
+        low, high = (float(end) for end in values.detach().aminmax())
+        if not math.isfinite(low + high):
+            return Answer(NOT_A_NUMBER)
+        return Answer(f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}")
+
+    def judge(self, output: Sequence[Map], truth: Distances) -> list[Judgement]:
+        """See `Task.judge`; the payload has the factor by which the distance is off, what is left of the relief, and
+        where scale and shift were found."""
+        with torch.no_grad():
+            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+            return [
+                Judgement.of(score, margin, *self._said(one, truth, right=margin <= 0.0))
+                for score, margin, one in zip(scores, margins, output, strict=True)
+            ]
+
+    def _said(self, one: Map, truth: Distances, *, right: bool) -> tuple[Answer, Any]:
+        if not truth.seen:
+            return Answer("out of view"), None
+        factors = self._factors(one, truth)
+        mean, relief = float(factors.mean()), float(self._relief(factors, truth))
+        if not math.isfinite(mean):
+            return Answer(NOT_A_NUMBER), None
+        distance = float(truth.z[truth.mask].double().log().mean().exp())
+        payload: dict[str, float | str] = {
+            "distance": round(distance, 4),
+            "judged": round(distance * math.exp(mean), 4),
+            "factor": round(math.exp(float(factors.abs().mean())), 4),
+            "relief": round(relief, 4),
+        }
+        if (self.kind or next(iter(one))) != METRIC:
+            payload["fitted"] = "beside the object" if truth.anchored else "in the whole picture"
+        holds = {"nearer": -mean > self._bar, "farther": mean > self._bar, "gone": relief < 0.5}
+        names = sorted(("gone", "nearer", "farther"), key=lambda name: name != self.seek)
+        wrong = next((LABELS[name] for name in names if holds[name]), OUT_OF_SHAPE)
+        return Answer(AS_FAR if right else wrong), payload
+
+    def marks(self, output: Sequence[Map], truth: Distances) -> list[list[Mark]]:
+        """See `Task.marks`: the object, its pixels of which the distance is right, and the disparity of everything."""
+        found = []
+        for one in output:
+            marks = [Mark("disparity", True, mask=truth.mask, map=truth.z.reciprocal())]
+            if truth.seen and not self._missing(self.kind or next(iter(one)), None):
+                right = torch.zeros_like(truth.mask)
+                right[truth.mask] = (self._factors(one, truth).detach().abs() <= self._bar).to(right.device)
+                judged, inverse = self._judged(one, truth)
+                near = judged if inverse else judged.clamp_min(1.0 / LARGEST).reciprocal()
+                marks.append(Mark("disparity", False, mask=right, map=near.detach().cpu()))
+            found.append(marks)
+        return found
+
+
+def _fitted(values: Tensor, wanted: Tensor, at: Tensor) -> Tensor:
+    """Return a scale times the values plus a shift, the nearest to what is wanted where `at` says, by least squares.
+
+    A scale is not negative: what the model holds for near stays near.
+
+    Args:
+        values, wanted: (H, W).
+        at: (H, W) bool, at least one pixel; `wanted` is finite there.
+    """
+    x, y = values[at], wanted[at]
+    x, y, middle, level = x - x.mean(), y - y.mean(), x.mean(), y.mean()
+    scale = ((x * y).sum() / x.square().sum().clamp_min(1e-20)).clamp_min(0.0)
+    return level + scale * (values - middle)

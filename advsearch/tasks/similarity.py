@@ -1,0 +1,203 @@
+"""Similarity: which reference pictures a network finds nearest, by the cosine of its features.
+
+Networks without classes are used like that: re-identification, search by picture, recognition of faces and products.
+With one folder of reference pictures for each name it is a classification among these names. Without, an answer is
+right where the picture is still the same thing as the clean one to the network.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from advsearch.errors import InputError
+from advsearch.files import JsonValue
+from advsearch.models import Model
+from advsearch.models.zoo.features import PARTS, pooled
+from advsearch.options import FROM_RUN
+from advsearch.tasks.base import Facts, Judgement
+from advsearch.tasks.classes import Labels
+from advsearch.tasks.classification import Classification
+from advsearch.tasks.gallery import Gallery, embedded, folders_of, seen_by
+
+METHODS = ("nearest", "linear")
+"""How features become logits."""
+
+TEMPERATURE = 0.07
+"""What cosines are divided by to be logits (Wu et al. 2018, arXiv 1805.01978, section 4.1; Caron et al. 2021, arXiv
+2104.14294, section 4.1)."""
+
+ITSELF, ELSE = "itself", "something else"
+"""The answers where there is a threshold."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Similarity(Classification):
+    """The object is what the nearest reference pictures show, or what the clean picture shows.
+
+    The output is features (N, D), whatever their length. With `references` the truth is the indices of the right names,
+    and logits (N, names) of them are
+
+    - `nearest`: the mean cosine of the `k` nearest pictures of each name, over `TEMPERATURE`. Each name is judged by
+      pictures of its own, so that one with many has no more votes than one with few, and every name has a gradient.
+      The mean, so that one odd picture decides nothing where `k` is over 1. With 1, the default, an answer is right
+      exactly where the nearest picture of all is.
+    - `linear`: those of a logistic regression on the reference features, of length 1 (`gallery.fitted`).
+
+    With `threshold` they are the cosine to the clean picture's features and the threshold, over `TEMPERATURE`.
+
+    Args:
+        references: a folder with a folder of pictures for each name; "" for none.
+        method: one of `METHODS`.
+        k: how many of the nearest.
+        threshold: cosine from which on a picture is the same as the clean one; None where there are references.
+        gallery: the references as the model sees them.
+        clean: (D,) features of the clean picture, of length 1; None before it was seen.
+
+    Raises:
+        InputError: a value out of range, or options that exclude each other.
+    """
+
+    name = "similarity"
+    reads_logits = False
+    names_from = "its folders"
+
+    references: str = ""
+    method: str = METHODS[0]
+    k: int = 1
+    threshold: float | None = None
+    gallery: Gallery | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)
+    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.method not in METHODS:
+            raise InputError(f"task similarity: method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+        if isinstance(self.k, bool) or not isinstance(self.k, int) or self.k < 1:
+            raise InputError(f"task similarity: k: expected a whole number of at least 1, got {self.k!r}")
+        if self.method == "linear" and self.k != 1:
+            raise InputError("task similarity: k: belongs to `method: nearest`; leave one of the two out")
+        bar = self.threshold
+        if bar is not None and (isinstance(bar, bool) or not isinstance(bar, (int, float)) or not -1.0 < bar < 1.0):
+            raise InputError(f"task similarity: threshold: expected a cosine between -1 and 1, got {bar!r}")
+        if bar is not None and self.references:
+            raise InputError("task similarity: threshold: compares with the clean picture; leave `references` out")
+
+    # ---- what it knows ----------------------------------------------------------------------------------------------
+
+    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Similarity:
+        """See `Task.on`; references are read and shown to the model, once.
+
+        Raises:
+            InputError, FileFormatError: as for `gallery.embedded`; neither references nor a threshold.
+        """
+        if not self.references and self.threshold is None:
+            raise InputError(
+                "task similarity: references: expected a folder with a folder of pictures for each name, or a "
+                "`threshold` of the cosine to the clean picture, got neither; write "
+                "`task='similarity={references: FOLDER}'` or `task='similarity={threshold: 0.8}'`"
+            )
+        if target is not None and not self.references:
+            raise InputError("target: a `threshold` knows no names; give `references` to task similarity")
+        found = super().on(model, target=target, minimise=minimise)
+        if not self.references or (self.gallery is not None and self.gallery.seen_by == seen_by(model)):
+            return found
+        return replace(found, gallery=embedded(self.references, model, linear=self.method == "linear"))
+
+    def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
+        """Those of the folders."""
+        return tuple(name for name, _ in folders_of(self.references)) if self.references else (ITSELF, ELSE), True
+
+    def right_classes(self, facts: Facts) -> Labels:
+        """See `ClassTask.right_classes`; with a threshold the clean picture says what is right."""
+        if self.references:
+            return super().right_classes(facts)
+        if facts.label is not None:
+            raise InputError("label: a `threshold` knows no names, the clean picture is what is right; leave it out")
+        return (0,)
+
+    @property
+    def looks(self) -> bool:
+        """See `Task.looks`."""
+        return not self.references and self.clean is None
+
+    def seeing(self, output: Tensor, truth: Labels | None) -> Similarity:
+        """See `Task.seeing`: the first picture is the clean one."""
+        return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.looks else self
+
+    # ---- features and logits ----------------------------------------------------------------------------------------
+
+    def read(self, answer: Any, count: int) -> Tensor:
+        """Return features (count, D): a tensor, the first of a tuple, or the first of `PARTS` that is there.
+
+        Of `last_hidden_state` that is the first token (CLS); a map is averaged over its positions.
+        """
+        found = pooled(answer[0] if type(answer) in (tuple, list) and answer else answer, token=True)
+        if found is None or found.dim() != 2 or found.shape[0] != count:
+            raise ValueError(f"expected features ({count}, D), or what has one of {', '.join(PARTS)}")
+        return found.float()
+
+    def logits(self, output: Tensor) -> Tensor:
+        """Return logits (N, names) of features (N, D); differentiable."""
+        features = functional.normalize(output, dim=1)
+        if self.gallery is None:
+            if self.clean is None or self.threshold is None:
+                raise InputError("task similarity: expected references, or a clean picture that it was shown first")
+            cosine = features @ self.clean.to(features)
+            scores = torch.stack([cosine, torch.full_like(cosine, self.threshold)], dim=1)
+        elif self.method == "linear":
+            return self.gallery.linear(features)
+        else:
+            scores = self.gallery.nearest(features, self.k)
+        return scores / TEMPERATURE
+
+    def answerable(self, output: Tensor, truth: Labels) -> Tensor:
+        """See `Task.answerable`: the logits."""
+        return super().answerable(self.logits(output), truth)
+
+    # ---- in words ---------------------------------------------------------------------------------------------------
+
+    def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
+        """See `Task.judge`; the payload has the cosine to the clean picture, or what `_ranked` says."""
+        with torch.no_grad():
+            judged, features = super().judge(output, truth), functional.normalize(output, dim=1)
+            if self.gallery is not None:
+                kept = self._ranked(self.gallery, features, self.answerable(output, truth), truth)
+            else:
+                assert self.clean is not None
+                kept = [{"cosine": round(one, 4)} for one in (features @ self.clean.to(features)).tolist()]
+        return [
+            replace(one, payload=payload if math.isfinite(one.margin) else None)
+            for one, payload in zip(judged, kept, strict=True)
+        ]
+
+    def _ranked(self, gallery: Gallery, features: Tensor, logits: Tensor, truth: Labels) -> list[dict[str, JsonValue]]:
+        """Say of each of N pictures where the right one stands.
+
+        Each has the `rank` of the nearest right reference among all (1 where it is the nearest of all) and its
+        `cosine`; `name_rank`, that of the right name by its logit; and the `nearest` reference of all and its cosine.
+        """
+        cosines = gallery.cosines(features)
+        inside = torch.isin(gallery.owners, torch.tensor(truth)).to(cosines.device)
+        best = cosines[:, inside].amax(dim=1)
+        ranks = 1 + (cosines[:, ~inside] > best[:, None]).sum(dim=1)
+        right = torch.isin(torch.arange(logits.shape[1]), torch.tensor(truth)).to(logits.device)
+        names = 1 + (logits[:, ~right] > logits[:, right].amax(dim=1, keepdim=True)).sum(dim=1)
+        top, places = cosines.max(dim=1)
+        rows = zip(*(one.tolist() for one in (ranks, best, names, places, top)), strict=True)
+        return [
+            {
+                "rank": rank,
+                "references": len(gallery.paths),
+                "cosine": round(cosine, 4),
+                "name_rank": name_rank,
+                "nearest": gallery.paths[place],
+                "nearest_cosine": round(nearest, 4),
+            }
+            for rank, cosine, name_rank, place, nearest in rows
+        ]

@@ -1,0 +1,435 @@
+"""The Python interface as somebody guesses it who has not read about it."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import pickle
+import pydoc
+import re
+import sys
+import types
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.api.watching import BarProgress, LineProgress, NotebookProgress, watched
+from advsearch.controls import PoseControl
+from advsearch.engine.attack_result import AttackResult
+from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
+from advsearch.progress import NullProgress
+from advsearch.report.tables import GapTable
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.region import RegionResult
+
+SIDE = 16
+PICTURE: dict[str, Any] = {"resolution": SIDE, "spp": 1, "denoise": "none", "threads": 1}
+FAST: dict[str, Any] = {**PICTURE, "verify_spp": 1, "trials": 6, "measure": "no", "baseline": False, "steps": 4}
+
+
+class Bright(nn.Module):
+    """The first class where a picture is brighter than a threshold, else the second."""
+
+    def __init__(self, threshold: float = 0.2) -> None:
+        super().__init__()
+        self.threshold = nn.Parameter(torch.tensor(threshold))
+
+    def forward(self, images: Tensor) -> Tensor:
+        score = 40.0 * (images.mean(dim=(1, 2, 3)) - self.threshold)
+        return torch.stack([score, -score], dim=1)
+
+
+class Detector(nn.Module):
+    """A box a picture, as torchvision's detectors answer."""
+
+    def forward(self, images: Tensor) -> list[dict[str, Tensor]]:
+        box = torch.tensor([[2.0, 2.0, 14.0, 14.0]])
+        return [{"boxes": box, "scores": image.mean()[None], "labels": torch.tensor([1])} for image in images]
+
+
+class Frame:
+    """What a `pandas.DataFrame` is given."""
+
+    attrs: dict[str, Any]
+
+    def __init__(self, data: list[dict[str, Any]], columns: list[str]) -> None:
+        self.columns = columns
+        self.data = data
+
+    def __getitem__(self, name: str) -> list[Any]:
+        assert name in self.columns
+        return [row[name] for row in self.data]
+
+
+@pytest.fixture
+def pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A table for those who have no pandas."""
+    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=Frame))
+
+
+def red(image: Tensor, output: Tensor, truth: Any) -> float:
+    """A metric that other processes can import."""
+    assert image.shape == (SIDE, SIDE, 3) and output.shape == (2,)
+    return float(image[..., 0].mean())
+
+
+@pytest.fixture(scope="module")
+def scene() -> advsearch.Scene:
+    return advsearch.load_scene("mug")
+
+
+@pytest.fixture(scope="module")
+def model() -> advsearch.Model:
+    return advsearch.load_model(Bright(), labels=["mug", "vase"], input_size=SIDE, name="bright")
+
+
+@pytest.fixture(scope="module")
+def attacked(scene: advsearch.Scene, model: advsearch.Model, tmp_path_factory: pytest.TempPathFactory) -> AttackResult:
+    run = tmp_path_factory.mktemp("guesses") / "run"
+    return advsearch.attack(scene, model, controls="texture", epsilon=1.0, run=run, metrics={"red": red}, **FAST)
+
+
+# ---- a run from its folder ------------------------------------------------------------------------------------------
+
+
+def test_an_attack_comes_back_from_its_folder(attacked: AttackResult) -> None:
+    assert attacked.run is not None
+    loaded = advsearch.load_run(attacked.run)
+    assert isinstance(loaded, AttackResult) and loaded.summary == attacked.summary and loaded.run == attacked.run
+    for name in ("u", "clean", "adversarial"):
+        assert torch.equal(getattr(loaded, name), getattr(attacked, name)), name
+    assert loaded.artifacts.keys() == attacked.artifacts.keys() == {"texture", "texture-original"}
+    assert all(torch.equal(loaded.artifacts[name], one) for name, one in attacked.artifacts.items())
+    assert list(loaded.rows()) == list(attacked.rows()) and repr(loaded) == repr(attacked)
+    with pytest.raises(InputError, match="the model bright: only the Python session that asked has what judges"):
+        loaded.render()
+
+
+def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.Model, tmp_path: Path) -> None:
+    swept = advsearch.sweep(
+        scene, model, {"pose.yaw": np.array([0.0, 90.0])}, run=tmp_path / "sweep", trials=0, **PICTURE
+    )
+    again = advsearch.load_run(tmp_path / "sweep")
+    assert isinstance(again, SweepResult) and again.summary == swept.summary and [*again.rows()] == [*swept.rows()]
+    gap = advsearch.gap(scene, model, controls="pose.yaw", average=6, policy="random", run=tmp_path / "gap", **FAST)
+    again = advsearch.load_run(tmp_path / "gap")
+    assert isinstance(again, GapTable) and again == gap and "PNG" in repr(again._repr_png_())
+    few = {**PICTURE, "samples": 8, "map": 0, "verify_spp": 1}
+    del few["spp"]
+    region = advsearch.region(scene, model, controls="pose.yaw", run=tmp_path / "region", **few)
+    loaded = advsearch.load_run(tmp_path / "region")
+    assert isinstance(loaded, RegionResult) and loaded == region
+    with pytest.raises(UnknownNameError):
+        advsearch.load_run(tmp_path / "none")
+    (tmp_path / "region" / "summary.json").unlink()
+    with pytest.raises(FileFormatError, match="did the run end"):
+        advsearch.load_run(tmp_path / "region")
+
+
+# ---- an answer elsewhere --------------------------------------------------------------------------------------------
+
+
+def test_an_answer_is_rendered_under_another_view(attacked: AttackResult, tmp_path: Path) -> None:
+    same, turned = attacked.render(spp=64), attacked.render(settings={"camera.azimuth": 200.0}, spp=64)
+    texture, plain = attacked.artifacts["texture"], {**PICTURE, "spp": 64}
+    del plain["threads"]
+    painted = advsearch.render("mug", Bright(), texture=texture, **plain)
+    assert torch.allclose(same.views[0].picture, painted.views[0].picture, atol=1.5 / 255.0)
+    assert turned.views[0].azimuth == 200.0 and (turned.views[0].picture - same.views[0].picture).abs().mean() > 0.01
+    elsewhere = attacked.render(scene=advsearch.load_scene("mug", "noon"), resolution=24)
+    assert elsewhere.scene.environment_name == "noon" and elsewhere.views[0].picture.shape == (24, 24, 3)
+    clean = advsearch.render("mug", Bright(), **plain)
+    assert (clean.views[0].picture - same.views[0].picture).abs().max() > 4.0 / 255.0
+    above = attacked.render(camera={"elevation": 80.0}, spp=64).views[0].picture
+    assert (above - same.views[0].picture).abs().mean() > 0.01
+    with pytest.raises(UnknownNameError, match="camera of the scene"):
+        attacked.render(camera="none")
+    other = pickle.loads(pickle.dumps(attacked))
+    with pytest.raises(InputError, match=r"load_run\(FOLDER\) has it"):
+        other.render()
+
+
+def test_an_answer_of_another_session_is_rendered_with_what_its_run_names(tmp_path: Path) -> None:
+    asked: dict[str, Any] = {**FAST, "resolution": 32, "steps": 1}
+    found = advsearch.attack("mug", controls="pose.yaw", policy="random", run=tmp_path / "run", **asked)
+    loaded = advsearch.load_run(tmp_path / "run")
+    assert isinstance(loaded, AttackResult)
+    one, other = (result.render(spp=4) for result in (found, loaded))
+    assert torch.equal(one.views[0].picture, other.views[0].picture) and one.model == other.model == "reference"
+
+
+def test_what_an_answer_says_is_not_set_beside_it(scene: advsearch.Scene, model: advsearch.Model) -> None:
+    found = advsearch.attack(scene, model, controls={"pose.yaw": np.array([0.0, 90.0])}, policy="random", **FAST)
+    with pytest.raises(InputError, match=r"settings: the answer says what pose.yaw is"):
+        found.render(settings={"pose.yaw": 3.0})
+    with pytest.raises(InputError, match="expected an attack that was kept, got one that was not; give it a `run`"):
+        advsearch.replay(found)
+
+
+def test_a_result_is_replayed_with_the_network_of_the_session(attacked: AttackResult, tmp_path: Path) -> None:
+    replayed = advsearch.replay(attacked, ways="curve", trials=6, run=tmp_path / "again", threads=1)
+    assert replayed.model == "bright" and len(replayed.table) > 1
+    assert replayed.command_line.startswith("No command repeats this: the model bright")
+    own = replayed.table[0]
+    assert attacked.summary.verified is not None and own.verified is not None
+    assert own.verified.trials == 6 and own.clean is not None
+
+
+def test_a_found_texture_is_put_on_another_scene(attacked: AttackResult, tmp_path: Path) -> None:
+    texture = attacked.artifacts["texture"]
+    painted = advsearch.load_scene("mug", "noon", texture=texture)
+    assert painted.only_here and np.array_equal(painted.description.object.base_color, texture.numpy())
+    drawn = advsearch.render("mug", Bright(), texture=texture, resolution=SIDE, spp=4, denoise="none")
+    plain = advsearch.render("mug", Bright(), resolution=SIDE, spp=4, denoise="none")
+    assert not torch.equal(drawn.views[0].picture, plain.views[0].picture)
+    levels = (texture.numpy() * 255.0).round().astype(np.uint8)
+    Image.fromarray(levels).save(tmp_path / "texture.png")
+    given: list[Any] = [levels, tmp_path / "texture.png", Image.fromarray(levels)]
+    for one in (advsearch.load_scene("mug", texture=one) for one in given):
+        assert np.allclose(one.description.object.base_color, levels / 255.0, atol=1e-6)
+    for wrong, words in ((texture[..., 0], r"\(h, w, 3\), got an array of shape"), (2.0 * texture + 1.0, "sRGB in")):
+        with pytest.raises(InputError, match=f"^texture: expected .*{words}"):
+            advsearch.load_scene("mug", texture=wrong)
+
+
+# ---- metrics --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("pandas")
+def test_metrics_are_columns_of_an_attack(attacked: AttackResult) -> None:
+    seen = attacked.to_pandas()["red"]
+    assert len(seen) > 10 and all(0.0 < one < 1.0 for one in seen) and len(set(seen)) > 4
+    assert attacked.summary.command_line.startswith("No command repeats this")
+    assert all(row.metrics.keys() == {"red"} for row in attacked.rows())
+
+
+@pytest.mark.usefixtures("pandas")
+def test_metrics_are_columns_of_a_sweep_and_of_one_that_goes_on(
+    scene: advsearch.Scene, model: advsearch.Model, tmp_path: Path
+) -> None:
+    class Stops(NullProgress):
+        def advance(self, n: int = 1, **info: float | str) -> None:
+            if n:
+                raise KeyboardInterrupt
+
+    def both(image: Tensor, output: Tensor, truth: Any) -> dict[str, Any]:
+        return {"light": image.mean(), "sure": np.float32(output.softmax(0)[0]), "none": float("nan")}
+
+    asked: dict[str, Any] = {**PICTURE, "grid": {"pose.yaw": [0, 90, 180, 270]}, "trials": 0, "batch": 1}
+    whole = advsearch.sweep(scene, model, metrics={"both": both}, **asked)
+    frame = whole.to_pandas()
+    assert all(0.0 < one < 1.0 for one in frame["both.light"]) and frame["both.none"] == [None] * 4
+    run = tmp_path / "run"
+    for progress in (Stops(), NullProgress()):
+        with suppress(KeyboardInterrupt):
+            advsearch.sweep(scene, model, metrics={"both": both}, run=run, progress=progress, **asked)
+        if isinstance(progress, Stops):
+            with pytest.raises(InputError, match="cannot go on: metric both is another function now"):
+                advsearch.sweep(scene, model, metrics={"both": _other()}, run=run, **asked)
+    again = advsearch.load_run(run)
+    assert isinstance(again, SweepResult)
+    assert [row.metrics for row in again.rows()] == [row.metrics for row in whole.rows()]
+
+
+def _other() -> Callable[..., float]:
+    def both(image: Tensor, output: Tensor, truth: Any) -> float:
+        return 1.0
+
+    return both
+
+
+def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
+    from advsearch.api.sweep import batches_of
+    from advsearch.config import SweepConfig
+    from advsearch.engine.metrics import metrics_as_settings, only_here
+
+    named = metrics_as_settings({"red": red, "own": lambda image, output, truth: 0.0})
+    assert named == {"red": f"{__name__}:red", "own": "<lambda>"}
+    assert only_here(named) == ["own"]
+    settings = SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, metrics={"red": "math:hypot"}, **PICTURE).plain()
+    with pytest.raises(ValueError, match="only one element tensors"):  # a worker has math.hypot from its name
+        batches_of(settings)(range(1))
+    refused: list[tuple[Any, str]] = [
+        ({"f": 3}, "f: expected a function"),
+        ({"margin": red}, "a column that rows have"),
+    ]
+    for wrong, words in refused:
+        with pytest.raises(InputError, match=f"^metrics: .*{words}"):
+            advsearch.sweep("mug", model, {"pose.yaw": [0, 90]}, metrics=wrong, trials=0, **PICTURE)
+    with pytest.raises(InputError, match=r"^metrics: f: expected a number, or a dict from names to numbers, got 'red'"):
+        advsearch.sweep("mug", model, {"pose.yaw": [0, 90]}, metrics={"f": lambda *_: "red"}, trials=0, **PICTURE)
+    with pytest.raises(InputError, match=r"^metrics: f: workers import a metric by its name"):
+        advsearch.attack("mug", metrics={"f": lambda *_: 0.0}, workers=2)
+    with pytest.raises(InputError, match=r"^metrics: f: no.such:thing cannot be imported"):
+        advsearch.attack("mug", metrics={"f": "no.such:thing"}, **FAST)
+
+
+# ---- progress -------------------------------------------------------------------------------------------------------
+
+
+def test_progress_is_a_bar_where_somebody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    def watcher(asked: Any) -> type[Any]:
+        with watched(asked) as progress:
+            progress.stage("searching", 4)
+            progress.advance(2, best=0.5)
+            progress.message("a sentence")
+            return type(progress)
+
+    assert [watcher(asked) for asked in (None, False, True)] == [NullProgress, NullProgress, LineProgress]
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert [watcher(asked) for asked in (None, False, True)] == [BarProgress, NullProgress, BarProgress]
+    shown: list[str] = []
+
+    def display(what: Any, display_id: bool) -> Any:
+        assert display_id
+        return types.SimpleNamespace(update=lambda one: shown.append(one._repr_html_()))
+
+    shell = types.SimpleNamespace(kernel=object())
+    notebook = types.SimpleNamespace(get_ipython=lambda: shell, display=types.SimpleNamespace(display=display))
+    monkeypatch.setitem(sys.modules, "IPython", notebook)
+    monkeypatch.setattr("advsearch.api.watching.UPDATE", 0.0)
+    assert watcher(True) is NotebookProgress
+    assert any(re.search(r'searching, 2 of 4.*best 0\.5 <progress value="2" max="4">', one) for one in shown)
+    assert shown[-1] == "<div>a sentence</div>"
+    with pytest.raises(InputError, match=r"^progress: expected True, False, None or a Progress, got 3"):
+        watcher(3)
+
+
+def test_every_question_takes_true(
+    scene: advsearch.Scene, model: advsearch.Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr(LineProgress, "stage", lambda self, name, *_, **__: seen.append(name))
+    advsearch.attack(scene, model, controls="pose.yaw", policy="random", progress=True, **{**FAST, "steps": 1})
+    advsearch.render(scene, model, resolution=SIDE, spp=1, progress=True)
+    assert "searching" in " ".join(seen) and "rendering" in seen
+    seen.clear()
+    advsearch.render(scene, model, resolution=SIDE, spp=1)
+    assert not seen, "nobody looks at a file"
+
+
+# ---- what is taken --------------------------------------------------------------------------------------------------
+
+
+def test_labels_numbers_and_ranges_come_as_they_are(scene: advsearch.Scene) -> None:
+    asked: dict[str, Any] = {**FAST, "steps": 1, "policy": "random"}
+    labels: list[Any] = [np.int64(0), torch.tensor(0), 0]
+    for label in labels:
+        found = advsearch.attack(scene, Bright(), labels=["mug", "vase"], label=label, controls="pose.yaw", **asked)
+        assert found.summary.label_set == ["mug"]
+    ends = np.array([10.0, 20.0], np.float32)
+    for controls in ({"pose": {"yaw": ends}}, {"pose.yaw": ends}, PoseControl(yaw=ends)):
+        found = advsearch.attack(scene, Bright(), labels=["mug", "vase"], controls=controls, **asked)
+        yaw = (found.summary.configuration or {})["pose.yaw"]
+        assert (yaw.low, yaw.high) == pytest.approx((10.0, 20.0))
+
+
+def test_a_detector_is_told_what_it_is() -> None:
+    with pytest.raises(ModelError, match="boxes are what a detector gives: use `task=detection`"):
+        advsearch.load_model(Detector(), input_size=SIDE)
+    detector = advsearch.load_model(Detector(), input_size=SIDE, task="detection", labels=["none", "mug"])
+    assert advsearch.render("mug", detector, task="detection", resolution=SIDE, spp=1).model == "Detector"
+
+
+def test_a_loaded_scene_is_asked_about_as_it_is(model: advsearch.Model, tmp_path: Path) -> None:
+    turned = advsearch.load_scene("mug", settings={"pose.yaw": 77.0})
+    asked: dict[str, Any] = {**FAST, "steps": 1, "average": 6, "policy": "random"}
+    gap = advsearch.gap(turned, model, controls="pose.pitch", run=tmp_path / "gap", **asked)
+    assert gap.command_line == "No command repeats this: the model bright exists only in the Python session that asked."
+    part = advsearch.load_run(tmp_path / "gap" / "parts" / gap.parts[0])
+    assert isinstance(part, AttackResult) and part.summary.command_line == gap.command_line
+    assert "pose.yaw: 77.0" in (tmp_path / "gap" / "run.yaml").read_text("utf-8")
+    with pytest.raises(InputError, match="environment: belongs to the scene, which is given already"):
+        advsearch.region(turned, model, environment="noon")
+    with pytest.raises(InputError, match="workers: expected names of objects, models"):
+        advsearch.gap(turned, model, workers=2)
+
+
+# ---- what is shown --------------------------------------------------------------------------------------------------
+
+
+def test_rows_are_there_without_a_folder(
+    scene: advsearch.Scene, model: advsearch.Model, attacked: AttackResult
+) -> None:
+    held = advsearch.attack(scene, model, controls="texture", epsilon=1.0, metrics={"red": red}, **FAST)
+    assert held.run is None
+    kept, rows = list(attacked.rows()), list(held.rows())
+    assert len(rows) == len(kept) and rows[0].values and rows[0].time is not None
+    for ours, theirs in zip(rows, kept, strict=True):
+        assert (ours.id, ours.kind, ours.step, ours.seed, ours.phase) == (
+            theirs.id, theirs.kind, theirs.step, theirs.seed, theirs.phase,
+        )  # fmt: skip
+        assert ours.objective == pytest.approx(theirs.objective) and ours.metrics == pytest.approx(theirs.metrics)
+    assert [row.kind for row in held.rows("control")] == ["control"] * 6
+
+
+@pytest.mark.usefixtures("pandas")
+def test_a_table_says_which_rows_are_steps(attacked: AttackResult) -> None:
+    frame, search = attacked.to_pandas("search"), attacked.search
+    assert search is not None and (len(search.history), len(search.ranking)) == (4, 8)
+    assert frame["phase"] == ["search"] * 4 + ["ranking"] * 8
+    axes = attacked.plot()
+    assert len(axes.lines[0].get_xdata()) == 4
+
+
+@pytest.mark.usefixtures("pandas")
+def test_columns_have_plain_names_and_units_stand_beside_them(scene: advsearch.Scene, model: advsearch.Model) -> None:
+    swept = advsearch.sweep(scene, model, {"pose.yaw": [0, 90], "camera.azimuth": [0, 1]}, trials=0, **PICTURE)
+    frame = swept.to_pandas()
+    assert frame["pose.yaw"] == [0.0, 0.0, 90.0, 90.0] and not [one for one in frame.columns if "[" in one]
+    assert frame.attrs["units"] == {"pose.yaw": "degrees", "camera.azimuth": "degrees"}
+
+
+def test_a_notebook_shows_pictures(scene: advsearch.Scene, model: advsearch.Model) -> None:
+    rendering = advsearch.render(scene, model, resolution=SIDE, spp=1, denoise="none")
+    renderer = scene.renderer("pose.yaw", resolution=SIDE, denoise="none")
+    before = renderer.renders
+    for one in (rendering, renderer):
+        with Image.open(io.BytesIO(one._repr_png_())) as picture:
+            assert picture.size == (SIDE, SIDE) and np.asarray(picture).std() > 1.0
+        assert "\n" not in repr(one) and len(repr(one)) < 120
+    assert renderer.renders == before and repr(rendering.views[0]) == "View(azimuth=40, 'mug')"
+    sheet = advsearch.render(scene, model, around=2, resolution=SIDE, spp=1, denoise="none")._repr_png_()
+    assert Image.open(io.BytesIO(sheet)).width > 2 * SIDE
+
+
+# ---- help and types -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [one for one in advsearch.__all__ if inspect.isfunction(getattr(advsearch, one))])
+def test_help_fits_a_screen_before_the_settings(name: str) -> None:
+    thing = getattr(advsearch, name)
+    text = pydoc.plain(pydoc.render_doc(thing))
+    lines = [part for line in text.splitlines() for part in (re.findall(".{1,120}", line) or [""])]
+    settings = [k for k, line in enumerate(lines) if re.match(r" +(environment|seed|confirm|case|quick): ", line)]
+    assert (settings[0] if settings else len(lines)) <= 42, "lines of 120 characters"
+
+
+def test_an_editable_install_is_a_path_that_type_checkers_follow() -> None:
+    """setuptools makes a plain path of one if every package lies where its name says (`package_dir` of the root)."""
+    import configparser
+
+    root = Path(__file__).resolve().parents[2]
+    setup = configparser.ConfigParser()
+    setup.read(root / "setup.cfg", encoding="utf-8")
+    assert setup["options"]["package_dir"].split() == ["=", "."]
+    for package in setup["options"]["packages"].split("\n"):
+        if package.strip() and not package.startswith("#"):
+            assert (root / package.strip().replace(".", "/") / "__init__.py").is_file(), package
+    assert "py.typed" in setup["options.package_data"]["advsearch"] and (root / "advsearch" / "py.typed").is_file()
+
+
+def test_type_checkers_know_what_comes_back(attacked: AttackResult) -> None:
+    """Each comment would be one too many, and mypy would say so, if these had no types."""
+    found: AttackResult | SweepResult | Result = advsearch.load_run(attacked.run or "")
+    loaded: int = found  # type: ignore[assignment]
+    assert isinstance(loaded, object)

@@ -1,0 +1,120 @@
+"""What a researcher guesses in Python: arrays for u, classes for instances, a function for a task, losses at hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_models import easy
+from torch import Tensor, nn
+
+import advsearch
+from advsearch import losses
+from advsearch.attacks import Random
+from advsearch.controls.pose import PoseControl
+from advsearch.errors import InputError
+from advsearch.tasks import Classification, Facts, make_task
+
+SMALL: dict[str, Any] = {
+    "resolution": 16, "steps": 4, "spp": 2, "trials": 6, "verify_spp": 4, "denoise": "none", "baseline": False,
+    "measure": "no",
+}  # fmt: skip
+
+
+class Level(nn.Module):
+    """One number: how bright the picture is."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images.mean(dim=(1, 2, 3))[:, None]
+
+
+@pytest.fixture(scope="module")
+def scene() -> advsearch.Scene:
+    return advsearch.load_scene("mug")
+
+
+def test_u_may_be_an_array_or_a_batch(scene: advsearch.Scene) -> None:
+    render = scene.renderer("pose.yaw", resolution=8, denoise="none")
+    whole = render(render.start, spp=1)
+    for u in (render.start.numpy(), render.start.double(), render.start.tolist()):
+        assert torch.equal(render(u, spp=1), whole)
+    assert torch.equal(render.mask(render.start.numpy()), render.mask(render.start))
+    several = torch.tensor([[0.5], [0.75]], requires_grad=True)
+    pictures = render(several, spp=1)
+    assert pictures.shape == (2, 8, 8, 3) and torch.equal(pictures[1], render(several[1], spp=1))
+    pictures.sum().backward()
+    assert several.grad is not None and several.grad.shape == (2, 1) and bool((several.grad != 0.0).all())
+    assert render(np.array([[0.5], [0.75]]), spp=1).shape == (2, 8, 8, 3)
+    with pytest.raises(InputError, match="expected u as a tensor or an array of numbers, got str"):
+        render("start", spp=1)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"expected u of shape \(1,\), got \(2,\)"):
+        render(np.zeros((3, 2)), spp=1)
+
+
+def test_a_class_in_the_place_of_an_instance_is_told_how_to_be_one(scene: advsearch.Scene) -> None:
+    for controls in (PoseControl, [PoseControl]):
+        for ask in (
+            lambda given: advsearch.attack(scene, easy(), controls=given),
+            lambda given: advsearch.sweep(scene, easy(), controls=given),
+            lambda given: scene.renderer(given),
+        ):
+            with pytest.raises(InputError, match=r"controls: .* got the class PoseControl; write PoseControl\(\)"):
+                ask(controls)
+    with pytest.raises(InputError, match=r"policy: .* got the class Random; write Random\(\)"):
+        advsearch.attack(scene, easy(), policy=Random)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"task: .* got the class Classification; write Classification\(\)"):
+        make_task(Classification)  # type: ignore[arg-type]
+    assert scene.renderer(PoseControl(yaw=[0, 10]), resolution=8).start.shape == (1,)
+
+
+def test_a_function_is_a_task(scene: advsearch.Scene) -> None:
+    """The network says how bright it is; right is a level near that of the yaw."""
+    seen: list[Facts] = []
+
+    def judge(output: Tensor, truth: Facts) -> Tensor:
+        seen.append(truth)
+        return (output[:, 0] - 0.4 - truth.number("pose.yaw") / 100.0).abs() - 0.2
+
+    network = advsearch.load_model(Level(), input_size=16, read=make_task(judge).reader)
+    shown = advsearch.render(scene, network, task=judge, controls={"pose": {"yaw": 0}}, spp=4)
+    level = float(shown.views[0].answers[0].label)
+    assert 0.2 < level < 0.6 and shown.task == "judge"
+    swept = advsearch.sweep(
+        scene, Level(), {"pose.yaw": [0, 90]}, task=judge, resolution=16, spp=2, denoise="none", trials=0
+    )
+    assert [row.correct for row in swept.rows()] == [True, False], "its level is no 1.3"
+    found = advsearch.attack(scene, Level(), task=judge, controls={"pose": {"yaw": [0, 90]}}, policy="random", **SMALL)
+    assert found.summary.objective == "score" and found.found and found.summary.task == "judge"
+    assert found.summary.command_line.startswith("No command repeats this: the model Level and the task judge exist")
+    assert seen[0].mask.shape == (128, 128) or seen[0].mask.shape == (16, 16)
+
+
+def test_a_function_that_says_yes_or_no_is_no_task() -> None:
+    task = make_task(lambda output, truth: output[:, 0] > 0.5)
+    with pytest.raises(
+        InputError, match=r"task <lambda>: expected how wrong .* 2 floating-point numbers.* got torch.bool"
+    ):
+        task.margin(torch.zeros(2, 1), Facts("mug"))
+    with pytest.raises(InputError, match="got float"):
+        make_task(lambda output, truth: output.sum().item()).margin(torch.zeros(2, 1), Facts("mug"))
+    whole = make_task(lambda output, truth: output.sum())
+    assert whole.judge(torch.tensor([[3.0, 1.0]]), Facts("mug", "cup"))[0].margin == 4.0
+    assert whole.answers(torch.tensor([[3.0, 1.0]]))[0][0].label == "3, 1"
+    assert whole.answers(torch.zeros(1, 4, 4))[0][0].label == "4 x 4 numbers, mean 0"
+    assert whole.truth_names(Facts("mug", None, "cup")) == ("cup",)
+
+
+def test_the_losses_at_hand_make_what_printable_makes(scene: advsearch.Scene) -> None:
+    """By the same search: with the weight of its terms, the answer is the same."""
+    assert advsearch.losses is losses and "losses" in dir(advsearch)
+
+    def own(logits: Tensor, images: Tensor, labels: Tensor, texture: Tensor) -> Tensor:
+        terms = losses.total_variation(texture) + losses.non_printability(texture)
+        return losses.margin(logits, labels) - 10.0 * terms
+
+    settings: dict[str, Any] = {**SMALL, "controls": {"texture": {"epsilon": 0.3, "resolution": 16}}, "resolution": 32}
+    ours = advsearch.attack(scene, easy(), objective=own, **settings)
+    theirs = advsearch.attack(scene, easy(), printable=True, **settings)
+    assert ours.found and torch.allclose(ours.u, theirs.u, atol=1e-5)

@@ -1,0 +1,138 @@
+"""Objectives that see more than pictures: u, the texture, the scene's inputs and numbers, with a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.api.attack import problem_of
+from advsearch.attacks import get_objective
+from advsearch.config import AttackConfig
+from advsearch.engine import bank
+from advsearch.engine.bank import Bank
+from advsearch.engine.problem import Problem
+from advsearch.engine.transport import Predictor, Transport
+from advsearch.errors import InputError, UnknownNameError
+
+SMALL: dict[str, Any] = {
+    "resolution": 16, "spp": 2, "trials": 6, "verify_spp": 4, "denoise": "none", "baseline": False, "measure": "no",
+}  # fmt: skip
+TEXTURE = {"texture": {"resolution": 8, "epsilon": 0.1}}
+PINK = torch.tensor([0.9, 0.1, 0.6])
+
+
+class Sure(nn.Module):
+    """A mug, whatever it sees."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images.mean(dim=(1, 2, 3))[:, None] * images.new_tensor([1.0, 0.5, 0.2]) + images.new_tensor([5.0, 0, 0])
+
+
+def sure() -> advsearch.Model:
+    return advsearch.load_model(Sure(), labels=["mug", "vase", "bowl"], input_size=16)
+
+
+@pytest.fixture(scope="module")
+def scene() -> advsearch.Scene:
+    return advsearch.load_scene("mug")
+
+
+def problem(scene: advsearch.Scene, objective: Callable[..., Tensor], **settings: Any) -> Problem:
+    config = AttackConfig(object="mug", resolution="16", spp=2, denoise="none", **settings)
+    made = problem_of(config, scene, sure())
+    made.objective = get_objective(objective, made.task)
+    return made
+
+
+def pinker(logits: Tensor, images: Tensor, labels: Tensor, texture: Tensor) -> Tensor:
+    """It looks at no picture."""
+    return -(texture - PINK).abs().mean(dim=(1, 2, 3))
+
+
+def test_a_search_follows_a_loss_of_the_texture(scene: advsearch.Scene) -> None:
+    """Nearly every texel ends where its budget lets it be next to the colour that is sought."""
+    settings: dict[str, Any] = {**SMALL, "steps": 16, "denoise": "oidn", "policy": "pgd"}
+    result = advsearch.attack(scene, sure(), controls=TEXTURE, objective=pinker, **settings)
+    assert result.summary.transport is not None and result.summary.transport.used
+    before, found = result.artifacts["texture-original"], result.artifacts["texture"]
+    wanted = before + (PINK - before).clamp(-0.1, 0.1)
+    assert float((found - wanted).abs().mean()) < 0.25 * float((before - wanted).abs().mean())
+    tried = result.summary.tried_objective
+    assert tried is not None and tried.answer is not None
+    assert tried.answer.mean == pytest.approx(float(pinker(PINK, PINK, PINK, found[None])), abs=1e-5)
+
+
+@pytest.mark.parametrize("over", [{}, {"camera": {}}], ids=["alone", "over conditions"])
+def test_it_is_the_same_for_rendered_and_for_predicted_pictures(
+    over: dict[str, Any], scene: advsearch.Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bank, "FIRST", 2)
+    settings = {"over": over, "draws": 2} if over else {}
+    made = problem(scene, pinker, controls=TEXTURE, **settings)
+    predicted: Predictor = Bank(made, 16) if over else Transport(made, 16)
+    at = made.domain.begin.clone().requires_grad_()
+    value = pinker(at, at, at, made.searched_space.printed(at)["texture"][None])
+    value.sum().backward()
+    for evaluator in (made.evaluator("search"), predicted.evaluator("search")):
+        found = evaluator(at.detach(), index=0, gradient=True)
+        assert found.gradient is not None and at.grad is not None
+        assert found.objective == pytest.approx(float(value.detach()))
+        assert torch.allclose(found.gradient, at.grad, atol=1e-7)
+
+
+def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(scene: advsearch.Scene) -> None:
+    """Of the texture by its adjoint, of the yaw by a secant, with one term of everything that can be asked for."""
+
+    def seen(logits: Tensor, images: Tensor, labels: Tensor) -> Tensor:
+        return images.mean(dim=(1, 2, 3))
+
+    def asks(logits: Any, images: Any, labels: Any, u: Any, texture: Any, inputs: Any, configuration: Any) -> Any:
+        own = u.square().sum(dim=1) + 3.0 * texture.mean(dim=(1, 2, 3)) + inputs["object.base_color"].sum(dim=(1, 2, 3))
+        return seen(logits, images, labels) * (1.0 + 0.1 * configuration["pose.yaw"]) + own
+
+    made = problem(scene, seen, controls={"texture": {"resolution": 8}, "pose": {"yaw": [-20, 30]}})
+    u = made.domain.begin
+    picture = made.evaluator("search")(u, index=3, gradient=True)
+    made.objective = get_objective(asks, made.task)
+    found = made.evaluator("search")(u, index=3, gradient=True)
+    assert found.gradient is not None and picture.gradient is not None
+    at = u.clone().requires_grad_()
+    space = made.searched_space
+    yaw = space.numbers(at)["pose.yaw"]
+    own = at.square().sum() + 3.0 * space.printed(at)["texture"].mean() + space.inputs(at)["object.base_color"].sum()
+    value = picture.objective * (1.0 + 0.1 * yaw) + own
+    value.backward()
+    assert at.grad is not None
+    expected = at.grad + (1.0 + 0.1 * float(yaw.detach())) * picture.gradient
+    assert found.objective == pytest.approx(float(value.detach()), rel=1e-5)
+    assert torch.allclose(found.gradient, expected, rtol=1e-3, atol=1e-5)
+    assert made.plan.having("secant") and made.plan.having("adjoint"), "both ways"
+
+
+def test_what_is_asked_for_is_of_every_picture(scene: advsearch.Scene) -> None:
+    made = problem(scene, pinker, controls=TEXTURE, over={"camera": {}})
+    wholes = [made.whole(made.domain.start, draw) for draw in range(3)]
+    asked = made.asked(*wholes)
+    assert asked("u").shape == (3, len(made.domain.start)) and asked("texture").shape == (3, 8, 8, 3)
+    azimuths = asked("configuration")["camera.azimuth"]
+    said = [made.space.describe(whole)["camera.azimuth"]["value"] for whole in wholes]
+    assert azimuths.tolist() == pytest.approx(said) and len(set(said)) == 3
+    assert asked("inputs")["object.base_color"].shape[0] == 3
+    with pytest.raises(UnknownNameError, match=r"unknown number of the configuration 'camera.azimut'. Did you mean"):
+        asked("configuration")["camera.azimut"]
+
+
+def test_a_texture_that_is_not_there_is_refused_before_anything_is_rendered(scene: advsearch.Scene) -> None:
+    with pytest.raises(InputError, match=r"asks for `texture`, .* got camera; add `texture` or `patch`"):
+        advsearch.attack(scene, sure(), controls="camera", objective=pinker, **SMALL)
+    made = problem(scene, pinker, controls={**TEXTURE, "patch": {}})
+    asked = made.asked(made.domain.start)
+    with pytest.raises(InputError, match="got texture, patch; ask for `textures`"):
+        asked("texture")
+    textures = asked("textures")
+    assert list(textures) == ["texture", "patch"] and textures["patch"].ndim == 4

@@ -1,0 +1,92 @@
+"""Networks that no task can judge as they are: each is refused in a sentence that says what it is, and the way on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from advsearch import load_model
+from advsearch.errors import ModelError
+
+
+class Answers(nn.Module):
+    """Answers with what `form` makes of logits of each pixel (N, 4, H, W)."""
+
+    def __init__(self, form: Any) -> None:
+        super().__init__()
+        self.form, self.pixels = form, nn.Conv2d(3, 4, 1)
+
+    def forward(self, x: Tensor) -> Any:
+        return self.form(self.pixels(x))
+
+
+def pooled(pixels: Tensor) -> Tensor:
+    return pixels.mean(dim=(2, 3))
+
+
+@pytest.mark.parametrize("task", ["classification", "segmentation"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda pixels: pixels.argmax(dim=1),
+        lambda pixels: pooled(pixels).argmax(dim=1),
+        lambda pixels: {"logits": pixels.argmax(dim=1).int()},
+        lambda pixels: {"out": pixels.argmax(dim=1)},
+    ],
+    ids=["pixels", "pictures", "logits", "out"],
+)
+def test_chosen_classes_are_no_scores(form: Any, task: str) -> None:
+    with pytest.raises(ModelError, match=r"these are the classes that it chose \(torch.int.*before the argmax"):
+        load_model(Answers(form), input_size=8, task=task)
+
+
+@pytest.mark.parametrize(
+    "form", [lambda pixels: pixels.mean(), lambda pixels: {"loss": pixels.mean(), "loss_boxes": pixels.sum()}]
+)
+def test_losses_are_no_scores(form: Any) -> None:
+    for task in ("classification", "detection"):
+        with pytest.raises(ModelError, match="what a loss is: give the network as it answers outside of training"):
+            load_model(Answers(form), input_size=8, task=task)
+
+
+def test_layers_without_weights_are_named() -> None:
+    network = nn.Sequential(nn.Flatten(), nn.Sequential(nn.ReLU(), nn.LazyLinear(3)))
+    with pytest.raises(ModelError, match=r"its layer 1.1 \(LazyLinear\) has no weights before it has seen a picture"):
+        load_model(network, input_size=8)
+    network(torch.zeros(1, 3, 8, 8))
+    assert load_model(network, input_size=8).classes == 3
+
+
+class InTraining(nn.Module):
+    """Cannot be asked without the right answers."""
+
+    def forward(self, x: Tensor, targets: Tensor) -> Tensor:
+        return x
+
+
+class ToldInTraining(nn.Module):
+    """Says itself that it cannot."""
+
+    def forward(self, x: Tensor, targets: Tensor | None = None, weight: float = 1.0) -> Tensor:
+        raise ValueError("targets should be passed, a weight too")
+
+
+@pytest.mark.parametrize("network", [InTraining(), ToldInTraining()])
+def test_what_is_wanted_beside_pictures_is_named(network: nn.Module) -> None:
+    with pytest.raises(ModelError, match=r"wants targets beside pictures; wrap it in an nn.Module that is called with"):
+        load_model(network, input_size=8)
+
+
+def test_networks_for_videos_are_named() -> None:
+    network = nn.Sequential(nn.Conv3d(3, 4, 1), nn.AdaptiveAvgPool3d(1), nn.Flatten())
+    with pytest.raises(ModelError, match=r"made for videos or volumes \(it has an nn.Conv3d\)"):
+        load_model(network, input_size=8)
+
+
+def test_other_errors_still_say_size_and_layout() -> None:
+    network = nn.Sequential(nn.Flatten(), nn.Linear(5, 3))
+    with pytest.raises(ModelError, match=r"cannot be run on a RGB image of 8 x 8 .* Give the `input_size`"):
+        load_model(network, input_size=8)

@@ -1,0 +1,292 @@
+"""Depth: how far a model judges the object to be, beside how far it is."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_models import SIDE, Ranger
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.attacks.objectives import get_objective
+from advsearch.cli.main import main
+from advsearch.described import NOT_A_NUMBER
+from advsearch.errors import InputError, ModelError
+from advsearch.runs.images import read_png
+from advsearch.runs.store import Store
+from advsearch.tasks import Depth, Facts, Sight, make_task
+from advsearch.tasks.depth import AS_FAR, DISPARITY, FARTHER, GONE, METRIC, NEARER, OUT_OF_SHAPE, RELATIVE, Distances
+
+HIGH, WIDE = 8, 10
+MASK = torch.zeros(HIGH, WIDE).bool()
+MASK[2:7, 3:7] = True
+GROUND = torch.linspace(0.2, 0.5, HIGH)[:, None].expand(HIGH, WIDE)
+"""Disparities of a plane."""
+INVERSE = torch.where(MASK, 1.2, GROUND)
+TRUTH = Distances(MASK, INVERSE.reciprocal())
+OTHERS = torch.where(MASK, 1.2, torch.where(torch.arange(HIGH)[:, None] < 3, 0.0, GROUND))
+OPEN = Distances(MASK, OTHERS.reciprocal())
+"""The same with a sky above the ground."""
+
+
+def said(inverse: Tensor, kind: str = DISPARITY, size: float = 0.5) -> list[dict[str, Tensor]]:
+    """The output of a model that means these disparities, by its own scale and shift."""
+    values = {DISPARITY: 7.0 * inverse - 2.0, RELATIVE: 3.0 / inverse + 1.0, METRIC: size / inverse}[kind]
+    return [{kind: values}]
+
+
+def moved(factor: float) -> Tensor:
+    """Disparities with the object so many times as far as it is."""
+    return torch.where(MASK, INVERSE / factor, INVERSE)
+
+
+TASK = Depth(size=0.5)
+
+
+@pytest.mark.parametrize("kind", [DISPARITY, RELATIVE, METRIC])
+@pytest.mark.parametrize(
+    ("factor", "right", "answer"),
+    [(1.0, True, AS_FAR), (1.2, True, AS_FAR), (1.3, False, FARTHER), (0.7, False, NEARER)],
+)
+def test_a_factor_of_the_tolerance_is_what_decides(kind: str, factor: float, right: bool, answer: str) -> None:
+    """By whatever scale and shift the model speaks: what is beside the object says them."""
+    (found,) = TASK.judge(said(moved(factor), kind), TRUTH)
+    assert (found.right, found.answer.label, found.success) == (right, answer, not right)
+    assert found.margin == pytest.approx(abs(math.log(factor)) - math.log(1.25), abs=1e-4)
+    payload: Any = found.payload
+    assert payload["factor"] == pytest.approx(max(factor, 1.0 / factor), abs=1e-3)
+    assert payload["judged"] == pytest.approx(factor / 1.2, abs=1e-3)
+    assert ("fitted" in payload) is (kind != METRIC)
+
+
+def test_an_object_that_takes_the_depth_of_what_is_behind_is_gone() -> None:
+    gone = replace(TASK, seek="gone")
+    for share, left in ((1.0, 1.0), (0.6, 0.6), (0.4, 0.4), (0.0, 0.0)):
+        inverse = GROUND + share * (INVERSE - GROUND)
+        (found,) = gone.judge(said(inverse), TRUTH)
+        payload: Any = found.payload
+        assert payload["relief"] == pytest.approx(left, abs=1e-3)
+        assert found.success is (left < 0.5) and (found.answer.label == GONE) is (left < 0.5)
+    (found,) = replace(TASK, seek="farther").judge(said(GROUND), TRUTH)
+    assert found.success and found.answer.label == FARTHER, "what is sought is named first"
+
+
+def test_behind_the_object_is_what_is_beside_it_in_its_row() -> None:
+    assert torch.allclose(TRUTH.behind[MASK], GROUND[MASK])
+    assert OPEN.behind[2, 3:7].tolist() == [0.0] * 4 and torch.allclose(OPEN.behind[4], GROUND[4])
+    edge = MASK.clone()
+    edge[3] = True
+    edge[4, :7] = True
+    behind = Distances(edge, INVERSE.reciprocal()).behind
+    assert bool(behind[3].isnan().all()) and torch.allclose(behind[4], GROUND[4])
+
+
+def test_nearer_and_farther_have_a_sign_and_a_mixture_has_neither() -> None:
+    for seek, factor in (("nearer", 0.7), ("farther", 1.4)):
+        task = replace(TASK, seek=seek)
+        other = said(moved(1.0 / factor))
+        assert task.judge(said(moved(factor)), TRUTH)[0].success and not task.judge(other, TRUTH)[0].success
+        assert float(get_objective(seek, task)(said(moved(factor)), torch.zeros(1), TRUTH)) > 0.0
+    columns = torch.where(torch.arange(WIDE) % 2 == 0, 2.0, 0.5)
+    (found,) = TASK.judge(said(torch.where(MASK, INVERSE * columns, INVERSE)), TRUTH)
+    assert not found.right and found.answer.label == OUT_OF_SHAPE
+    assert replace(TASK, minimise=True).judge(said(INVERSE), TRUTH)[0].success
+
+
+def test_near_does_not_become_far_by_a_negative_scale() -> None:
+    (found,) = TASK.judge([{DISPARITY: -INVERSE}], TRUTH)
+    payload: Any = found.payload
+    assert not found.right and payload["relief"] < 0.5
+
+
+def test_where_nothing_is_seen_nothing_is_wrong_and_where_numbers_are_none_nothing_is_right() -> None:
+    unseen = Distances(torch.zeros_like(MASK), TRUTH.z)
+    (found,) = TASK.judge(said(GROUND), unseen)
+    assert (found.right, found.answer.label, found.payload) == (True, "out of view", None)
+    for value in (math.nan, math.inf):
+        broken = said(INVERSE)
+        broken[0][DISPARITY][0, 0] = value
+        (found,) = TASK.judge(broken, TRUTH)
+        assert found.not_a_number and not found.right and not found.success
+        assert TASK.answers(broken)[0][0].label == NOT_A_NUMBER
+    assert TASK.answers(said(INVERSE, METRIC))[0][0].label == "metric depth from 0.417 to 2.5"
+
+
+def test_what_is_beside_the_object_has_to_say_the_scale() -> None:
+    """In a scene that is all object, or seen from above: refused when a run begins, and fitted on all that there is."""
+    alone = Distances(MASK, torch.where(MASK, 1.0 / 1.2, math.inf))
+    above = Distances(MASK, torch.where(MASK, 1.0, 2.0))
+    for truth, count in ((alone, 0), (above, 60)):
+        assert not truth.anchored
+        task = TASK.seeing(said(INVERSE), truth)
+        assert f"expected 16 pixels at distances that differ by a factor of 1.1, got {count}" in task.unsaid
+        assert not TASK.seeing(said(INVERSE, METRIC), truth).unsaid
+    (found,) = TASK.judge([{DISPARITY: torch.where(MASK, 3.0, 1.0)}], above)
+    payload: Any = found.payload
+    assert found.right and payload["fitted"] == "in the whole picture"
+    assert TASK.seeing(said(INVERSE), OPEN).unsaid == "" and TASK.seeing(said(INVERSE), None).unsaid == ""
+
+
+def test_a_model_is_read_in_every_form() -> None:
+    values = INVERSE[None]
+    plain = [values, values[:, None], (values, None), {"predicted_depth": values}, {"depth": values}]
+    forms: list[Any] = [*((one, "") for one in plain), ({METRIC: values}, METRIC), ({DISPARITY: values}, DISPARITY)]
+    for answer, kind in forms:
+        ((found),) = TASK.read(answer, 1)
+        assert list(found) == [kind] and found[kind].equal(INVERSE)
+    for other in (INVERSE, values.expand(2, -1, -1), {"masks": values}, values[:, None].expand(-1, 2, -1, -1), ()):
+        with pytest.raises(ValueError, match=r"expected a number for each pixel, \(N, height, width\)"):
+            TASK.read(other, 1)
+
+
+def test_what_has_to_be_said_is_said() -> None:
+    assert (
+        "kind: expected what its numbers are, one of relative disparity, relative depth, metric depth, and"
+        in TASK.seeing([{"": INVERSE}], TRUTH).unsaid
+    )
+    assert "give the longest side of the real object in metres" in Depth().seeing(said(INVERSE, METRIC), TRUTH).unsaid
+    (remark,) = Depth(kind=RELATIVE).seeing([{"": INVERSE}], TRUTH).remarks
+    assert remark.startswith("The model's numbers are read as relative depth: the distance, up to a scale and a shift")
+    with pytest.raises(InputError, match="label: task depth has no classes"):
+        TASK.check(Facts("mug", "mug"))
+    for options, text in (({"kind": "depth"}, "kind: expected one of"), ({"seek": "vanish"}, "seek: expected one of")):
+        with pytest.raises(InputError, match=f"task depth: {text}"):
+            make_task({"name": "depth", **options})
+    with pytest.raises(InputError, match="task depth: tolerance: expected a number over 0"):
+        Depth(tolerance=0.0)
+
+
+def test_maps_are_brought_to_the_size_of_the_picture() -> None:
+    fine = nn.functional.interpolate(said(INVERSE)[0][DISPARITY][None, None], scale_factor=4, mode="nearest")[0, 0]
+    assert TASK.judge([{DISPARITY: fine}], TRUTH)[0].right
+
+
+def test_the_gradient_agrees_with_differences() -> None:
+    """Of every objective, in float64, along a direction."""
+    generator = torch.Generator().manual_seed(0)
+    at, way = (torch.randn((HIGH, WIDE), generator=generator, dtype=torch.float64) for _ in range(2))
+    truth = Distances(MASK, TRUTH.z.double())
+    for kind in (DISPARITY, RELATIVE, METRIC):
+        start = (said(INVERSE.double(), kind)[0][kind] + 0.02 * at).requires_grad_()
+        for seek in ("", "nearer", "farther", "gone"):
+            task = replace(TASK, seek=seek)
+
+            def value(values: Tensor, task: Depth = task, kind: str = kind) -> Tensor:
+                return task.score([{kind: values}], truth).sum()
+
+            (slope,) = torch.autograd.grad(value(start), start)
+            with torch.no_grad():
+                seen = float(value(start + 1e-6 * way) - value(start - 1e-6 * way)) / 2e-6
+            assert abs(seen) > 1e-3
+            assert float((slope * way).sum()) == pytest.approx(seen, rel=1e-4), (kind, seek)
+
+
+def test_it_is_compared_with_the_distance_along_the_axis() -> None:
+    sight = Sight(MASK, 2.0 * TRUTH.z, TRUTH.z)
+    truth = TASK.truth(Facts("mug", look=lambda: sight))
+    assert truth.z is TRUTH.z and TASK.truth_names(truth) == (AS_FAR,)
+    for kind in (DISPARITY, RELATIVE, METRIC):
+        true, right = TASK.marks(said(moved(2.0), kind), truth)[0]
+        assert true.true and true.mask is MASK and right.mask is not None and not right.mask.any()
+        assert true.map is not None and torch.allclose(true.map, INVERSE)
+        assert right.map is not None and torch.allclose(right.map, moved(2.0), atol=1e-4)
+
+
+# ---- on a model -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """The flags of the task with a model file."""
+    file = tmp_path_factory.mktemp("depth") / "net.pt2"
+    batch = {0: torch.export.Dim("batch", min=1, max=64)}
+    program = torch.export.export(Ranger().eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
+    torch.export.save(program, file)
+    return ["--object", "mug", "--task", f"depth={{kind: {DISPARITY}}}", "--model", str(file), "--json"]
+
+
+def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
+    """Type a command, and return what it prints."""
+    assert main(list(command)) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none", "--trials", "6"]
+
+
+def test_a_search_verifies_and_draws(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    flags = ["--epsilon", "0.5", "--steps", "12", "--objective", "gone", "--no-baseline", "--run", str(run)]
+    found = answer(capsys, "attack", *asked, *SHORT, *flags)
+    assert found["ending"] == "found" and found["clean"]["label"] == AS_FAR and found["clean"]["correct"]
+    assert found["verified"]["labels"] == {GONE: 6} and found["adversarial"]["payload"]["relief"] < 0.5
+    with Store(run / "results.sqlite", read_only=True) as store:
+        payloads: list[Any] = [row.payload for row in store.rows("verification")]
+    assert {one["fitted"] for one in payloads} == {"beside the object"}
+    clean, drawn = (read_png(run / "images" / f"{name}-answer.png") for name in ("clean", "adversarial"))
+    assert clean.shape == (512, 3 * 512, 3), "the picture, the true disparity and the model's"
+    orange = [float((one[:, :512, 0] - one[:, :512, 2]).clip(0.2).mean()) for one in (clean, drawn)]
+    assert orange[0] > orange[1] + 0.02, "fewer pixels of the object are right"
+    off = [float(abs(one[:, 512:1024] - one[:, 1024:]).mean()) for one in (clean, drawn)]
+    assert off[0] < 0.16 and off[1] > off[0] + 0.1, off
+    page = (run / "report.html").read_text("utf-8")
+    assert f"The model judges this mug {GONE} in 6 of 6 fresh renders" in page
+    assert "orange the object&#x27;s pixels whose distance is right." in page
+
+
+def test_a_sweep_counts(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """From above, what is beside the object says no scale, and the whole picture does."""
+    flags = ["--grid", "camera.elevation=25,85", "--spp", "2", "--denoise", "none", "--trials", "6"]
+    found = answer(capsys, "sweep", *asked, *flags, "--run", str(tmp_path / "run"))
+    assert found["configurations"] == 2 and found["task"] == "depth"
+    with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
+        payloads: list[Any] = [row.payload for row in store.rows("sweep")]
+    assert [one["fitted"] for one in payloads] == ["beside the object", "in the whole picture"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "flags"),
+    [
+        ("gap", ["--control", "pose", *SHORT, "--steps", "3", "--average", "4", "--policy", "random"]),
+        ("region", ["--control", "pose", "--vary", "pose.yaw", "--denoise", "none", "--samples", "20"]),
+        ("attack", ["--over", "camera={azimuth: [35, 45]}", "--draws", "2", "--steps", "2", *SHORT]),
+    ],
+)
+def test_other_commands_take_it(
+    asked: list[str], command: str, flags: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    found = answer(capsys, command, *asked, *flags, "--run", str(tmp_path / "run"))
+    assert found["task"] == "depth" or found["table"]
+
+
+def test_the_bundled_ground_says_the_scale() -> None:
+    """A model that knows every distance along the axis by a scale and a shift is right, and one along rays is not."""
+    scene = advsearch.load_scene("mug")
+    render = scene.renderer(["pose"], resolution=24)
+    seen = render.surfaces(render.start)
+    truth = Distances(seen.seen("object"), seen.z_depth)
+    assert truth.anchored and int(truth.beside.sum()) > 100
+    margins = [float(TASK.margin(said(one.reciprocal()), truth)) for one in (seen.z_depth, seen.depth)]
+    assert margins[0] == pytest.approx(-math.log(1.25), abs=1e-5) and margins[1] > margins[0] + 1e-3
+
+
+def test_a_model_is_refused_for_what_it_is_not() -> None:
+    with pytest.raises(ModelError, match="expected a number for each pixel"):
+        advsearch.load_model(nn.Flatten(), input_size=8, task="depth")
+    network = nn.Conv2d(3, 1, 1)
+    assert np.isfinite(
+        float(advsearch.load_model(network, input_size=8, task="depth")(torch.zeros(8, 8, 3))[0][""].sum())
+    )
+    with pytest.raises(InputError, match="labels: task depth has no classes"):
+        Depth().on(advsearch.load_model(network, input_size=8, task="depth", labels=["mug", "cup"]))
+    with pytest.raises(InputError, match='it was loaded for its logits; load it with task="depth"'):
+        Depth().on(advsearch.load_model(nn.Sequential(nn.Flatten(), nn.Linear(192, 2)), input_size=8))

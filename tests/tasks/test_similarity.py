@@ -1,0 +1,427 @@
+"""Similarity: features as the library's own pipeline gives them, references in folders, ranks, distances."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from small_models import SIDE
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.attacks.feature_distance import NEARBY
+from advsearch.attacks.objectives import check_objective, get_objective
+from advsearch.cli.main import main
+from advsearch.errors import AdvsearchError, InputError, ModelError
+from advsearch.models import Model, ModelWarning
+from advsearch.runs.images import read_png, to_8bit
+from advsearch.runs.made_with import file_digests
+from advsearch.tasks import Facts, Similarity, make_task
+from advsearch.tasks.similarity import ELSE, ITSELF, TEMPERATURE
+
+COLOURS = {"blue": (0.2, 0.3, 0.9), "green": (0.2, 0.8, 0.3), "red": (0.9, 0.2, 0.2)}
+NAMES = tuple(COLOURS)
+
+
+class Embedder(nn.Module):
+    """Features (N, 12) of the mean colours of four squares; smooth."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        weights = torch.randn((12, 12), generator=torch.Generator().manual_seed(1))
+        self.weights = nn.Parameter(weights / 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        squares = nn.functional.adaptive_avg_pool2d(x - 0.5, 2).flatten(1)
+        return (squares @ self.weights).tanh()
+
+
+class Banded(nn.Module):
+    """Features (N, 4) of the hue in the middle, where the bundled mug has a blue band and the bowl has none."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        colour = x[:, :, 15:21, 8:22].mean(dim=(2, 3))
+        hue = 4.0 * (colour - colour.mean(dim=1, keepdim=True))
+        return torch.cat([hue, torch.full_like(hue[:, :1], 0.3)], dim=1)
+
+
+def write(path: Path, picture: Tensor, **more: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(to_8bit(picture)).save(path, **more)
+    return path
+
+
+def noisy(colour: tuple[float, float, float], seed: int, size: tuple[int, int] = (8, 8)) -> Tensor:
+    noise = torch.rand((*size, 3), generator=torch.Generator().manual_seed(seed))
+    return (torch.tensor(colour) + 0.4 * (noise - 0.5)).clamp(0.0, 1.0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three names; red has a picture more than the others, and one file is a link."""
+    for seed, (name, colour) in enumerate(COLOURS.items()):
+        for number in range(4 if name == "red" else 3):
+            write(tmp_path / "refs" / name / f"{number}.png", noisy(colour, 10 * seed + number))
+    (tmp_path / "refs" / "blue" / "9.png").symlink_to(tmp_path / "refs" / "blue" / "0.png")
+    (tmp_path / "refs" / "blue" / ".hidden").write_text("no picture")
+    return tmp_path / "refs"
+
+
+@pytest.fixture
+def model() -> Model:
+    return advsearch.load_model(Embedder(), task="similarity", input_size=8, name="embedder")
+
+
+def own_pictures(folder: Path, name: str) -> Tensor:
+    return torch.stack([torch.from_numpy(read_png(one)) for one in sorted((folder / name).glob("*.png"))])
+
+
+def features(model: Model, pictures: Tensor) -> Tensor:
+    return nn.functional.normalize(model(pictures), dim=1)
+
+
+# ---- networks -------------------------------------------------------------------------------------------------------
+
+transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
+SIZES = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 8}
+EYES = {**SIZES, "image_size": 16, "patch_size": 8}
+
+
+def published(folder: Path, architecture: str) -> str:
+    """A tiny network with random weights and its processor, as `save_pretrained` writes them."""
+    kind = getattr(transformers, architecture)
+    given: dict[str, Any] = dict(EYES)
+    if architecture == "CLIPModel":
+        given = {"vision_config": EYES, "text_config": {**SIZES, "vocab_size": 9}, "projection_dim": 6}
+    torch.manual_seed(0)
+    network = kind(kind.config_class(**given))
+    for parameter in network.parameters():
+        if parameter.dim() > 1:
+            nn.init.normal_(parameter, std=0.3)
+    network.save_pretrained(folder)
+    size = {"height": 16, "width": 16}
+    transformers.ViTImageProcessor(size=size, image_mean=[0.4] * 3, image_std=[0.3] * 3).save_pretrained(folder)
+    return f"hf:{folder}"
+
+
+OWN = {
+    "Dinov2Model": lambda network, given: network(given).pooler_output,
+    "CLIPModel": lambda network, given: network.get_image_features(given).pooler_output,
+    "CLIPVisionModelWithProjection": lambda network, given: network(given).image_embeds,
+    "ViTForImageClassification": lambda network, given: network.vit(given).last_hidden_state[:, 0],
+}
+"""How the library itself says what the features of a picture are."""
+
+
+@pytest.mark.parametrize("architecture", OWN)
+def test_features_are_those_of_the_librarys_own_pipeline(architecture: str, tmp_path: Path) -> None:
+    spec = published(tmp_path / "net", architecture)
+    picture = torch.rand((16, 16, 3), generator=torch.Generator().manual_seed(3))
+    file = write(tmp_path / "picture.png", picture)
+    loaded = advsearch.load_model(spec, task="similarity")
+    processor = transformers.AutoImageProcessor.from_pretrained(tmp_path / "net")
+    network = getattr(transformers, architecture).from_pretrained(tmp_path / "net").eval()
+    with torch.no_grad(), Image.open(file) as image:
+        theirs = OWN[architecture](network, processor(images=image, return_tensors="pt")["pixel_values"])
+        ours = loaded(torch.from_numpy(read_png(file)))
+    assert loaded.labels == () and float(theirs.std()) > 0.05
+    torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=0.0)
+    again = advsearch.load_model(network, task="similarity")  # from Python, as it is
+    torch.testing.assert_close(again(torch.from_numpy(read_png(file))), theirs, atol=1e-4, rtol=0.0)
+
+
+def test_a_pooler_that_was_never_trained_is_left_out(tmp_path: Path) -> None:
+    network = transformers.ViTModel(transformers.ViTConfig(**EYES), add_pooling_layer=False)
+    network.save_pretrained(tmp_path)
+    with pytest.warns(ModelWarning, match="without an image processor"):
+        loaded = advsearch.load_model(f"hf:{tmp_path}", task="similarity")
+    pictures = torch.rand(2, 16, 16, 3)
+    with torch.no_grad():
+        tokens = network.eval()(pictures.permute(0, 3, 1, 2)).last_hidden_state
+    torch.testing.assert_close(loaded(pictures), tokens[:, 0], atol=1e-5, rtol=0.0)
+
+
+def test_what_has_no_classes_is_refused_as_a_classifier(tmp_path: Path) -> None:
+    spec = published(tmp_path, "Dinov2Model")
+    with pytest.raises(ModelError, match=r"is a Dinov2Model, which answers with features .* use `task=similarity`"):
+        advsearch.load_model(spec)
+    network = transformers.Dinov2Model.from_pretrained(tmp_path)
+
+    class Wrapped(nn.Module):
+        def forward(self, x: Tensor) -> Any:
+            return network(x)
+
+    with pytest.raises(ModelError, match="features are what a network without a head gives: use `task=similarity`"):
+        advsearch.load_model(Wrapped(), input_size=16)
+    answer = network(torch.rand(2, 3, 16, 16))
+    torch.testing.assert_close(Similarity().read(answer, 2), answer.pooler_output)
+    with pytest.raises(ValueError, match=r"expected features \(2, D\)"):
+        Similarity().read(torch.zeros(2, 3, 4, 4), 2)
+
+
+# ---- references -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [1, 2, 50])
+def test_logits_are_the_mean_cosine_of_the_nearest_of_each_name(folder: Path, model: Model, k: int) -> None:
+    task = Similarity(references=str(folder), k=k).on(model)
+    asked = torch.stack([noisy(colour, 99) for colour in COLOURS.values()])
+    expected = []
+    for name in NAMES:
+        cosines = features(model, asked) @ features(model, own_pictures(folder, name)).T
+        expected.append(cosines.sort(dim=1, descending=True).values[:, :k].mean(dim=1))
+    logits = task.logits(model(asked))
+    torch.testing.assert_close(logits, torch.stack(expected, dim=1) / TEMPERATURE)
+    assert task.labels == NAMES and logits.argmax(dim=1).tolist() == [0, 1, 2]
+    assert [first.label for first, *_ in task.answers(model(asked), 2)] == list(NAMES)
+
+
+def test_a_linear_head_is_the_minimum_of_its_loss_and_the_same_each_time(folder: Path, model: Model) -> None:
+    task = Similarity(references=str(folder), method="linear").on(model)
+    again = Similarity(references=str(folder), method="linear").on(model)
+    assert task.gallery and task.gallery.head and again.gallery and again.gallery.head
+    assert all(torch.equal(*both) for both in zip(task.gallery.head, again.gallery.head, strict=True))
+    weights, biases = (one.double().requires_grad_() for one in task.gallery.head)
+    given, owners = task.gallery.features.double(), task.gallery.owners
+    shares = torch.stack([1.0 / (3 * (owners == one).sum()) for one in owners])
+    each = nn.functional.cross_entropy(given @ weights.T + biases, owners, reduction="none")
+    loss = (shares * each).sum() + 5e-4 * weights.square().sum()
+    slopes = torch.autograd.grad(loss, (weights, biases))
+    assert max(float(one.abs().max()) for one in slopes) < 1e-5
+    asked = torch.stack([noisy(colour, 98) for colour in COLOURS.values()])
+    assert task.logits(model(asked)).argmax(dim=1).tolist() == [0, 1, 2]
+
+
+def test_references_are_turned_upright_and_cut_to_the_shape_of_the_input(tmp_path: Path, model: Model) -> None:
+    tall = noisy(COLOURS["red"], 5, (24, 8))
+    turned = Image.Exif()
+    turned[0x0112] = 6  # the camera was held on its side: a viewer turns it with the clock
+    write(tmp_path / "a" / "0.png", tall.rot90(1), exif=turned)
+    write(tmp_path / "b" / "0.png", noisy(COLOURS["blue"], 6))
+    task = Similarity(references=str(tmp_path)).on(model)
+    assert task.gallery is not None
+    middle = torch.from_numpy(to_8bit(tall[8:16]).astype(np.float32) / 255)
+    torch.testing.assert_close(task.gallery.features[0], features(model, middle[None])[0])
+
+
+def test_a_judgement_says_where_the_right_one_stands(folder: Path, model: Model) -> None:
+    task = Similarity(references=str(folder)).on(model)
+    blue, green = (noisy(COLOURS[name], 97) for name in ("blue", "green"))
+    truth = task.truth(Facts("mug", label="blue"))
+    right, wrong = task.judge(model(torch.stack([blue, green])), truth)
+    assert task.gallery is not None
+    cosines = task.gallery.cosines(features(model, green[None]))[0]
+    own = cosines[task.gallery.owners == 0].max()
+    assert right.right and right.payload["rank"] == right.payload["name_rank"] == 1  # type: ignore[index, call-overload]
+    assert not wrong.right and wrong.answer.label == "green"
+    assert wrong.payload == {
+        "rank": 1 + int((cosines > own).sum()),
+        "references": 11,
+        "cosine": round(float(own), 4),
+        "name_rank": 2 if float(own) > float(cosines[task.gallery.owners == 2].max()) else 3,
+        "nearest": task.gallery.paths[int(cosines.argmax())],
+        "nearest_cosine": round(float(cosines.max()), 4),
+    }
+    assert 1 < wrong.payload["rank"] <= 8  # type: ignore[operator]
+    (broken,) = task.judge(torch.full((1, 12), torch.nan), truth)
+    assert broken.not_a_number and broken.payload is None
+
+
+@pytest.mark.parametrize(
+    ("objective", "options"),
+    [("margin", {}), ("margin", {"k": 3}), ("margin", {"method": "linear"}), ("log_odds", {}), ("dlr", {"k": 3})],
+)
+def test_objectives_of_logits_have_a_true_gradient(
+    folder: Path, model: Model, objective: str, options: dict[str, Any]
+) -> None:
+    task = Similarity(references=str(folder), **options).on(model)
+    found, picture = get_objective(objective, task), noisy((0.5, 0.5, 0.6), 96).requires_grad_()
+    (gradient,) = torch.autograd.grad(found(model(picture), picture[None], (0,)).sum(), picture)
+    step = 2e-3 * gradient / gradient.norm()
+    with torch.no_grad():
+        ends = [float(found(model(one), one[None], (0,))) for one in (picture + step, picture - step)]
+        value = float(found(model(picture), picture[None], (0,)))
+    assert ends[0] - ends[1] == pytest.approx(2.0 * 2e-3 * float(gradient.norm()), rel=0.02)
+    if objective == "margin":
+        assert value == pytest.approx(task.judge(model(picture.detach()), (0,))[0].margin)
+
+
+# ---- the clean picture ----------------------------------------------------------------------------------------------
+
+
+def test_a_threshold_compares_with_the_clean_picture(model: Model) -> None:
+    task = Similarity(threshold=0.8).on(model)
+    clean, other = noisy(COLOURS["red"], 1), noisy(COLOURS["blue"], 1)
+    assert task.looks and task.truth(Facts("mug", own_label="mug")) == (0,)
+    with pytest.raises(InputError, match="a clean picture that it was shown first"):
+        task.judge(model(clean), (0,))
+    task = task.seeing(model(clean), (0,))
+    assert not task.looks and task.seeing(model(other), (0,)) is task
+    same, different = task.judge(model(torch.stack([clean, other])), (0,))
+    assert same.right and same.answer.label == ITSELF and same.payload == {"cosine": 1.0}
+    assert same.margin == pytest.approx((0.8 - 1.0) / TEMPERATURE, rel=1e-3)
+    assert not different.right and different.answer.label == ELSE
+
+
+def test_the_distance_is_one_minus_the_cosine_and_leads_away_from_the_start(model: Model) -> None:
+    clean, other = noisy(COLOURS["red"], 1), noisy(COLOURS["blue"], 1)
+    objective = get_objective("distance", Similarity(), features=model, clean=clean)
+    cosine = float(features(model, clean[None])[0] @ features(model, other[None])[0])
+    value = float(objective(model(other), other[None], (0,)))
+    assert value == pytest.approx(1.0 - cosine, abs=2 * NEARBY)
+    start = clean.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(objective(model(start), start[None], (0,)).sum(), start)
+    with torch.no_grad():
+        moved = clean + 0.01 * slope / slope.norm()
+        assert float(objective(model(moved), moved[None], (0,))) > float(objective(model(clean), clean[None], (0,)))
+
+
+# ---- as a user types it ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """References of the bundled mug and bowl, and a network as a file."""
+    place = tmp_path_factory.mktemp("rendered")
+    network = advsearch.load_model(Embedder(), task="similarity", input_size=SIDE)
+    for name in ("mug", "bowl"):
+        for view in advsearch.render(
+            name, network, around=2, spp=2, denoise="none", task=Similarity(threshold=0)
+        ).views:
+            write(place / "refs" / name / f"{view.azimuth:.0f}.png", view.picture)
+    batch = {0: torch.export.Dim("batch", min=1, max=64)}
+    shape = torch.zeros(2, 3, SIDE, SIDE)
+    torch.export.save(torch.export.export(Banded().eval(), (shape,), dynamic_shapes=(batch,)), place / "net.pt2")
+    return place
+
+
+SMALL = ["--spp", "2", "--verify-spp", "4", "--trials", "6", "--measure", "no", "--no-baseline"]
+
+
+def typed(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
+    assert main([*command, "--json"]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+@pytest.mark.parametrize("objective", ["margin", "distance"])
+def test_an_attack_is_verified(
+    rendered: Path, objective: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(rendered)
+    flags = ["--task", "similarity={references: refs}", "--model", "net.pt2", "--objective", objective, *SMALL]
+    run = tmp_path / "run"
+    command = ["attack", "--object", "mug", *flags, "--epsilon", "0.5", "--run", str(run)]
+    command += ["--steps", "16" if objective == "margin" else "6"]
+    found = typed(capsys, *command)
+    assert found["clean"]["correct"] and found["clean"]["payload"]["rank"] == 1
+    assert found["ending"] == "found" and set(found["verified"]["labels"]) == {"bowl"}
+    kept = found["adversarial"]["payload"]
+    assert kept["rank"] > 1 and kept["references"] == 4 and kept["nearest"].startswith("bowl/")
+    assert f"right one at rank {kept['rank']} of 4" in (run / "report.html").read_text("utf-8")
+    if objective == "margin":
+        assert found["transport"]["used"]
+        return
+    write(rendered / "refs" / "bowl" / "more.png", torch.zeros(8, 8, 3))
+    (run / "summary.json").unlink()
+    try:
+        assert main(["resume", str(run)]) == 2
+    finally:
+        (rendered / "refs" / "bowl" / "more.png").unlink()
+    assert "cannot go on: refs is another file now than it was" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    assert typed(capsys, "resume", str(run))["verified"] == found["verified"]
+
+
+def test_a_sweep_counts_what_is_not_itself_any_more(
+    rendered: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    flags = ["--task", "similarity={threshold: 0.9}", "--model", str(rendered / "net.pt2"), "--trials", "0"]
+    flags += ["--grid", "camera.azimuth=40,220", "--spp", "2", "--denoise", "none"]
+    found = typed(capsys, "sweep", "--object", "mug", *flags, "--run", str(tmp_path / "run"))
+    assert (found["configurations"], found["correct"]) == (2, 1)
+    assert found["worst"]["claimed"]["label"] == ELSE and found["worst"]["claimed"]["payload"]["cosine"] < 0.9
+
+
+# ---- wrong uses -----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_wrong_with_references_is_said_in_a_sentence(folder: Path, model: Model, tmp_path: Path) -> None:
+    def said(references: Path, **options: Any) -> str:
+        with pytest.raises(AdvsearchError) as error:
+            Similarity(references=str(references), **options).on(model)
+        return str(error.value)
+
+    assert "(No such file or directory); check the path" in said(tmp_path / "none")
+    assert "(Not a directory)" in said(folder / "red" / "0.png")
+    (tmp_path / "empty").mkdir()
+    assert "two folders of pictures at least" in said(tmp_path / "empty") and "got no folder" in said(
+        tmp_path / "empty"
+    )
+    (tmp_path / "empty" / "mug").mkdir()
+    assert "got only mug" in said(tmp_path / "empty")
+    (tmp_path / "empty" / "bowl").mkdir()
+    assert "expected pictures of bowl" in said(tmp_path / "empty")
+    (folder / "red" / "notes.txt").write_text("no picture")
+    assert "notes.txt: expected a picture file such as PNG" in said(folder)
+    (folder / "red" / "notes.txt").unlink()
+    (folder / "red" / "inner").mkdir()
+    assert "inner: expected a picture file such as PNG, got a directory" in said(folder)
+
+
+def test_huge_and_many_references_are_refused(folder: Path, model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ADVSEARCH_LIMITS", "1e-6")  # 67 pixels
+    write(folder / "red" / "0.png", torch.zeros(100, 100, 3))
+    with pytest.raises(AdvsearchError, match="if you trust it"):
+        Similarity(references=str(folder)).on(model)
+
+
+def test_names_that_are_not_there_are_refused_with_those_that_are(folder: Path, model: Model) -> None:
+    task = Similarity(references=str(folder)).on(model)
+    with pytest.raises(InputError, match=r"label: .* no label 'blu'. Did you mean 'blue' \(#0\)"):
+        task.check(Facts("mug", label="blu"))
+    with pytest.raises(InputError, match=r"label: the label of mug itself does not fit .* blue, green, red"):
+        task.check(Facts("mug", own_label="mug"))
+    with pytest.raises(InputError, match=r"target: .* no label 'pink'"):
+        Similarity(references=str(folder)).on(model, target="pink")
+    with pytest.raises(InputError, match="labels: the names of task similarity are those of its folders"):
+        advsearch.load_model(Embedder(), task="similarity", input_size=8, labels=["a", "b"])
+
+
+def test_options_that_make_no_sense_are_refused(model: Model) -> None:
+    cases: dict[str, dict[str, Any]] = {
+        "method: expected one of nearest, linear": {"method": "near"},
+        "k: expected a whole number": {"k": 0},
+        "k: belongs to": {"k": 3, "method": "linear"},
+        "threshold: expected a cosine": {"threshold": 1.5},
+        "leave `references` out": {"threshold": 0.5, "references": "refs"},
+    }
+    for text, options in cases.items():
+        with pytest.raises(InputError, match=text):
+            make_task({"name": "similarity", **options})
+    with pytest.raises(InputError, match="got neither"):
+        Similarity().on(model)
+    bar = Similarity(threshold=0.5)
+    for refused in (lambda: bar.on(model, target="mug"), lambda: bar.on(model).check(Facts("mug", label="mug"))):
+        with pytest.raises(InputError, match="knows no names"):
+            refused()
+    with pytest.raises(InputError, match="it was loaded for its logits"):
+        bar.on(replace(model, read=None))
+    with pytest.raises(InputError, match=r"expected one of task similarity .*distance.*got vanish"):
+        check_objective("vanish", "similarity")
+    with pytest.raises(InputError, match="got distance, which takes outputs of similarity"):
+        check_objective("distance", "classification")
+
+
+def test_a_folder_of_references_has_one_digest(folder: Path) -> None:
+    settings = {"task": {"name": "similarity", "references": str(folder)}, "run": str(folder)}
+    before = file_digests(settings)
+    assert list(before) == [str(folder)]
+    write(folder / "red" / "0.png", torch.ones(8, 8, 3))
+    assert file_digests(settings) != before

@@ -1,0 +1,154 @@
+"""Two tasks at once, with a model each: one answer against both."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from small_models import SIDE, Finder, Painter, Ranger
+from torch import nn
+
+import advsearch
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
+from advsearch.engine.objective import objective_for
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.models import Model
+from advsearch.models.ensemble import together
+from advsearch.runs.images import read_png
+from advsearch.runs.store import Store
+from advsearch.tasks import Depth, Detection, Facts, Segmentation, Sight, Task, make_task
+from advsearch.tasks.depth import AS_FAR, DISPARITY, GONE
+from advsearch.tasks.together import Together
+
+BOTH = {"name": "detection+depth", "depth": {"kind": DISPARITY}}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A detector and a network of depth as files, with a comma between them."""
+    folder = tmp_path_factory.mktemp("both")
+    batch = {0: torch.export.Dim("batch", min=1, max=64)}
+    networks: dict[str, nn.Module] = {"finder": Finder(), "ranger": Ranger()}
+    for name, network in networks.items():
+        program = torch.export.export(network.eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
+        torch.export.save(program, folder / f"{name}.pt2")
+    return ",".join(str(folder / f"{name}.pt2") for name in networks)
+
+
+def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
+    """Type a command, and return what it prints."""
+    assert main(list(command)) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_one_answer_against_a_detector_and_a_model_of_depth(
+    files: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    found = answer(
+        capsys, "attack", "--object", "mug", "--task", f"detection+depth={{kind: {DISPARITY}, seek: gone}}",
+        "--model", files, "--labels", "cup,bowl,dog", "--label", "cup", "--epsilon", "0.5", "--steps", "12",
+        "--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none", "--trials", "6", "--no-baseline",
+        "--run", str(run), "--json",
+    )  # fmt: skip
+    assert found["ending"] == "found" and found["objective"] == "each" and found["task"] == "detection+depth"
+    assert found["clean"]["label"] == f"cup; {AS_FAR}" and found["verified"]["labels"] == {f"bowl; {GONE}": 6}
+    with Store(run / "results.sqlite", read_only=True) as store:
+        payloads: list[Any] = [row.payload for row in store.rows("verification")]
+    for one in payloads:
+        assert {"bowl"} == {box["label"] for box in one["finder"]["found"] if box["score"] > 0.5}
+        assert one["ranger"]["relief"] < 0.5
+    drawn = read_png(run / "images" / "clean-answer.png")
+    for colour in ((0, 190, 255), (255, 110, 0)):  # a true box, and the detector's; depth tints
+        assert (abs(drawn - torch.tensor(colour).numpy() / 255) < 1 / 255).all(axis=2).sum() > 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "flags"),
+    [
+        ("sweep", ["--grid", "camera.elevation=25,85", "--trials", "6"]),
+        ("gap", ["--control", "pose", "--trials", "6", "--steps", "3", "--average", "4", "--policy", "random"]),
+    ],
+)
+def test_other_commands_take_both(
+    files: str, command: str, flags: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    asked = ["--object", "mug", "--task", f"detection+depth={{kind: {DISPARITY}}}", "--model", files]
+    asked += ["--labels", "cup,bowl,dog", "--label", "cup", "--spp", "2", "--denoise", "none"]
+    found = answer(capsys, command, *asked, *flags, "--run", str(tmp_path / "run"), "--json")
+    assert found["task"] == "detection+depth" and not list((tmp_path / "run").glob("*.tmp"))
+
+
+# ---- how it is asked for --------------------------------------------------------------------------------------------
+
+FORMS: list[tuple[Any, Any]] = [
+    ("detection+depth", "detection+depth"),
+    ("detection={iou: 0.7} + depth", {"name": "detection+depth", "detection": {"iou": 0.7}}),
+    (f"detection+depth={{kind: {DISPARITY}}}", BOTH),
+    (f"detection+depth={{depth: {{kind: {DISPARITY}}}}}", BOTH),
+    (["detection", {"name": "depth", "kind": DISPARITY}], BOTH),
+    (BOTH, BOTH),
+]
+
+
+@pytest.mark.parametrize(("asked", "kept"), FORMS)
+def test_tasks_are_joined_by_a_plus_or_in_a_list(asked: Any, kept: Any) -> None:
+    config = AttackConfig(object="mug", model="a.pt2,b.pt2", task=asked)
+    assert config.task == kept and config.models == ("a.pt2,b.pt2",) and not config.is_matrix
+    made = make_task(config.task)
+    assert isinstance(made, Together) and [type(one) for one in made.parts] == [Detection, Depth]
+
+
+def test_each_task_has_a_model() -> None:
+    with pytest.raises(InputError, match="model: expected 2 with commas between them, one for each of detection, dept"):
+        AttackConfig(object="mug", model="a.pt2", task="detection+depth")
+    with pytest.raises(UnknownNameError, match="unknown task 'deep'"):
+        make_task("detection+deep")
+    with pytest.raises(UnknownNameError, match="option of task 'detection\\+depth'"):
+        make_task({"name": "detection+depth", "segmentation": {}})
+    assert AttackConfig(object="mug", model="a.pt2,b.pt2", task="depth").is_matrix
+
+
+# ---- what is judged -------------------------------------------------------------------------------------------------
+
+
+def models(*tasks: tuple[nn.Module, Task, Any]) -> list[Model]:
+    return [
+        advsearch.load_model(network, input_size=SIDE, task=task, labels=labels, name=type(network).__name__)
+        for network, task, labels in tasks
+    ]
+
+
+def test_each_is_judged_by_its_own_rule() -> None:
+    """A label goes to the task that takes one, a picture to both; the objective is the least of both."""
+    parts = (Segmentation(), Depth(kind=DISPARITY, seek="farther"))
+    both = models((Painter(), parts[0], ["background", "mug", "dog"]), (Ranger(), parts[1], None))
+    task = Together(parts=parts).on(model := together(both))
+    mask = torch.zeros(SIDE, SIDE).bool()
+    mask[8:20, 8:20] = True
+    distance = torch.linspace(3.0, 2.0, SIDE)[:, None].expand(SIDE, SIDE) - 0.5 * mask
+    facts = Facts("mug", "mug", look=lambda: Sight(mask, distance, distance))
+    task.check(facts)
+    truth = task.truth(facts)
+    output = model(torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)))
+    task = task.seeing(output, truth)
+    assert task.looks and not task.unsaid and len(task.remarks) == 1
+    own = list(zip(task.tasks, output[0], truth, strict=True))
+    margins = [float(one.margin(said, true)) for one, said, true in own]
+    scores = [float(one.score(said, true)) for one, said, true in own]
+    (judged,) = task.judge(output, truth)
+    assert judged.margin == max(margins) and judged.score == min(scores) and judged.right is (max(margins) <= 0.0)
+    objective, _ = objective_for("each", task, model, None, 0)  # type: ignore[arg-type]
+    values = [float(parts[0].pixel_margin(output[0][0], truth[0])), scores[1]]
+    assert float(objective(output, torch.zeros(1), truth)) == pytest.approx(min(values))
+    assert judged.answer.label.count(";") == 1 and task.told(task.tasks[1], facts).label is None
+    with pytest.raises(InputError, match="model: expected 2, one for each task, got 1"):
+        Together(parts=parts).on(both[0])
+    with pytest.raises(InputError, match="label: task depth has no classes"):
+        Together(parts=parts[1:], tasks=task.tasks[1:]).check(facts)
