@@ -248,6 +248,7 @@ def test_a_name_that_begins_another_is_said(tmp_path: Path) -> None:
 WRONG: dict[str, tuple[dict[str, Any], type[AdvsearchError], str]] = {
     "no names": ({}, InputError, "labels: expected two names at least, .* got none; with `task=answer` it"),
     "one name": ({"labels": ["mug"]}, InputError, "labels: expected two names at least, .* got 'mug'"),
+    "another task": ({"task": "depth"}, ModelError, "cannot do task depth; use `task=classification` or `task=answer`"),
     "names of an answer": ({"labels": NAMES, "task": "answer"}, InputError, "task answer has no classes; leave them"),
     "two questions": ({"labels": NAMES, "prompt": "a | b"}, InputError, "prompt: expected one question .* got 2"),
     "too long": ({"labels": NAMES, "prompt": "the " * 64}, InputError, "to have at most 64 tokens for model .* got 7"),

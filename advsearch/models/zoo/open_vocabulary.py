@@ -43,7 +43,7 @@ def source(loaded: Loaded) -> Source:
 
 def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
     """Return the detector of these names."""
-    names = purpose.named(name, "finds what it is told to")
+    names = purpose.named(name, "finds what it is told to", "detection")
     try:
         with torch.no_grad():
             network = sharing_copy(network).eval()
@@ -69,6 +69,7 @@ class _Owl(nn.Module):
     """
 
     rows: Tensor
+    boxes_are_corners_in_pixels = True
 
     def __init__(self, network: Any, rows: Tensor) -> None:
         super().__init__()
@@ -109,6 +110,7 @@ class _Grounded(nn.Module):
 
     text: Tensor
     places: Tensor
+    boxes_are_corners_in_pixels = True
 
     def __init__(self, network: Any, text: Tensor, places: Tensor) -> None:
         super().__init__()

@@ -60,7 +60,7 @@ def check_takes_pictures(network: Any, spec: str) -> None:
 
 def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
     """Return the classifier of these names."""
-    names = purpose.named(name, "compares a picture with texts")
+    names = purpose.named(name, "compares a picture with texts", "classification")
     prompts = patterns(purpose.prompts)
     if len(names) < 2:
         raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
