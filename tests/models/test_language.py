@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -358,3 +359,10 @@ def test_its_free_answer_is_attacked(tmp_path: Path, capsys: pytest.CaptureFixtu
     kept = [read_png(run / "images" / f"verification-{number:02d}.png") for number in range(4)]
     told = [spoken(tmp_path / "llava", np.rint(one * 255).astype(np.uint8), 3) for one in kept]
     assert [row.label for row in rows[:4]] == [text or "(nothing)" for text in told] and any(told)
+
+
+def test_an_answer_that_goes_on_otherwise_is_no_masked_gradient(tmp_path: Path) -> None:
+    """After a small step it may say another word, and then all logits after it are others."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ModelWarning)
+        assert advsearch.load_model(published(tmp_path, llava()), task="answer").differentiable
