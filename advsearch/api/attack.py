@@ -76,8 +76,8 @@ from advsearch.runs.directory import only_here as only_python_has
 from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import next_count
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
-from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task

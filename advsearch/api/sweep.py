@@ -50,7 +50,7 @@ from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, fi
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import attack_of
 from advsearch.scene.description import ENVIRONMENT
-from advsearch.scene.mitsuba_backend.samplers import next_count
+from advsearch.scene.formation import next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES, split_names
 from advsearch.tasks import AnyTask, Task, make_task

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from advsearch.controls.clean import Moved
@@ -186,16 +185,15 @@ class Control(ABC):
         Raises:
             UnknownNameError: there is none of that name.
         """
-        if self.mesh in {one.name for one in scene.parts if isinstance(one, PluginPart)}:
+        mesh = self.mesh
+        if mesh in scene.meshes:
+            return scene.meshes[mesh]
+        if any(one.name == mesh for one in scene.parts if isinstance(one, PluginPart)):
             raise InputError(
-                f"`controls` {self.name}: {self.mesh} is around the object in a Mitsuba scene, and stays as it is; "
-                f"make it the object, or vary its numbers by Mitsuba's names, mitsuba:{self.mesh}.KEY=[low, high]"
+                f"`controls` {self.name}: {mesh} is around the object in a Mitsuba scene, and stays as it is; "
+                f"make it the object, or vary its numbers by Mitsuba's names, mitsuba:{mesh}.KEY=[low, high]"
             )
-        if self.mesh not in scene.meshes:
-            raise UnknownNameError(
-                "mesh of the scene", self.mesh, scene.meshes, f"It stands in `controls` {self.name}."
-            )
-        return scene.meshes[self.mesh]
+        raise UnknownNameError("mesh of the scene", mesh, scene.meshes, f"It stands in `controls` {self.name}.")
 
     def setting(self, parameter: Parameter) -> str:
         """Return the name of the scene's setting that says the same as a parameter, whether or not there is one."""
@@ -247,8 +245,3 @@ class Control(ABC):
         Raises:
             InputError: a setting of the control is impossible in this scene.
         """
-
-
-def scalar(value: float) -> Tensor:
-    """Return a number as a float32 tensor without dimensions."""
-    return torch.tensor(value, dtype=torch.float32)

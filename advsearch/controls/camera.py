@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter, scalar
+from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
@@ -107,7 +107,7 @@ class CameraControl(NumberControl):
         if isinstance(fov, Fixed):
             return scene.with_values(camera__fov=float(fov.value))
         if isinstance(focal_length, Fixed):
-            return scene.with_values(camera__fov=_fov_of(scalar(float(focal_length.value))).item())
+            return scene.with_values(camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item())
         return scene
 
     def _orbit(self, scene: SceneDescription, values: Values, distance: Tensor) -> Tensor:

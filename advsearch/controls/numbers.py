@@ -31,7 +31,6 @@ from advsearch.controls.base import (
     Group,
     Parameter,
     Value,
-    scalar,
 )
 from advsearch.controls.clean import Moved, apart, check_start, nearest, same
 from advsearch.controls.values import (
@@ -244,18 +243,6 @@ class Slot:
             return [(spec.values.index(value) + 0.5) / len(spec.values)]
         return [to_unit(spec, self.parameter.log, float(value))] * self.size
 
-    def value(self, u: Tensor) -> Tensor:
-        """The value at a configuration: a float32 tensor of the parameter's shape, or the number of an option."""
-        parameter, spec = self.parameter, self.spec
-        if isinstance(spec, Range):
-            part = u[self.begin : self.begin + self.size]
-            value = to_value(spec, parameter.log, part)
-            return value.reshape(()) if not parameter.shape else value
-        chosen = spec.value if isinstance(spec, Fixed) else spec.values[option_index(len(spec.values), u[self.begin])]
-        if isinstance(chosen, str):
-            return scalar(float(parameter.options.index(chosen))).to(u.device)
-        return (scalar(chosen) if not parameter.shape else torch.full((self.size,), float(chosen))).to(u.device)
-
 
 class BoundNumbers(BoundControl):
     """A `NumberControl` in a scene.
@@ -270,6 +257,7 @@ class BoundNumbers(BoundControl):
         self.name = control.name
         self.refines = control.refines(scene)
         self.slots = slots
+        self._draws = type(control).on_picture is not NumberControl.on_picture
         self.moved = tuple(control.moved(scene, slots))
         self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
@@ -289,8 +277,21 @@ class BoundNumbers(BoundControl):
         )
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        """Return every parameter's value at a slice of u, fixed ones too."""
-        return {slot.parameter.name: slot.value(u) for slot in self.slots}
+        """Return every parameter's value at a slice of u: float32 of the parameter's shape, or the number of an option.
+        Fixed ones are there too.
+        """
+        found: dict[str, Tensor] = {}
+        for slot in self.slots:
+            parameter, spec = slot.parameter, slot.spec
+            if isinstance(spec, Range):
+                value = to_value(spec, parameter.log, u[slot.begin : slot.begin + slot.size])
+                found[parameter.name] = value if parameter.shape else value.reshape(())
+                continue
+            one = spec.value if isinstance(spec, Fixed) else spec.values[option_index(len(spec.values), u[slot.begin])]
+            shape = (slot.size,) if parameter.shape and not isinstance(one, str) else ()
+            number = parameter.options.index(one) if isinstance(one, str) else one
+            found[parameter.name] = torch.full(shape, float(number), dtype=torch.float32, device=u.device)
+        return found
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
         named = {slot.parameter.name for slot in self.slots if slot.parameter.options}
@@ -300,14 +301,13 @@ class BoundNumbers(BoundControl):
         return self.control.scene_inputs(self.scene, self.values(u), so_far)
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        return self.control.on_picture(self.scene, self.values(u), image)
+        return self.control.on_picture(self.scene, self.values(u), image) if self._draws else image
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        u = u.detach()
-        values = self.values(u)
+        values = self.values(u.detach())
         said: dict[str, Value] = {}
         for slot in self.slots:
-            if slot.width == 0:
+            if isinstance(slot.spec, Fixed):
                 continue
             parameter, value = slot.parameter, values[slot.parameter.name]
             if parameter.options:

@@ -59,7 +59,8 @@ class PoseControl(NumberControl):
             raise InputError(f"{self.name}.on_ground: expected yes or no, got {given!r}")
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        base, vertices, floor = _standing(self.mesh_in(scene), scene.around.get(self.mesh))
+        mesh = self.mesh_in(scene)
+        base, vertices, floor = _standing(mesh, scene.around.get(mesh.name))
         base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
         middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
         turned = rotation_vector(values["rotation"]) @ euler(values["yaw"], values["pitch"], values["roll"])
@@ -70,7 +71,7 @@ class PoseControl(NumberControl):
             lowest = floor - middle[2]
         shift = torch.stack([values["x"], values["y"], floor + values["z"] - lowest])
         translation = shift - linear @ middle + torch.cat([middle[:2], middle.new_zeros(1)])
-        return {f"{self.mesh}.to_world": affine(linear, translation) @ base}
+        return {f"{mesh.name}.to_world": affine(linear, translation) @ base}
 
 
 @lru_cache(maxsize=16)

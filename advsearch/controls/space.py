@@ -71,10 +71,20 @@ class Space:
                 begin += group.size
         return tuple(found)
 
-    def slices(self, u: Tensor) -> Sequence[tuple[BoundControl, Tensor]]:
+    @cached_property
+    def sizes(self) -> list[int]:
+        """How many coordinates each control has."""
+        return [len(control.start) for control in self.controls]
+
+    def slices(self, u: Tensor) -> list[tuple[BoundControl, Tensor]]:
         """Return each control with its slice of u."""
-        parts = torch.split(u, [len(control.start) for control in self.controls]) if self.controls else ()
-        return list(zip(self.controls, parts, strict=True))
+        return list(zip(self.controls, u.split(self.sizes), strict=True))
+
+    @cached_property
+    def _turns(self) -> tuple[int, ...]:
+        """The numbers of the controls: those later that refine what others set, and last those that lie on top."""
+        kinds = [(bool(one.refines), one.on_top) for one in self.controls]
+        return tuple(sorted(range(len(kinds)), key=kinds.__getitem__))
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Map u to scene inputs, by differentiable torch operations.
@@ -85,25 +95,26 @@ class Space:
         Raises:
             InputError: two controls set one input.
         """
-        merged: dict[str, Tensor] = {}
-        for control, part in self._in_turn(u):
-            merged = _with_inputs(control, part, merged)
+        parts, merged = u.split(self.sizes), dict[str, Tensor]()
+        for number in self._turns:
+            control = self.controls[number]
+            own = control.inputs(parts[number], merged)
+            for name in own:
+                if name in merged and name not in control.refines:
+                    hint = "; one `texture` takes several materials" if name.endswith(".base_color") else ""
+                    raise InputError(f"controls: two controls set {name}; leave one of them out{hint}")
+            merged = {**merged, **own}
         return merged
 
-    def _in_turn(self, u: Tensor) -> Sequence[tuple[BoundControl, Tensor]]:
-        """Controls with their slices of u: those later that refine what others set, and last those that lie on top."""
-        return sorted(self.slices(u), key=lambda one: (bool(one[0].refines), one[0].on_top))
-
-    def _among_others(self, u: Tensor) -> dict[BoundControl, tuple[Tensor, Mapping[str, Tensor]]]:
-        """Each control's slice of u and the inputs of the controls before it, for those that take any."""
-        turns = self._in_turn(u.detach())
-        found: dict[BoundControl, tuple[Tensor, Mapping[str, Tensor]]] = {}
-        so_far: Mapping[str, Tensor] = NOTHING
-        for number, (control, part) in enumerate(turns):
-            found[control] = part, so_far if control.refines else NOTHING
-            if any(later.refines for later, _ in turns[number + 1 :]):
-                so_far = _with_inputs(control, part, so_far)
-        return {control: found[control] for control in self.controls}
+    def _among_others(self, u: Tensor) -> list[tuple[BoundControl, Tensor, Mapping[str, Tensor]]]:
+        """Each control with its slice of u and the inputs of those before it, if it takes any."""
+        parts, so_far, found = u.detach().split(self.sizes), NOTHING, dict[int, Mapping[str, Tensor]]()
+        for turn, number in enumerate(self._turns):
+            control = self.controls[number]
+            found[number] = so_far if control.refines else NOTHING
+            if any(self.controls[later].refines for later in self._turns[turn + 1 :]):
+                so_far = {**so_far, **control.inputs(parts[number], so_far)}
+        return [(control, parts[number], found[number]) for number, control in enumerate(self.controls)]
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Apply what controls do to the finished picture (H, W, 3) sRGB, in their order; differentiable in both."""
@@ -114,9 +125,9 @@ class Space:
     def describe(self, u: Tensor, controls: Sequence[BoundControl] | None = None) -> dict[str, Value]:
         """Say a configuration in a few named values with units: what some of the controls say of it, or else all."""
         found: dict[str, Value] = {}
-        for control, arguments in self._among_others(u).items():
+        for control, part, so_far in self._among_others(u):
             if controls is None or control in controls:
-                found.update(control.describe(*arguments))
+                found.update(control.describe(part, so_far))
         return found
 
     def printed(self, u: Tensor) -> dict[str, Tensor]:
@@ -138,13 +149,11 @@ class Space:
         Raises:
             InputError: no number of controls has so many coordinates.
         """
-        sizes = [len(control.start) for control in self.controls]
+        sizes = self.sizes
         count = next((k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)), None)
         if count is None:
             raise InputError(f"controls: expected the coordinates of whole controls, of {sizes} each, got {len(u)}")
-        held = [
-            _Held(control, part) for control, part in zip(self.controls, torch.split(u, sizes[:count]), strict=False)
-        ]
+        held = [_Held(control, part) for control, part in zip(self.controls, u.split(sizes[:count]), strict=False)]
         chosen = Space(self.controls[:count], self.scene)
         lit_by = chosen.lit_by(chosen.describe(u)) or self.environment
         return replace(self, controls=(*held, *self.controls[count:]), environment=lit_by)
@@ -163,14 +172,12 @@ class Space:
 
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return the pictures worth keeping of a configuration, by file stem."""
-        parts = self._among_others(u).items()
-        named = (control.artifacts(*arguments) for control, arguments in parts)
+        named = (control.artifacts(part, so_far) for control, part, so_far in self._among_others(u))
         return {file_name(name): image for one in named for name, image in one.items()}
 
     def files(self, u: Tensor) -> dict[str, bytes]:
         """Return the other files worth keeping of a configuration, by name."""
-        parts = self._among_others(u).items()
-        named = (control.files(*arguments) for control, arguments in parts)
+        named = (control.files(part, so_far) for control, part, so_far in self._among_others(u))
         return {file_name(name): data for one in named for name, data in one.items()}
 
 
@@ -198,17 +205,3 @@ class _Held(BoundControl):
 def file_name(name: str) -> str:
     """Return a control's name as it stands in names of files: texture@chair of texture:chair."""
     return name.replace(":", "@")
-
-
-def _with_inputs(control: BoundControl, u: Tensor, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the inputs of the controls before one with its own laid over them.
-
-    Raises:
-        InputError: it sets what one before has set, and does not refine it.
-    """
-    own = control.inputs(u, so_far)
-    for name in own:
-        if name in so_far and name not in control.refines:
-            hint = "; one `texture` takes several materials" if name.endswith(".base_color") else ""
-            raise InputError(f"controls: two controls set {name}; leave one of them out{hint}")
-    return {**so_far, **own}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from advsearch.attacks.sample_count import LADDER
-from advsearch.scene.mitsuba_backend.samplers import next_count
+from advsearch.scene.formation import next_count
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,10 @@ from advsearch.scene.description import (
     check_one_environment,
     describe,
 )
-from advsearch.scene.formation import ImageFormation
+from advsearch.scene.formation import SAMPLER, ImageFormation
 from advsearch.scene.gradients.motion import Motion
 from advsearch.scene.importing.images import read_picture
 from advsearch.scene.leaving_out import EVERYTHING
-from advsearch.scene.mitsuba_backend.samplers import SAMPLER
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import Given

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -111,7 +112,7 @@ class Problem:
     def _over(self) -> bool:
         return self.searched is not None and self.searched < len(self.space.controls)
 
-    @property
+    @cached_property
     def searched_space(self) -> Space:
         """The controls that are searched, as a space of their own: it describes and keeps what was found."""
         return replace(self.space, controls=self.space.controls[: self.searched])

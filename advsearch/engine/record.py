@@ -210,6 +210,8 @@ class Recorder:
 
     def _machine(self) -> str | None:
         """The machine on which the picture of this row was made, if that is not like this one."""
+        if self.ahead.executor is None:
+            return None
         name = self.ahead.machine_of_row()
         self.machines.meet(name, self.ahead.facts)
         return name

@@ -29,8 +29,7 @@ from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
-from advsearch.scene.formation import ImageFormation, to_8_bit
-from advsearch.scene.mitsuba_backend.samplers import SAMPLER
+from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
 from advsearch.scene.surfaces import Surfaces
 from advsearch.settings import as_python
 from advsearch.tasks import Answer, AnyTask, Facts, Mark, Sight, make_task

@@ -180,7 +180,8 @@ class Searches:
 
         def make(tell: OnImage | None) -> Evaluate:
             made = (self.problem if transport is None else transport).evaluator(kind, tell)
-            made = made if transport is not None else self.recorder.ahead.evaluator(self.problem, made, kind, tell)
+            if transport is None and self.recorder.ahead.executor is not None:
+                made = self.recorder.ahead.evaluator(self.problem, made, kind, tell)
             return less_print_terms(made, self.problem.searched_space) if self._penalises(kind) else made
 
         if transport is None:

@@ -238,6 +238,9 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.
     """
+    if isinstance(output, Tensor) and output.is_floating_point() and output.shape == (count, classes):
+        mend_batch_norms(output)
+        return output.float()
     tensor = _tensor_in(output)
     expected = f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
     if advice := _no_scores(output):

@@ -314,18 +314,15 @@ _JSON = json.JSONEncoder(allow_nan=False)
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     """Return the row's columns. Numbers of numpy and torch become Python's."""
-    return (*(_held(name, getattr(row, name)) for name in _OTHERS), stamp, row.id)
-
-
-def _held(name: str, value: Any) -> Any:
-    if name not in _AS_JSON:
-        return _column(value)
-    return None if value is None or (name == "metrics" and not value) else _json(value)
-
-
-def _column(value: Any) -> Any:
-    simple = type(value) in _SIMPLE or (type(value) is float and value - value == 0.0)
-    return value if simple else plain(value)
+    values = []
+    for name in _OTHERS:
+        value = getattr(row, name)
+        if name in _AS_JSON and value is not None:
+            value = _json(value) if value or name != "metrics" else None
+        elif type(value) not in _SIMPLE and not (type(value) is float and math.isfinite(value)):
+            value = plain(value)
+        values.append(value)
+    return (*values, stamp, row.id)
 
 
 def _json(value: object) -> str:

@@ -129,7 +129,7 @@ class SceneDescription:
         under_test = mesh_part(OBJECT, self.object, object_to_world(self), self.material)
         return {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
 
-    @property
+    @cached_property
     def around(self) -> Mapping[str, MeshPart]:
         """The meshes around the object by name, as they came."""
         return {one.name: one for one in self.parts if isinstance(one, MeshPart)}

@@ -8,6 +8,7 @@ Verification then rounds to 8 bits, as a file would.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -15,10 +16,14 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.mitsuba_backend.samplers import SAMPLER, SAMPLERS
 
 DENOISERS = ("oidn", "none")
 FILTERS = ("box", "gaussian")
+SAMPLERS = ("independent", "multijitter")
+"""Samplers of a run's image formation; `advsearch precision` compares more."""
+SAMPLER = "multijitter"
+"""The one that is taken where nobody asks: its pictures are as good with a third of the samples."""
+PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61, 67, 71, 73, 79, 83, 89, 97, 101)
 DARK = 1e-6
 """Keeps the slope of a power finite in black; half of one of 255 levels comes of it."""
 
@@ -85,3 +90,23 @@ def levels_of(display: Tensor) -> Tensor:
 def to_8_bit(display: Tensor) -> Tensor:
     """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not differentiable."""
     return (display.detach() * 255.0).round() / 255.0
+
+
+def next_count(sampler: str, samples: float) -> int:
+    """Return the number of samples that a sampler takes when it is asked for at least so many.
+
+    Independent samples come in any number; stratified ones in squares, multi-jittered ones in products of two near
+    numbers, orthogonal arrays in squares of primes, the low-discrepancy sequence in powers of four.
+    """
+    whole = max(1, math.ceil(samples - 1e-9))
+    root = math.isqrt(whole - 1) + 1
+    if sampler == "stratified":
+        return root**2
+    if sampler == "multijitter":
+        wide = max(1, math.isqrt(whole))
+        return wide * math.ceil(whole / wide)
+    if sampler == "orthogonal":
+        return next((prime for prime in PRIMES if prime >= root), PRIMES[-1]) ** 2
+    if sampler == "ldsampler":
+        return int(4 ** math.ceil(math.log(max(4, whole), 4) - 1e-9))
+    return whole

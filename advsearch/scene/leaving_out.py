@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 ITEMS: Mapping[str, str] = {
-    "tracing": "tracing a render anew: it is recorded once and replayed, until a shape moves",
+    "tracing": "tracing a render anew: it is recorded once and replayed",
     "uploads": "writing inputs that are as they were, with the sampling tables and the ray tracing tree that follow",
     "gradients": "derivatives of inputs that no coordinate reaches",
     "boundary": "boundary terms of an adjoint where nothing that it differentiates moves an outline",

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -99,6 +99,7 @@ class Renderer:
         self.space = space
         self.formation = formation
         self.root_seed = root_seed
+        self._shape = space.start.shape
         self._source: Source | None = None
         self.renders = 0
         self.gradients = 0
@@ -161,11 +162,12 @@ class Renderer:
         if u.ndim == 2 and len(u):
             return torch.stack([self(one, seed, spp) for one in u])
         self._check(u, spp)
-        with _outside_inference(u) as u:
-            image = self._picture(u, seed, spp)
-            if u.requires_grad and torch.is_grad_enabled() and self._differenced():
-                result: Tensor = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
-                return result
+        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+            u = u.clone() if u.is_inference() else u
+            through = self._through(u) if u.requires_grad else u
+            image = self._picture(through, seed, spp)
+            if through is not u and torch.is_grad_enabled() and self._differenced():
+                image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
             return image
 
     def radiance(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
@@ -174,8 +176,9 @@ class Renderer:
         Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not.
         """
         u = self._check(_tensor(u), spp)
-        with _outside_inference(u) as u:
-            return self._radiance(self._through(u), seed, spp)
+        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+            through = self._through(u.clone() if u.is_inference() else u)
+            return self._formed(self.scene.assembly(self.space.inputs(through)), seed, spp)
 
     def mask(self, u: Configuration) -> Tensor:
         """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.
@@ -193,7 +196,7 @@ class Renderer:
         """
         u = self._check(_tensor(u), 1)
         with torch.no_grad():
-            inputs = self._assembled(u)
+            inputs = self.scene.assembly(self.space.inputs(u))
         return self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE}, fineness)
 
     def gradient(
@@ -222,7 +225,7 @@ class Renderer:
         finally:
             self._left_out = frozenset()
         derivative = torch.zeros_like(at) if found is None else found
-        secants = () if free else self.plan.having("secant")
+        secants = [group for group in self.plan.groups if group.estimator == "secant" and not free]
         if secants:
             noise, count = seeds.stream(self.root_seed, "differences", seed), self.plan.spp or spp
             with torch.no_grad():
@@ -231,44 +234,41 @@ class Renderer:
         return value.detach(), derivative
 
     def _check(self, u: Tensor, spp: int) -> Tensor:
-        if u.shape != self.start.shape:
-            raise InputError(f"render: expected u of shape {tuple(self.start.shape)}, got {tuple(u.shape)}")
+        if u.shape != self._shape:
+            raise InputError(f"render: expected u of shape {tuple(self._shape)}, got {tuple(u.shape)}")
         if not 1 <= spp <= MAX_SPP:
             raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
         low, high = torch.aminmax(u.detach()) if u.numel() else (u.sum(), u.sum())
         if not bool((low >= 0.0) & (high <= 1.0)):
             raise InputError("render: expected every entry of u in [0, 1]; project u before you render it")
+        if u.is_inference() and u.requires_grad:
+            raise InputError(
+                "render: u was made in `torch.inference_mode()`, so that nothing can be differentiated with respect to "
+                "it; make it outside, or pass `u.detach()` for the picture alone"
+            )
         return u
 
     # ---- from u to the picture --------------------------------------------------------------------------------------
 
+    def _picture(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        radiance = self._formed(self.scene.assembly(self.space.inputs(u)), seed, spp)
+        return self.space.picture(u, self.formation.display(radiance))
+
     def _through(self, u: Tensor) -> Tensor:
         """Return u with a graph only where the derivative runs back through scene inputs or the picture."""
-        if not u.requires_grad:
-            return u
         mask = self.plan.through_inputs(len(u))
-        if bool(mask.all()):
-            return u
-        return u.detach() + mask * (u - u.detach())
-
-    def _picture(self, u: Tensor, seed: int, spp: int) -> Tensor:
-        through = self._through(u)
-        return self.space.picture(through, self.formation.display(self._radiance(through, seed, spp)))
-
-    def _radiance(self, u: Tensor, seed: int, spp: int) -> Tensor:
-        return self._formed(self._assembled(u), seed, spp)
+        return u if bool(mask.all()) else u.detach() + mask * (u - u.detach())
 
     def _formed(self, inputs: dict[str, Tensor], seed: int, spp: int) -> Tensor:
         """Radiance of scene inputs with exposure and backdrop."""
-        applied = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
-        hide = "backdrop.color" in applied
-        rendered = self._rendered(inputs, seed, spp, hide)
+        exposure, backdrop = inputs.pop("camera.exposure", None), inputs.pop("backdrop.color", None)
+        rendered = self._rendered(inputs, seed, spp, backdrop is not None)
         radiance = rendered[..., :3]
-        if "camera.exposure" in applied:
-            radiance = radiance * torch.exp2(applied["camera.exposure"])
-        if hide:
+        if exposure is not None:
+            radiance = radiance * torch.exp2(exposure)
+        if backdrop is not None:
             uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
-            radiance = radiance + uncovered * (applied["backdrop.color"] / self.formation.gain)
+            radiance = radiance + uncovered * (backdrop / self.formation.gain)
         return radiance
 
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
@@ -284,10 +284,14 @@ class Renderer:
         if self._source is not None:
             self.renders += 1
             return self._finite(self._source(inputs, noise, spp))
-        rendered = self._finite(self.scene.radiance(inputs, noise, spp, hide=hide))
+        wanted = {"hidden" if hide else "path": noise}
         if self.formation.denoiser == "oidn":
-            albedo, normal = self.scene.guides(inputs, seeds.stream(self.root_seed, "guides", seed), spp)
-            clean = denoise(rendered[..., :3].contiguous(), albedo, normal, quick=self.formation.quick)
+            wanted["guides"] = seeds.stream(self.root_seed, "guides", seed)
+        rendered, *guides = self.scene.pictures(inputs, wanted, spp)
+        rendered = self._finite(rendered)
+        for guide in guides:
+            noisy, quick = rendered[..., :3].contiguous(), self.formation.quick
+            clean = denoise(noisy, guide[..., :3], guide[..., 3:], quick=quick)
             rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
         self.renders += 1
         return rendered
@@ -301,8 +305,16 @@ class Renderer:
         """
         noise = seeds.stream(self.root_seed, "gradient", seed)
         cotangent = self._finite(cotangent[..., :3])
-        found: dict[str, Tensor] = {}
-        for estimator, wrt in self._wanted(inputs).items():
+        found, left = dict[str, Tensor](), list(inputs)
+        for estimator in ("material", "boundary", "guided", "adjoint"):  # what two reach goes to the more general one
+            groups = [group for group in self.plan.groups if group.estimator == estimator]
+            reached = set[str]().union(*(self.routes.get(group.name, ()) for group in groups))
+            if estimator == "adjoint":
+                reached &= self.scene.interior
+            wrt = [name for name in left if name in reached]
+            if not wrt:
+                continue
+            left = [name for name in left if name not in reached]
             if estimator == "material":
                 meshes = sorted({name.rpartition(".")[0] for name in wrt})
                 gradients = self.scene.material_adjoint(inputs, cotangent, noise, spp, meshes=meshes)
@@ -310,22 +322,9 @@ class Renderer:
                 method = {"adjoint": "hidden" if hide else "path"}.get(estimator, estimator)
                 gradients = self.scene.adjoint(inputs, cotangent, noise, spp, wrt=wrt, method=method)
             self.gradients += 1
-            found |= {name: self._finite(gradient) for name, gradient in gradients.items()}
+            for name, gradient in gradients.items():
+                found[name] = self._finite(gradient)
         return found
-
-    def _wanted(self, inputs: Mapping[str, Tensor]) -> dict[str, list[str]]:
-        """Which inputs each adjoint has to differentiate; an input that two ask for goes to the more general one."""
-        wanted: dict[str, list[str]] = {}
-        taken: set[str] = set()
-        for estimator in ("material", "boundary", "guided", "adjoint"):
-            names = {name for group in self.plan.having(estimator) for name in self.routes.get(group.name, ())}
-            if estimator == "adjoint":
-                names &= self.scene.interior
-            chosen = [name for name in inputs if name in names and name not in taken]
-            if chosen:
-                wanted[estimator] = chosen
-                taken |= set(chosen)
-        return wanted
 
     def _finite(self, values: Tensor) -> Tensor:
         """Replace NaN and infinite entries by zero and count them."""
@@ -362,9 +361,6 @@ class Renderer:
 
     # ---- set-up -----------------------------------------------------------------------------------------------------
 
-    def _assembled(self, u: Tensor) -> dict[str, Tensor]:
-        return self.scene.assembly(self.space.inputs(u))
-
     def _steps(self, groups: tuple[Group, ...], motion: Motion | None) -> Tensor:
         moving = [
             number
@@ -373,7 +369,11 @@ class Renderer:
             for number in range(group.begin, group.begin + group.size)
         ]
         still = torch.zeros(len(self.start))
-        speeds = still if motion is None or not moving else motion.speeds(self._assembled, self.start, moving)
+        speeds = (
+            still
+            if motion is None or not moving
+            else motion.speeds(lambda u: self.scene.assembly(self.space.inputs(u)), self.start, moving)
+        )
         steps = steps_for(speeds)
         for group in groups:
             if group.periodic and not bool(speeds[group.coordinates].any()):
@@ -389,7 +389,7 @@ class Renderer:
         noise = torch.rand(self.start.shape, generator=generator)
         at = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
         with torch.enable_grad():
-            inputs = self._assembled(at)
+            inputs = self.scene.assembly(self.space.inputs(at))
             for name, tensor in inputs.items():
                 if not tensor.requires_grad:
                     continue
@@ -407,22 +407,6 @@ def _tensor(u: Configuration) -> Tensor:
         return torch.as_tensor(u, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError):
         raise InputError(f"render: expected u as a tensor or an array of numbers, got {type(u).__name__}") from None
-
-
-@contextmanager
-def _outside_inference(u: Tensor) -> Iterator[Tensor]:
-    """Leave `torch.inference_mode` inside the block, where derivatives are neither taken nor missed; yield u.
-
-    Raises:
-        InputError: u was made in that mode, and its derivative is asked for.
-    """
-    if u.is_inference() and u.requires_grad:
-        raise InputError(
-            "render: u was made in `torch.inference_mode()`, so that nothing can be differentiated with respect to it; "
-            "make it outside, or pass `u.detach()` for the picture alone"
-        )
-    with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-        yield u.clone() if u.is_inference() else u
 
 
 class _Radiance(torch.autograd.Function):

@@ -269,17 +269,29 @@ def test_a_configuration_after_many_others_is_bitwise_that_of_a_fresh_scene(othe
         assert torch.equal(after, fresh(probe, seed=7, spp=4))
 
 
-def test_recordings_do_not_outlive_a_move() -> None:
-    """A kernel recorded before a mesh moved renders something else afterwards."""
+def test_recordings_live_on_over_moves_and_gradients() -> None:
+    """Mitsuba's recordings hold on to the memory of vertices, so that it has to stay theirs."""
     controls = {"pose": {"yaw": [0, 360], "x": [-0.2, 0.2]}}
-    recorded, plain = (load_scene("mug").renderer(controls, resolution=32, denoise="none") for _ in range(2))
+    recorded, plain = (
+        load_scene("mug").renderer(controls, resolution=24, denoise="none", estimators={"*": "boundary"}) for _ in "ab"
+    )
     plain.scene._freeze = False
     generator = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for number in range(6):
-            u = torch.rand(2, generator=generator)
-            for again in range(3):
+    of_a_move: set[int] = set()
+    for number in range(6):
+        u = torch.rand(2, generator=generator)
+        if number == 3:
+            assert bool(recorded.gradient(lambda image: image.square().sum(), u, 1, 2)[1].any())
+        if number == 4:  # a second owner of the vertices, which makes Dr.Jit copy them
+            held = recorded.scene.parameters["object.vertex_positions"]
+            second = type(held)(held)
+        with torch.no_grad():
+            for again in range(2):
                 assert torch.equal(recorded(u, again, 4), plain(u, again, 4)), (number, again)
+        of_a_move.add(id(recorded.scene._recorded["path", 4, recorded.scene.depth]))
+        if number < 4:
+            assert len(of_a_move) == 1 + (number == 3)  # an integrator that is new makes recordings stale
+    assert len(second) == len(held)
 
 
 # ---- judging --------------------------------------------------------------------------------------------------------

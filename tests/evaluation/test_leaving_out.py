@@ -49,8 +49,9 @@ def test_putting_an_item_back_takes_effect(monkeypatch: pytest.MonkeyPatch) -> N
 
     def adjoints(item: str) -> tuple[set[str], set[str]]:
         scene = renderer.scene.like(leave_out=EVERYTHING - {item})
-        inner = scene._write
-        monkeypatch.setattr(scene, "_write", lambda name, value: [note(name), inner(name, value)])
+        names = {key: name for name, (key, _) in scene.declared.items()}
+        inner = scene.parameters.set_dirty
+        monkeypatch.setattr(scene.parameters, "set_dirty", lambda key: [note(names[key]), inner(key)])
         inputs = {"object.base_color": scene.base("object.base_color") * 0.5}
         scene.radiance(inputs, 0, 1)
         by_render = set(written)

@@ -61,8 +61,8 @@ from advsearch.report.diagrams import precision_figures
 from advsearch.runs.listing import finished
 from advsearch.runs.results.precision import PrecisionReference, PrecisionResult, Recommended
 from advsearch.runs.summary import read_result
+from advsearch.scene.formation import next_count
 from advsearch.scene.gradients.group import Group
-from advsearch.scene.mitsuba_backend.samplers import next_count
 
 SIZE = 400
 """Numbers in a synthetic picture."""

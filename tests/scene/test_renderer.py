@@ -182,7 +182,7 @@ def test_the_denoiser_brings_few_samples_close_to_many(raw: Renderer, denoised: 
 def test_non_finite_radiance_is_counted_and_set_to_zero(raw: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = torch.full((SIZE, SIZE, 3), 0.5)
     broken[0, 0, 0], broken[1, 1, 1] = float("nan"), float("inf")
-    monkeypatch.setattr(raw.scene, "radiance", lambda *_, **__: broken)
+    monkeypatch.setattr(raw.scene, "pictures", lambda *_, **__: [broken])
     before = raw.non_finite
     with torch.no_grad():
         image = raw(raw.start, seed=0, spp=1)

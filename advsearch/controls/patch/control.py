@@ -26,7 +26,6 @@ from advsearch.controls.base import (
     Group,
     Parameter,
     Value,
-    scalar,
 )
 from advsearch.controls.clean import Moved
 from advsearch.controls.numbers import BoundNumbers, NumberControl
@@ -273,7 +272,7 @@ class _Placement(NumberControl):
         if self.asked:
             return self.bind(scene)
         fixed = {name: spec.value for name, spec in self.specs.items() if isinstance(spec, Fixed)}
-        return {one.name: scalar(float(fixed.get(one.name, self.default(scene, one)))) for one in self.parameters}
+        return {one.name: torch.tensor(float(fixed.get(one.name, self.default(scene, one)))) for one in self.parameters}
 
 
 class BoundPatch(BoundControl):

@@ -30,7 +30,7 @@ from advsearch.runs.results.precision import (
     Recommended,
     SettingPlace,
 )
-from advsearch.scene.mitsuba_backend.samplers import next_count
+from advsearch.scene.formation import next_count
 
 Line = tuple[str, str, str]
 AGAINST: tuple[Against, ...] = ("samples", "seconds")

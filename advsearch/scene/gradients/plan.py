@@ -104,7 +104,7 @@ class GradientPlan:
         mask = torch.zeros(dimension)
         for group in self.groups:
             if group.estimator in BY_ADJOINT or group.estimator == "image":
-                mask[group.coordinates] = 1.0
+                mask[group.begin : group.begin + group.size] = 1.0
         return mask
 
     def with_estimator(self, names: Mapping[str, str], reason: str) -> GradientPlan:

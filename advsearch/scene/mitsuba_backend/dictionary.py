@@ -6,15 +6,17 @@ from typing import Any
 
 import numpy as np
 
+from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, number, transform
 from advsearch.scene.mitsuba_backend.meshes import matt, mitsuba_mesh
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.mitsuba_backend.parts import SceneInput, number, transform
+from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mitsuba
+from advsearch.scene.parts import PluginPart
 
 GROUND = "ground"
-GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", as_is, interior=True)
+GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True)
 """(h, w, 3): the texture of a ground that shows the environment's photograph (`advsearch.scene.photograph`)."""
 
 
@@ -48,6 +50,21 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
             },
         }
     return scene
+
+
+def loaded(plugins: Plugin, description: SceneDescription) -> Any:
+    """Return Mitsuba's scene of a dictionary.
+
+    Raises:
+        InputError: Mitsuba refuses plugins of the user's.
+    """
+    try:
+        with fewer_warnings():
+            return mitsuba().load_dict(plugins, optimize=False)
+    except RuntimeError as error:
+        if not any(isinstance(part, PluginPart) for part in description.parts):
+            raise
+        raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {error}; change it there") from error
 
 
 def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:

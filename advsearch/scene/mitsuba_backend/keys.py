@@ -9,7 +9,7 @@ import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.mitsuba_backend.inputs import color, number
+from advsearch.scene.mitsuba_backend.parts import color, number
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import PluginNumber

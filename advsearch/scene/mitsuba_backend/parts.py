@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import singledispatch
+from operator import attrgetter
+from typing import Any
 
-from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, number, plain_number, point, transform
+import numpy as np
+import torch
+from torch import Tensor
+
 from advsearch.scene.mitsuba_backend.meshes import (
     NORMALS,
     POSITIONS,
@@ -18,8 +23,7 @@ from advsearch.scene.mitsuba_backend.meshes import (
     textured_emission,
 )
 from advsearch.scene.mitsuba_backend.plugins import loadable
-from advsearch.scene.mitsuba_backend.population import population
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba, population
 from advsearch.scene.parts import (
     BallLamp,
     HazePart,
@@ -31,6 +35,102 @@ from advsearch.scene.parts import (
     ScenePart,
     SpotLamp,
 )
+
+Write = Callable[[Any], Any]
+"""From a Dr.Jit `TensorXf` (perhaps with gradients enabled) to the type that the Mitsuba parameter takes."""
+
+
+flat: Write = attrgetter("array")
+"""Vertex buffers: Mitsuba takes a flat array."""
+number: Write = attrgetter("array")
+"""A single number."""
+
+
+def plain_number(value: Any) -> float:
+    """A single number that is the same for all light paths."""
+    return float(value.array[0])
+
+
+def color(value: Any) -> Any:
+    """Three numbers: an RGB colour."""
+    import mitsuba as mi
+
+    return mi.Color3f(*_entries(value, 3))
+
+
+def point(value: Any) -> Any:
+    """Three numbers: a place."""
+    import mitsuba as mi
+
+    return mi.Point3f(*_entries(value, 3))
+
+
+def transform(value: Any) -> Any:
+    """A 4 x 4 matrix, row by row."""
+    import mitsuba as mi
+
+    found = _entries(value, 16)
+    return mi.Transform4f(mi.Matrix4f([found[4 * row : 4 * row + 4] for row in range(4)]))
+
+
+def as_torch(value: Any) -> Tensor:
+    """Return a Dr.Jit value as a torch tensor with memory of its own."""
+    import mitsuba as mi
+
+    if isinstance(value, (mi.Color3f, mi.Point3f)):  # Dr.Jit's own conversion gives a colour six entries
+        return torch.cat([as_torch(component) for component in value])
+    value = getattr(value, "matrix", value)
+    if hasattr(value, "torch"):
+        tensor: Tensor = value.torch()
+        return tensor.clone()
+    return torch.tensor(np.array(value, dtype=np.float32))
+
+
+def _entries(value: Any, count: int) -> list[Any]:
+    import drjit as dr
+    import mitsuba as mi
+
+    return [dr.gather(mi.Float, value.array, mi.UInt32(entry)) for entry in range(count)]
+
+
+@dataclass(frozen=True)
+class SceneInput:
+    """One named input of a scene.
+
+    Attributes:
+        name: the input's name, e.g. "key.position".
+        key: Mitsuba's parameter path, or its beginning and end with one "*" between for an unknown middle.
+        write: converts the tensor; None where Mitsuba takes it itself, as for textures and grids.
+        interior: the interior adjoint (`prb`) differentiates it correctly.
+        shape: of the tensor; None takes it from Mitsuba's own value.
+        owner: Mitsuba's object that has the parameter, where `key` alone may mean several.
+    """
+
+    name: str
+    key: str
+    write: Write | None = None
+    interior: bool = False
+    shape: tuple[int, ...] | None = None
+    owner: Any = None
+
+
+def key_of(parameters: Any, one: SceneInput) -> str | None:
+    """Return the parameter that an input means, or None if the scene has none such.
+
+    Raises:
+        RuntimeError: there are several.
+    """
+    before, star, after = one.key.partition("*")
+    found = [
+        key
+        for key in parameters.keys()
+        if (key.startswith(before) and key.endswith(after) if star else key == one.key)
+        and (one.owner is None or parameters.properties[key][2] is one.owner)
+    ]
+    if len(found) > 1:
+        raise RuntimeError(f"expected one Mitsuba parameter {one.key}, found {found}")
+    return str(found[0]) if found else None
+
 
 ABSENT = {"type": "uniform", "value": 0.0}
 IDLE_LOBES: Plugin = {name: ABSENT for name in ("clearcoat", "sheen")}

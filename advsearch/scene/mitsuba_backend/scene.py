@@ -18,18 +18,25 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
+from advsearch.scene.formation import SAMPLER, next_count
 from advsearch.scene.leaving_out import EVERYTHING
-from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, scene_dict
+from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, loaded, scene_dict
 from advsearch.scene.mitsuba_backend.first_hit import first_hits
-from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of, plain_number
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
-from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
-from advsearch.scene.mitsuba_backend.population import media_in, population
-from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
+from advsearch.scene.mitsuba_backend.parts import (
+    IDLE_LOBES,
+    SceneInput,
+    as_torch,
+    key_of,
+    leave_dark_lamps_out,
+    mesh_translation,
+    plain_number,
+    translation,
+)
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mitsuba, one_at_a_time
+from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, media_in, mitsuba, one_at_a_time, population
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
-from advsearch.scene.parts import PluginPart, plugins_in
+from advsearch.scene.parts import plugins_in
 from advsearch.scene.surfaces import Surfaces
 
 MAX_DEPTH = 6
@@ -43,7 +50,7 @@ SHADOW_SPP = 4
 BASE_COLOR = "object.base_color"
 """Input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)."""
 
-ENVIRONMENT_INPUT = SceneInput("environment.padded", "environment.data", as_is, interior=True)
+ENVIRONMENT_INPUT = SceneInput("environment.padded", "environment.data", interior=True)
 """(H, W + 2, 3): Mitsuba keeps a copy of the last column before the first, and of the first after the last."""
 
 
@@ -112,7 +119,7 @@ class MitsubaScene:
             self._path |= one.integrator
         if "emitters" in leave_out:
             leave_dark_lamps_out(plugins, description.parts)
-        self._scene = _loaded(plugins, description)
+        self._scene = loaded(plugins, description)
         self._sensor = self._scene.sensors()[0]
         self.parameters = mi.traverse(self._scene)
         for name, weight in sampling_weights(description.meshes.values()).items():
@@ -124,10 +131,8 @@ class MitsubaScene:
         self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one))}
         self.names = frozenset(self.declared)
         self.interior = frozenset(name for name, (_, one) in self.declared.items() if one.interior)
-        self._shapes = frozenset(
-            name for name, (key, one) in self.declared.items() if one.write is plain_number or _is_of_a_shape(key)
-        )
-        self._unsettled: set[str] = set()
+        self._buffers = frozenset(n for n, (key, _) in self.declared.items() if key.endswith((POSITIONS, NORMALS)))
+        self._literals = frozenset(n for n, (_, one) in self.declared.items() if one.write is plain_number)
         self._base: dict[str, Any] = {}
         self._applied: dict[str, Tensor] = {}
         self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
@@ -166,43 +171,76 @@ class MitsubaScene:
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor of the input's shape."""
         key, one = self.declared[name]
-        self._apply({})
+        self._set({})
         value = as_torch(self.parameters[key])
         return value if one.shape is None else value.reshape(one.shape)
 
     @one_at_a_time
-    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
-        """Render linear radiance with `spp` independent samples a pixel.
+    def pictures(self, inputs: Mapping[str, Tensor], seeds: Mapping[str, int], spp: int) -> list[Tensor]:
+        """Render pictures of one configuration with `spp` independent samples a pixel each.
+
+        A render is recorded on first use and replayed later. Only primal ones are: Dr.Jit 1.5.0 corrupts memory when it
+        replays some adjoints (a texture of 32 x 32 under a film of 32 x 32 pixels, say), and the gain there is small.
 
         Args:
             inputs: what differs from the base values.
-            seed: number of the noise.
+            seeds: what is wanted, each with the number of its noise: "path", the linear radiance; "hidden", the same
+                without what the environment shows directly, for a backdrop; "guides", what guides the denoiser.
             spp: samples a pixel.
-            hide: leave out what the environment shows directly, for a backdrop.
 
         Returns:
-            (H, W, 3) float32; (H, W, 4) with the coverage of the scene's surfaces where the scene has a backdrop.
+            For each of `seeds` (H, W, 3) float32; of a scene with a backdrop (H, W, 4) with the coverage of its
+            surfaces; of "guides" (H, W, 6), the first hit's albedo in [0, 1] and its shading normal.
         """
-        self._apply(inputs)
-        return self._render("hidden" if hide else "path", seed, spp)
+        import drjit as dr
+        import mitsuba as mi
 
-    @one_at_a_time
+        def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
+            image = integrator.render(scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=False)
+            sensor.sampler().seed(0, 1)  # otherwise the sampler's state keeps the whole render alive
+            return image
+
+        self._set(inputs)
+        population.bury()
+        spp = next_count(self.sampler, spp)
+        integrators = [self._integrator(what) for what in seeds]
+        now = (population.changes, dr.thread_count())  # a recording crashes in another thread pool
+        if self._recorded_at != now:
+            self._recorded.clear()
+            self._recorded_at = now
+        media = population.media() if self.volumetric else []
+        found: list[Tensor] = []
+        for (what, seed), integrator in zip(seeds.items(), integrators, strict=True):
+            key = what, spp, self._depth
+            if self._freeze and key not in self._recorded:
+                self._recorded[key] = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
+            function: Callable[..., Any] = self._recorded.get(key, render)
+            image = function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)).torch().clone()
+            if what == "guides":
+                image = image[..., -6:]
+                image[..., :3].clamp_(0.0, 1.0)
+            found.append(image)
+        return found
+
+    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
+        """Render linear radiance, without what the environment shows directly if hidden; as of `pictures`."""
+        return self.pictures(inputs, {"hidden" if hide else "path": seed}, spp)[0]
+
     def guides(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> tuple[Tensor, Tensor]:
         """Render what guides the denoiser: first-hit albedo and shading normal, each (H, W, 3) float32."""
-        self._apply(inputs)
-        both = self._render("guides", seed, spp)[..., -6:]
-        return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
+        (both,) = self.pictures(inputs, {"guides": seed}, spp)
+        return both[..., :3], both[..., 3:]
 
     @one_at_a_time
     def held(self, inputs: Mapping[str, Tensor]) -> Any:
         """Return Mitsuba's scene with these inputs set, until the next call of anything here."""
-        self._apply(inputs)
+        self._set(inputs)
         return self._scene
 
     @one_at_a_time
     def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; arguments as for `Renderer.surfaces`."""
-        self._apply(inputs)
+        self._set(inputs)
         height, width = self.resolution
         return first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
 
@@ -232,34 +270,38 @@ class MitsubaScene:
         Returns:
             For each of `wrt` a float32 tensor of the input's shape.
         """
-        mi = mitsuba()
         import drjit as dr
+        import mitsuba as mi
 
         wanted = tuple(inputs if wrt is None else wrt)
-        method, beside = self._general(method, wanted)
-        values = {name: inputs[name] if name in inputs else self.base(name) for name in beside}
-        values |= {name: inputs[name] for name in wanted}
-        spp = next_count(self.sampler, spp)
-        self._apply(inputs)
-        tracked = {name: mi.TensorXf(contiguous(value)) for name, value in values.items()}
+        beside = set() if "gradients" in self._leave_out else set(self.interior)
+        plain = method == "path" and not self._thin_lens and not self.volumetric
+        if "boundary" not in self._leave_out and plain:  # Mitsuba's projective integrator knows no lens and no medium
+            method, beside = "boundary", beside | self._buffers
+        shown = cotangent.detach().to(torch.float32).contiguous()
+        if self._backdrop:
+            shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
+        self._set(inputs)
+        held, tracked = dict[str, Any](), dict[str, Any]()
         try:
-            for name, value in tracked.items():
-                dr.enable_grad(value)
-                self._write(name, value)
+            for name in (*sorted(beside - set(wanted)), *wanted):
+                key, one = self.declared[name]
+                own = self.parameters[key]
+                held[key] = type(own)(own)
+                value = inputs[name] if name in inputs else as_torch(own)
+                tracked[name] = mi.TensorXf(value.detach().to(torch.float32).contiguous())  # type: ignore[call-overload]
+                dr.enable_grad(tracked[name])
+                self.parameters[key] = one.write(tracked[name]) if one.write else tracked[name]
             self.parameters.update()
-            shown = contiguous(cotangent)
-            if self._backdrop:
-                shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
-            arriving = mi.TensorXf(shown)
+            spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)  # type: ignore[call-overload]
             with fewer_warnings():
                 self._integrator(method).render_backward(
                     self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
                 )
-            found = {name: as_torch(dr.grad(value)).reshape(values[name].shape) for name, value in tracked.items()}
-            return {name: found[name] for name in wanted}
+            return {name: dr.grad(tracked[name]).torch().clone().reshape(inputs[name].shape) for name in wanted}
         finally:
-            for name, value in values.items():
-                self._write(name, mi.TensorXf(contiguous(value)))
+            while held:  # what is put back must have no second owner, see `_set`
+                self.parameters.__setitem__(*held.popitem())
             self.parameters.update()
 
     @one_at_a_time
@@ -277,7 +319,7 @@ class MitsubaScene:
         """
         from advsearch.scene.mitsuba_backend.material_form.adjoint import material_adjoint
 
-        self._apply(inputs)
+        self._set(inputs)
         names = list(meshes)
         by_vertices, by_normals = material_adjoint(
             self._scene,
@@ -310,7 +352,7 @@ class MitsubaScene:
         mi = mitsuba()
         import drjit as dr
 
-        self._apply(inputs)
+        self._set(inputs)
         key, spp = self.declared[name][0], next_count(self.sampler, spp)
         noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
         noise.set_samples_per_wavefront(spp)
@@ -325,18 +367,14 @@ class MitsubaScene:
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
-    def _general(self, method: str, wanted: Collection[str]) -> tuple[str, list[str]]:
-        """Return the adjoint's method and what to differentiate beside what is wanted, where that is not left out."""
-        beside = set() if "gradients" in self._leave_out else set(self.interior)
-        plain = method == "path" and not self._thin_lens and not self.volumetric
-        if "boundary" not in self._leave_out and plain:  # Mitsuba's projective integrator knows no lens and no medium
-            method = "boundary"
-            beside |= {name for name in self._shapes if name.endswith((".vertices", ".normals"))}
-        return method, sorted(beside - set(wanted))
+    def _set(self, inputs: Mapping[str, Tensor]) -> None:
+        """Set exactly these inputs, everything else at its base value; does nothing for what is set already.
 
-    def _apply(self, inputs: Mapping[str, Tensor]) -> None:
-        """Set exactly these inputs, everything else at its base value; does nothing for what is set already."""
+        Vertices are written into the memory where they are: recordings hold on to it. Numbers that Mitsuba takes for
+        constants are part of a recording, so that every change makes all recordings stale.
+        """
         mi = mitsuba()
+        import drjit as dr
 
         unknown = [name for name in inputs if name not in self.declared]
         if any(name.endswith(".base_color") for name in unknown):
@@ -349,31 +387,34 @@ class MitsubaScene:
         if self._every:
             inputs = {**self._every, **inputs}
             self._applied.clear()
-        changed: set[str] = set()
-        for name in [name for name in self._applied if name not in inputs]:
-            self.parameters[self.declared[name][0]] = type(self._base[name])(self._base[name])
-            del self._applied[name]
-            changed.add(name)
+        wanted: dict[str, Tensor | None] = dict.fromkeys([name for name in self._applied if name not in inputs])
         for name, tensor in inputs.items():
-            value = contiguous(tensor)
-            held = self._applied.get(name)
-            if held is not None and held.shape == value.shape and torch.equal(held, value):
-                continue
+            value, applied = tensor.detach().to(torch.float32).contiguous(), self._applied.get(name)
+            if applied is None or applied.shape != value.shape or not torch.equal(applied, value):
+                wanted[name] = value
+        population.changes += not self._literals.isdisjoint(wanted)
+        for name, fresh in wanted.items():
+            key, one = self.declared[name]
+            own = self.parameters[key]
             if name not in self._base:
-                own = self.parameters[self.declared[name][0]]
-                self._base[name] = type(own)(own)
-            self._write(name, mi.TensorXf(value))
-            self._applied[name] = value.clone()
-            changed.add(name)
-        if changed:
+                self._base[name] = type(own)(own.torch().clone() if name in self._buffers else own)
+            given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
+            if fresh is not None and one.write:
+                given = one.write(given)
+            if name in self._buffers:
+                place = own.torch().data_ptr()
+                dr.scatter(own, given, dr.arange(mi.UInt32, len(own)))
+                dr.eval(own)
+                population.changes += own.torch().data_ptr() != place  # Dr.Jit copies what has a second owner
+                self.parameters.set_dirty(key)
+            else:
+                self.parameters[key] = given
+            if fresh is None:
+                del self._applied[name]
+            else:
+                self._applied[name] = fresh.clone()
+        if wanted:
             self.parameters.update()
-        if not changed.isdisjoint(self._shapes):
-            self._unsettled = {"path", "hidden", "guides"}
-            population.changes += 1
-
-    def _write(self, name: str, value: Any) -> None:
-        key, one = self.declared[name]
-        self.parameters[key] = one.write(value)
 
     def _integrator(self, method: str) -> Any:
         """Return the integrator of one method for the paths that are rendered now, made on first use."""
@@ -396,63 +437,3 @@ class MitsubaScene:
             self._integrators[key] = mi.load_dict(recipes[method])
             population.changes += 1
         return self._integrators[key]
-
-    def _render(self, what: str, seed: int, spp: int) -> Tensor:
-        mi = mitsuba()
-        import drjit as dr
-
-        def record(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
-            image = integrator.render(scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=False)
-            sensor.sampler().seed(0, 1)  # otherwise the sampler's state keeps the whole render alive
-            return image
-
-        spp = next_count(self.sampler, spp)
-        integrator = self._integrator(what)
-        function = self._function(what, spp, record)
-        return as_torch(function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)))
-
-    def _function(self, what: str, spp: int, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the recorded function for one job at one sample count, recording it on first use.
-
-        Only primal renders are recorded. Dr.Jit 1.5.0 corrupts memory when it replays some adjoints (a texture of
-        32 x 32 under a film of 32 x 32 pixels, say), and the gain there is small. A recording made before a shape
-        moved renders something else (measured: wrong from the third pose on), so that every move makes all of them
-        stale, and the first render after a move is not recorded: in a search over poses none would be replayed.
-        """
-        import drjit as dr
-
-        population.bury()
-        now = (population.changes, dr.thread_count())  # a recording crashes in another thread pool
-        if self._recorded_at != now:
-            self._recorded.clear()
-            self._recorded_at = now
-        if not self._freeze or what in self._unsettled:
-            self._unsettled.discard(what)
-            return function
-        key = what, spp, self._depth
-        if key not in self._recorded:
-            beside = population.media() if self.volumetric else []
-            self._recorded[key] = dr.freeze(function, state_fn=lambda *_, **__: beside)
-        return self._recorded[key]
-
-
-def _loaded(plugins: Plugin, description: SceneDescription) -> Any:
-    """Return Mitsuba's scene.
-
-    Raises:
-        InputError: Mitsuba refuses plugins of the user's.
-    """
-    try:
-        with fewer_warnings():
-            return mitsuba().load_dict(plugins, optimize=False)
-    except RuntimeError as error:
-        if not any(isinstance(part, PluginPart) for part in description.parts):
-            raise
-        raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {error}; change it there") from error
-
-
-def _is_of_a_shape(key: str) -> bool:
-    """Whether a change of this Mitsuba parameter moves a shape, so that ray tracing is set up anew."""
-    return key.endswith((POSITIONS, NORMALS)) or (
-        key.endswith("to_world") and not key.startswith(("camera", "environment"))
-    )

@@ -289,7 +289,8 @@ class BasisRenderer(PredictingRenderer):
         self.products = 0
         with torch.no_grad():
             moving = moving or lighting(renderer)
-            self._lights = Lights(renderer, moving, self._assembled(moving.at_its_brightest(u)))
+            inputs = self.scene.assembly(self.space.inputs(moving.at_its_brightest(u)))
+            self._lights = Lights(renderer, moving, inputs)
             self._of_each = [
                 LinearRenderer(renderer, u, seeds.stream(seed, "light", number), tick, light=alone)
                 for number, alone in enumerate(self._lights.alone)

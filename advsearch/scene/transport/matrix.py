@@ -120,23 +120,21 @@ class ColouredRows:
 
     def times(self, values: Floats) -> Floats:
         """Return the matrix times (columns, 3): (rows, 3)."""
-        return self._product(values, transposed=False) * self._coloured()
+        if self._both_ways is not None:
+            found: Floats = (self._both_ways[0] @ torch.from_numpy(values)).numpy()
+        else:
+            found = self._shares() @ values
+        found = found * self._kept_colours().reshape(-1, 3).numpy()
+        return found
 
     def transposed_times(self, values: Floats) -> Floats:
         """Return the transpose times (rows, 3): (columns, 3)."""
-        return self._product(values * self._coloured(), transposed=True)
-
-    def _product(self, values: Floats, *, transposed: bool) -> Floats:
-        """The shares, or their transpose, times (n, 3)."""
-        found: Floats
+        coloured = values * self._kept_colours().reshape(-1, 3).numpy()
         if self._both_ways is not None:
-            found = (self._both_ways[transposed] @ torch.from_numpy(values)).numpy()
+            found: Floats = (self._both_ways[1] @ torch.from_numpy(coloured)).numpy()
         else:
-            found = (self._shares().T if transposed else self._shares()) @ values
+            found = self._shares().T @ coloured
         return found
-
-    def _coloured(self) -> Floats:
-        return self._kept_colours().reshape(-1, 3).numpy()
 
     def _shares(self) -> scipy.sparse.csr_matrix:
         assert self._kept is not None, "finish it first"

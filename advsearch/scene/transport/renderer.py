@@ -14,7 +14,6 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.files import scaled
 from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.gradients.group import Group
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.transport import Paths, mean_of
 from advsearch.scene.renderer import InputSpace, Renderer
@@ -61,9 +60,6 @@ class PredictingRenderer(Renderer, ABC):
 
     def _through(self, u: Tensor) -> Tensor:
         return u
-
-    def _differenced(self) -> tuple[Group, ...]:
-        return ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +127,7 @@ class LinearRenderer(PredictingRenderer):
             self._applied, self._base = collected.applied, collected.base
             return
         with torch.no_grad():
-            inputs = self._assembled(u)
+            inputs = self.scene.assembly(self.space.inputs(u))
             self._applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
             traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE} | dict(light)
             linear = [name for name in traced if name in (linear_inputs(renderer) if names is None else names)]

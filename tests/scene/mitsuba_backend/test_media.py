@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 import advsearch
-from advsearch.scene.mitsuba_backend.population import Population
+from advsearch.scene.mitsuba_backend.variant import Population
 from advsearch.scene.renderer import Renderer
 
 
