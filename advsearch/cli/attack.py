@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from advsearch.cli.flags import as_notes
 from advsearch.cli.output import columns
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
@@ -40,7 +41,7 @@ def answer(summary: AttackSummary | CurveResult | MatrixResult) -> str:
     parts = [wording.verdict(summary), columns(_rates(summary)), columns(facts)]
     if summary.failures and summary.failures.tried:
         parts.append(columns([list(FAILURE_HEADS), *failure_rows(summary.failures, tried=True)]))
-    return "\n\n".join(parts) + "".join(f"\n\nNote: {text}" for text in wording.remarks(summary))
+    return "\n\n".join(parts) + as_notes(wording.remarks(summary))
 
 
 def _rates(summary: AttackSummary) -> list[list[str]]:
@@ -98,7 +99,7 @@ def _matrix(result: MatrixResult) -> str:
     facts = [["time", wording.seconds_text(result.seconds["total"])], ["run", str(result.run)]]
     ending = "Interrupted." if result.ending == "interrupted" else ""
     parts = [matrix_text(result), columns([matrix_heads(result), *matrix_rows(result)]), columns(facts), ending]
-    return "\n\n".join(filter(None, parts)) + "".join(f"\n\nNote: {text}" for text in result.warnings)
+    return "\n\n".join(filter(None, parts)) + as_notes(result.warnings)
 
 
 COMMAND = QuestionCommand("attack", answer)

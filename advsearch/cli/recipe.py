@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
+from advsearch.cli.flags import as_notes
 from advsearch.cli.question import Positional, QuestionCommand
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def answer(result: RecipeResult) -> str:
     parts = [result.title, *said, output.columns(facts)]
     parts += ["Quick: few and small pictures; no result."] if result.quick else []
     parts += ["Interrupted."] if result.goes_on else []
-    return "\n\n".join(parts) + "".join(f"\n\nNote: {text}" for text in result.warnings)
+    return "\n\n".join(parts) + as_notes(result.warnings)
 
 
 COMMAND = _Recipe(

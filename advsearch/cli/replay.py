@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
+from advsearch.cli.flags import as_notes
 from advsearch.cli.question import Positional, QuestionCommand
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def answer(result: ReplayResult) -> str:
     ]
     parts = [replay_text(result), output.columns([HEADS, *replay_rows(result)]), output.columns(facts)]
     parts += ["Interrupted."] if result.ending == "interrupted" else []
-    return "\n\n".join(parts) + "".join(f"\n\nNote: {text}" for text in result.warnings)
+    return "\n\n".join(parts) + as_notes(result.warnings)
 
 
 COMMAND = QuestionCommand("replay", answer, about="answer", place=Positional("RUN", "a run"))

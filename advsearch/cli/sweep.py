@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from advsearch.cli.flags import as_notes
 from advsearch.cli.output import columns
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
@@ -53,7 +54,7 @@ def answer(summary: SweepSummary) -> str:
     """Return accuracy in total and by axis, the worst configuration and the cost."""
     facts = [[name, text] for name, text in _facts(summary).items() if text]
     parts = [_verdict(summary), *_tables(summary), "\n".join(_surface(summary)), columns(facts)]
-    return "\n\n".join(part for part in parts if part) + "".join(f"\n\nNote: {text}" for text in summary.warnings)
+    return "\n\n".join(part for part in parts if part) + as_notes(summary.warnings)
 
 
 def _verdict(summary: SweepSummary) -> str:

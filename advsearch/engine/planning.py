@@ -138,9 +138,13 @@ def measured_plan(
     for groups, candidates in contested(plan, every=every):
         scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats, counted, tick, keep)
         best = min(scores, key=lambda name: scores[name])
-        others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
         time = "renders" if counted else "time"
-        reason = f"least squared error x {time}, measured at {spp} samples (others, as multiples of it: {others})"
+        reason = f"least squared error x {time}, measured at {spp} samples"
+        if scores[best] > 0.0:
+            others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
+            reason += f" (others, as multiples of it: {others})"
+        elif not any(scores.values()):  # a loss that is flat here, as of a detector that sees nothing
+            reason = f"as preferred: none of them has an error, measured at {spp} samples"
         names = {group.name for group in groups}
         plan = replace(
             plan,

@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -361,9 +361,10 @@ def _check_gradient(model: Model, images: Tensor, gradient: Tensor, detached: bo
 
 
 def _choices(model: Model, images: Tensor) -> str:
-    """What an output has that no gradient moves: how many numbers, and which of them are whole.
+    """What an output has that no gradient moves: how many numbers, which of them are whole, and texts.
 
-    A detector that has suppressed boxes finds more or fewer of them, or others, after a small step.
+    A detector that has suppressed boxes finds more or fewer of them, or others, after a small step, and what answers in
+    words goes on otherwise after another word.
     """
     assert model.read is not None
     found: list[Any] = []
@@ -376,6 +377,7 @@ def _choices(model: Model, images: Tensor) -> str:
     outputs = read_by(model.read, *_answer(model, images), model.name)[: len(images)]
     if not isinstance(outputs, Tensor):
         each_tensor(outputs, keep)
+        found += [text for one in outputs if isinstance(one, Mapping) for text in one.values() if type(text) is str]
     return str(found)
 
 

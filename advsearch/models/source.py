@@ -19,7 +19,7 @@ from torch.nn.parameter import is_lazy
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.files import open_regular
 from advsearch.models.archive import LARGEST
-from advsearch.models.model import CPU, ModelWarning
+from advsearch.models.model import CPU, GIVEN_BY, ModelWarning
 from advsearch.models.preprocessing import Triple
 from advsearch.models.probe import first_line
 
@@ -40,16 +40,30 @@ class Purpose:
     prompts: tuple[str, ...] | None = None
     tokens: int = 16
 
-    def named(self, model: str, what: str) -> tuple[str, ...]:
-        """Return the names, for a network that has no classes of its own.
+    def check(self, model: str, what: str, *tasks: str) -> None:
+        """Raise a ModelError where a network cannot do the task.
 
         Args:
             model: for messages.
             what: it does, such as "compares a picture with texts".
+            tasks: that it does. Tasks of a user's own may read its answer in any way.
+        """
+        if self.task in (*GIVEN_BY, "answer") and self.task not in tasks:
+            instead = " or ".join(f"`task={task}`" for task in tasks)
+            raise ModelError(f"model {model} {what} and cannot do task {self.task}; use {instead}")
+
+    def named(self, model: str, what: str, task: str) -> tuple[str, ...]:
+        """Return the names, for a network that has no classes of its own.
+
+        Args:
+            model, what: as in `check`.
+            task: that it does.
 
         Raises:
-            InputError: there are none.
+            ModelError: see `check`.
+            InputError: there are no names.
         """
+        self.check(model, what, task)
         if self.names is None:
             raise InputError(
                 f"model {model} {what} and has no classes of its own: name them, two at least, such as "

@@ -13,6 +13,9 @@ from advsearch.tasks.detector_answers import Detections, as_option, counted, num
 
 UNITS = ("fractions", "pixels")
 
+KNOWN = "boxes_are_corners_in_pixels"
+"""The attribute of a network that says so of its boxes, which are then not guessed from what they look like."""
+
 LOOKED_AT = 100
 """The best boxes of a picture that are looked at: what has no score says nothing."""
 

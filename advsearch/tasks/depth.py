@@ -164,7 +164,8 @@ class Depth(Task):
         elif hasattr(answer, "predicted_depth"):
             answer = answer.predicted_depth
         elif isinstance(answer, (list, tuple)) and answer:
-            answer = answer[0]
+            boxes = isinstance(answer[0], Tensor) and answer[0].shape[-1:] == (4,)
+            answer = None if boxes and len(answer) > 1 else answer[0]
         if isinstance(answer, Tensor) and answer.ndim == 4 and answer.shape[1] == 1:
             answer = answer[:, 0]
         if not isinstance(answer, Tensor) or answer.ndim != 3 or len(answer) != count or 0 in answer.shape:
@@ -183,7 +184,9 @@ class Depth(Task):
         if model.read is None:
             raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="depth"')
         if model.labels:
-            raise InputError("labels: task depth has no classes; leave it out")
+            raise InputError(
+                "labels: task depth has no classes; leave them out, or give a network without classes of its own"
+            )
         return super().on(model, target=target, minimise=minimise)
 
     def seeking(self, objective: str) -> Depth:

@@ -24,7 +24,7 @@ from advsearch.models import Model
 from advsearch.models.labels import names_nothing
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
-from advsearch.tasks.box_readings import UNITS, Reading, strongest_boxes, unit_in
+from advsearch.tasks.box_readings import KNOWN, UNITS, Reading, strongest_boxes, unit_in
 from advsearch.tasks.boxes import FORMS, left_over, overlap, share_inside, strongest
 from advsearch.tasks.classes import NO, ClassTask, Labels
 from advsearch.tasks.detector_answers import (
@@ -105,6 +105,7 @@ class Detection(ClassTask):
         undecided: whether only numbers tell scores from classes in its answers.
         shape: (A, B) of an answer that is read as a YOLO's head; None of others.
         masks: whether mask coefficients stand in its answers, which are left out.
+        told: whether its network says that its boxes are corners in pixels, as those of libraries do (`KNOWN`).
         fills_with_nan: whether rows of NaN stand where nothing is found, and not for an answer that is not a number.
         doubts: what is odd about these.
 
@@ -128,6 +129,7 @@ class Detection(ClassTask):
     undecided: bool = field(default=False, metadata=FROM_RUN)
     shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
     masks: bool = field(default=False, metadata=FROM_RUN)
+    told: bool = field(default=False, metadata=FROM_RUN)
     fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
     doubts: str = field(default="", metadata=FROM_RUN)
 
@@ -161,12 +163,13 @@ class Detection(ClassTask):
             noise = torch.rand((1, *model.input_size, 3), generator=torch.Generator().manual_seed(0))
             output = model(noise)
         blank = any("blank" in one for one in output)
-        return replace(found, input_size=model.input_size, fills_with_nan=blank)._having_seen(output)
+        told = not (self.boxes or self.unit) and getattr(model.module, KNOWN, False)
+        return replace(found, input_size=model.input_size, fills_with_nan=blank, told=told)._having_seen(output)
 
     @property
     def looks(self) -> bool:
         """See `Task.looks`: unless all is said already, boxes are compared with the true one."""
-        return not (self.boxes and self.unit) or (self.undecided and not self.order)
+        return not (self.told or (self.boxes and self.unit)) or (self.undecided and not self.order)
 
     def seeing(self, output: Sequence[Detections], truth: Place | None) -> Detection:
         """See `Task.seeing`."""
@@ -206,7 +209,7 @@ class Detection(ClassTask):
         boxed = found._boxed(output)
         return replace(
             found,
-            seen_unit=unit_in(strongest_boxes(boxed)) or self.seen_unit,
+            seen_unit=UNITS[1] if self.told else unit_in(strongest_boxes(boxed)) or self.seen_unit,
             fills_with_nan=self.fills_with_nan or any("blank" in one and len(one["boxes"]) for one in boxed),
         )
 

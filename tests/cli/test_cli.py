@@ -862,9 +862,11 @@ def test_the_table_is_read_in_five_seconds() -> None:
 
 def test_the_table_says_what_matters_beside_the_verdict() -> None:
     text = answer(
-        samples.attack(warnings=["A texture is missing."], baseline={**ATTACK["baseline"], "verified": rated()})
+        samples.attack(
+            warnings=["A texture is missing; use `task='depth'`."], baseline={**ATTACK["baseline"], "verified": rated()}
+        )
     )
-    assert text.endswith("adds nothing here.\n\nNote: A texture is missing.")
+    assert text.endswith("adds nothing here.\n\nNote: A texture is missing; use --task 'depth'.")
 
 
 def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -> None:

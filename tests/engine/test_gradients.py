@@ -387,6 +387,18 @@ def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> No
     assert contested(forced.plan) == []
 
 
+def test_a_loss_that_is_flat_keeps_what_is_preferred() -> None:
+    """As of a detector that sees nothing with the right name: all gradients are nil, and none has an error."""
+    render = renderer({"environment": {"exposure": [-1, 1]}})
+    plan = measured_plan(render, lambda image: 0.0 * image.sum(), inside(render), seed=0, spp=2, repeats=2)
+    (one,) = plan.groups
+    assert set(one.measured.values()) == {0.0}
+    assert (one.estimator, one.reason) == (
+        render.plan.groups[0].estimator,
+        "as preferred: none of them has an error, measured at 2 samples",
+    )
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_random_directions_do_not_judge_an_adjoint(seed: int) -> None:
     """What differs from the mean of a few is not wrong for that. They take eight renders, an adjoint about three."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -248,6 +249,7 @@ def test_a_name_that_begins_another_is_said(tmp_path: Path) -> None:
 WRONG: dict[str, tuple[dict[str, Any], type[AdvsearchError], str]] = {
     "no names": ({}, InputError, "labels: expected two names at least, .* got none; with `task=answer` it"),
     "one name": ({"labels": ["mug"]}, InputError, "labels: expected two names at least, .* got 'mug'"),
+    "another task": ({"task": "depth"}, ModelError, "cannot do task depth; use `task=classification` or `task=answer`"),
     "names of an answer": ({"labels": NAMES, "task": "answer"}, InputError, "task answer has no classes; leave them"),
     "two questions": ({"labels": NAMES, "prompt": "a | b"}, InputError, "prompt: expected one question .* got 2"),
     "too long": ({"labels": NAMES, "prompt": "the " * 64}, InputError, "to have at most 64 tokens for model .* got 7"),
@@ -357,3 +359,10 @@ def test_its_free_answer_is_attacked(tmp_path: Path, capsys: pytest.CaptureFixtu
     kept = [read_png(run / "images" / f"verification-{number:02d}.png") for number in range(4)]
     told = [spoken(tmp_path / "llava", np.rint(one * 255).astype(np.uint8), 3) for one in kept]
     assert [row.label for row in rows[:4]] == [text or "(nothing)" for text in told] and any(told)
+
+
+def test_an_answer_that_goes_on_otherwise_is_no_masked_gradient(tmp_path: Path) -> None:
+    """After a small step it may say another word, and then all logits after it are others."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ModelWarning)
+        assert advsearch.load_model(published(tmp_path, llava()), task="answer").differentiable

@@ -15,6 +15,7 @@ import advsearch
 from advsearch import load_model
 from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning
+from advsearch.tasks import Detection
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -205,12 +206,12 @@ def test_a_network_from_python_brings_its_tokenizer(tmp_path: Path) -> None:
 DETECTS: dict[str, Any] = {"labels": NAMES, "task": "detection"}
 WRONG: dict[str, tuple[str, dict[str, Any], type[AdvsearchError], str]] = {
     "no names": ("Owlv2", {"task": "detection"}, InputError, "finds what it is told to and has no classes of its own"),
-    "a classifier": ("Owlv2", {"labels": NAMES}, ModelError, "boxes are what a detector gives: use `task=detection`"),
+    "a classifier": ("Owlv2", {}, ModelError, "cannot do task classification; use `task=detection`"),
     "a segmenter": (
         "OwlViT",
         {"labels": NAMES, "task": "segmentation"},
         ModelError,
-        "boxes are what a detector gives: use `task=detection`",
+        "finds what it is told to and cannot do task segmentation; use `task=detection`",
     ),
     "no place": ("Owlv2", {**DETECTS, "prompt": "a photo"}, InputError, "prompt: expected a text with {} where the"),
     "too long": ("OwlViT", {**DETECTS, "prompt": "a {}" + " a" * 14}, InputError, "at most 16 tokens, got 18: 'a mug"),
@@ -240,6 +241,15 @@ def test_wrong_uses_are_refused(tmp_path: Path, wrong: str) -> None:
     family, given, error, text = WRONG[wrong]
     with pytest.raises(error, match=text):
         load_model(published(tmp_path, family), **given)
+
+
+def test_what_its_boxes_are_is_known(tmp_path: Path) -> None:
+    """They are not guessed from what they look like: here they are smaller than a pixel, and wrong."""
+    model = load_model(published(tmp_path, "Owlv2"), labels=NAMES, task="detection")
+    task = Detection().on(model)
+    tiny: Any = [{"boxes": torch.tensor([[0.2, 0.2, 0.4, 0.9]]), "scores": torch.tensor([[0.9, 0.1, 0.1]])}]
+    assert not task.looks and task.seeing(tiny, None).seen_unit == "pixels"
+    assert Detection(boxes="xywh").on(model).looks, "what is said counts, and is compared"
 
 
 def test_names_that_are_the_same_text_are_said(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import advsearch
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.labels import read_labels
+from advsearch.tasks import Depth
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -204,6 +205,7 @@ def test_a_network_from_python_brings_its_tokenizer(tmp_path: Path) -> None:
 
 WRONG: dict[str, tuple[dict[str, Any], type[AdvsearchError], str]] = {
     "no names": ({}, InputError, "has no classes of its own: name them, .* such as `labels=mug,cup,bowl`"),
+    "another task": ({"task": Depth()}, ModelError, "cannot do task depth; use `task=classification`"),
     "one name": ({"labels": ["mug"]}, InputError, "expected two names at least, .* got 'mug'"),
     "one word": ({"labels": "mug"}, FileFormatError, "label file mug: .*, and several names have commas between them"),
     "no such file": ({"labels": "a,b.json"}, FileFormatError, r"label file a,b\.json: cannot be read"),

@@ -199,6 +199,12 @@ def test_it_is_compared_with_the_distance_along_the_axis() -> None:
         assert right.map is not None and torch.allclose(right.map, moved(2.0), atol=1e-4)
 
 
+def test_boxes_are_no_map() -> None:
+    with pytest.raises(ValueError, match="expected a number for each pixel"):
+        TASK.read((torch.rand(1, 6, 4), torch.rand(1, 6, 3)), 1)
+    assert TASK.read((torch.rand(1, 6, 5), torch.rand(1, 6)), 1)[0][""].shape == (6, 5)
+
+
 # ---- on a model -----------------------------------------------------------------------------------------------------
 
 

@@ -76,6 +76,7 @@ def source(loaded: Loaded) -> Source:
 
 def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
     """Return the classifier of these names, or what answers freely."""
+    purpose.check(loaded.name, "goes on in words", "classification", "answer")
     free, names = purpose.task == "answer", purpose.names
     if free and names is not None:
         raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")

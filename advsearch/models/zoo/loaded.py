@@ -5,14 +5,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from advsearch.models.model import ModelWarning
-from advsearch.models.source import Source, source_of
+from advsearch.models.source import Purpose, Source, source_of
 from advsearch.models.zoo.processors import Measured, measured
 
 UNPREPARED = (
@@ -57,6 +57,19 @@ class Loaded:
     def source(self, module: nn.Module, **fields: Any) -> Source:
         """Return the source of a module that is given pictures as the network wants them; `fields` go to `Source`."""
         return source_of(module, self.name, **{**self.described, **fields})
+
+    def when_named(self, named: Callable[[Any, Any, str, Measured, Purpose], Source]) -> Source:
+        """Return the source of a network that reads texts, which is built when the user's names are there.
+
+        Args:
+            named: makes it of the network, its tokenizer, its name, what is done to pictures, and the purpose.
+        """
+        tokenizer, described = self.part("AutoTokenizer"), self.described
+        side = getattr(getattr(self.network.config, "vision_config", None), "image_size", None)
+        if "input_size" not in described and isinstance(side, int):
+            described = Measured(**{**described, "input_size": (side, side)})
+        finish = partial(named, self.network, tokenizer, self.name, described)
+        return Source(self.network, self.name, finish=finish, reads_text=True)
 
 
 def in_pixels(boxes: Tensor, images: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -31,19 +30,12 @@ def finds(architecture: str) -> bool:
 
 def source(loaded: Loaded) -> Source:
     """Return the source of a network that becomes a detector when names are there."""
-    network, described = loaded.network, loaded.described
-    side = getattr(getattr(network.config, "vision_config", None), "image_size", None)
-    if "input_size" not in described and isinstance(side, int):
-        described = Measured(**{**described, "input_size": (side, side)})
-    tokenizer = loaded.part("AutoTokenizer")
-    return Source(
-        network, loaded.name, finish=partial(_named, network, tokenizer, loaded.name, described), reads_text=True
-    )
+    return loaded.when_named(_named)
 
 
 def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
     """Return the detector of these names."""
-    names = purpose.named(name, "finds what it is told to")
+    names = purpose.named(name, "finds what it is told to", "detection")
     try:
         with torch.no_grad():
             network = sharing_copy(network).eval()
@@ -69,6 +61,7 @@ class _Owl(nn.Module):
     """
 
     rows: Tensor
+    boxes_are_corners_in_pixels = True
 
     def __init__(self, network: Any, rows: Tensor) -> None:
         super().__init__()
@@ -109,6 +102,7 @@ class _Grounded(nn.Module):
 
     text: Tensor
     places: Tensor
+    boxes_are_corners_in_pixels = True
 
     def __init__(self, network: Any, text: Tensor, places: Tensor) -> None:
         super().__init__()

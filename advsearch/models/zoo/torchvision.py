@@ -90,6 +90,8 @@ def _size_inside(transform: Any) -> tuple[int, int] | None:
 class _FromList(nn.Module):
     """What a detector finds in each of a list of pictures."""
 
+    boxes_are_corners_in_pixels = True
+
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network

@@ -218,6 +218,8 @@ class _Detector(nn.Module):
     each class by itself.
     """
 
+    boxes_are_corners_in_pixels = True
+
     def __init__(self, network: Any) -> None:
         super().__init__()
         self.network, self.classes = network, len(network.config.id2label)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -38,15 +37,8 @@ def source(loaded: Loaded) -> Source:
     Raises:
         ModelError: it takes patches in place of pictures.
     """
-    network = loaded.network
-    check_takes_pictures(network, loaded.spec)
-    tokenizer, described = loaded.part("AutoTokenizer"), loaded.described
-    side = getattr(getattr(network.config, "vision_config", None), "image_size", None)
-    if "input_size" not in described and isinstance(side, int):
-        described = Measured(**{**described, "input_size": (side, side)})
-    return Source(
-        network, loaded.name, finish=partial(_named, network, tokenizer, loaded.name, described), reads_text=True
-    )
+    check_takes_pictures(loaded.network, loaded.spec)
+    return loaded.when_named(_named)
 
 
 def check_takes_pictures(network: Any, spec: str) -> None:
@@ -60,7 +52,7 @@ def check_takes_pictures(network: Any, spec: str) -> None:
 
 def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
     """Return the classifier of these names."""
-    names = purpose.named(name, "compares a picture with texts")
+    names = purpose.named(name, "compares a picture with texts", "classification")
     prompts = patterns(purpose.prompts)
     if len(names) < 2:
         raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
