@@ -39,7 +39,7 @@ class NullProgress:
 
 
 Watched = Progress | bool | None
-"""Who watches, as a caller says it: True is a bar, False nobody, None a bar on a terminal (`api.watching`)."""
+"""Who watches, as a caller says it: True is a bar, False nobody, None a bar on a terminal (`watching`)."""
 
 
 def watcher(watched: Watched) -> Progress:

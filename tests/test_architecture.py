@@ -33,6 +33,7 @@ COMMON = {
     "seeds",
     "threads",
     "progress",
+    "watching",
     "yaml_text",
 }
 """Small modules that anyone may import and that import nobody but each other."""
@@ -58,6 +59,7 @@ RULES = {
     **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
     "pictures": Rule(set(), {"numpy", "PIL"}, HEAVY),
     "yaml_text": Rule(set(), {"yaml"}),
+    "watching": Rule({"report"}, {"rich"}),
     # typing_extensions for the type checker only
     "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),
     "config": Rule({"settings"}, {"pydantic", "yaml", "typing_extensions"}),

@@ -18,7 +18,6 @@ from typing import Any, Literal, TypedDict, TypeVar
 import numpy as np
 from torch import nn
 
-from advsearch.api.watching import watched
 from advsearch.engine.loading import (
     CONTROL,
     MODEL,
@@ -38,6 +37,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import told
 from advsearch.settings import Config, as_python, is_shallow, settings
+from advsearch.watching import watched
 
 Names = str | Sequence[str]
 """Names in a list, or in a text with commas between them."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 
-from advsearch.api.watching import shows_progress
 from advsearch.config import RenderConfig
 from advsearch.engine import rendering
 from advsearch.engine.loading import load_scene
@@ -18,6 +17,7 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.runs.results.render import RenderResult
 from advsearch.scene.surfaces import aovs_of
 from advsearch.tasks import make_task
+from advsearch.watching import shows_progress
 
 render = in_turn()(shows_progress(rendering.render))
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from advsearch.cli.flags import as_notes
-from advsearch.cli.output import columns
+from advsearch.cli.output import as_notes, columns
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
 from advsearch.report.failures import FAILURE_HEADS, failure_rows, failures_text

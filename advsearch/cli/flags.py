@@ -97,11 +97,6 @@ def _inside(scene: str) -> str:
     return ", ".join(shown(name, quoted=False) for name in names[:MOST_NAMES]) + more
 
 
-def as_notes(texts: Sequence[str]) -> str:
-    """Return notes below an answer, each a paragraph, with the flags of the settings that they name."""
-    return "".join(f"\n\nNote: {with_flags(text)}" for text in texts)
-
-
 def with_flags(message: str) -> str:
     """Return an error's message with the flags of the settings that it names.
 

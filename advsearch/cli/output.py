@@ -145,3 +145,10 @@ def _flush_c() -> None:
     """Write out what the C library holds back, before its descriptor changes."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).fflush(None)
+
+
+def as_notes(texts: Sequence[str]) -> str:
+    """Return notes below an answer, each a paragraph, with the flags of the settings that they name."""
+    from advsearch.cli.flags import with_flags  # settings, which `--help` does without
+
+    return "".join(f"\n\nNote: {with_flags(text)}" for text in texts)

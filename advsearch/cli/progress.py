@@ -6,12 +6,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
-from advsearch.api.watching import bars, lines
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import output_kept_clean
 from advsearch.cli.screen import raw
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress, Progress
+from advsearch.watching import bars, lines
 
 LOADING_STAGES = 2
 """The first stages of a command: modules are imported, then a scene and a model are loaded, which imports more."""

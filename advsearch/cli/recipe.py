@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.flags import as_notes
+from advsearch.cli.output import as_notes
 from advsearch.cli.question import Positional, QuestionCommand
 
 if TYPE_CHECKING:

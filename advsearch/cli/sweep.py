@@ -6,8 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from advsearch.cli.flags import as_notes
-from advsearch.cli.output import columns
+from advsearch.cli.output import as_notes, columns
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
 from advsearch.report.phrases import answer_text, beside_text, margin_text, percent

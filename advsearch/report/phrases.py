@@ -37,11 +37,12 @@ SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
 
 _UNITS = {
     "logits": ("margin", "log_odds", "pixel_margin"),
-    "logarithm of a factor": ("nearer", "farther"),
+    "logarithm of a factor": ("nearer", "farther", "gone"),
     "log-odds": ("vanish", "mislabel", "displace", "create"),
     "nats": ("cross_entropy",),
     "lengths of the clean features": ("feature_distance",),
     "1 - cosine": ("distance",),
+    "those of the tasks": ("each",),
 }
 
 MOST_DECIMALS = 4

@@ -21,7 +21,6 @@ from PIL import Image
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.watching import BarProgress, LineProgress, NotebookProgress, watched
 from advsearch.controls import LightControl, PoseControl
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.loading import as_controls, instances_in, settings_of
@@ -32,6 +31,7 @@ from advsearch.progress import NullProgress
 from advsearch.report.tables import GapTable
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.region import RegionResult
+from advsearch.watching import BarProgress, LineProgress, NotebookProgress, watched
 
 SIDE = 16
 PICTURE: dict[str, Any] = {"resolution": SIDE, "spp": 1, "denoise": "none", "threads": 1}
@@ -341,7 +341,7 @@ def test_progress_is_a_bar_where_somebody_looks(monkeypatch: pytest.MonkeyPatch)
     shell = types.SimpleNamespace(kernel=object())
     notebook = types.SimpleNamespace(get_ipython=lambda: shell, display=types.SimpleNamespace(display=display))
     monkeypatch.setitem(sys.modules, "IPython", notebook)
-    monkeypatch.setattr("advsearch.api.watching.UPDATE", 0.0)
+    monkeypatch.setattr("advsearch.watching.UPDATE", 0.0)
     assert watcher(True) is NotebookProgress
     assert any(re.search(r'searching, 2 of 4.*best 0\.5 <progress value="2" max="4">', one) for one in shown)
     assert shown[-1] == "<div>a sentence</div>"

@@ -26,7 +26,6 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 
 import advsearch
 from advsearch import __version__
-from advsearch.api.watching import BarProgress, LineProgress
 from advsearch.cli import list as listing
 from advsearch.cli.attack import answer
 from advsearch.cli.flags import with_flags
@@ -42,6 +41,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.parameters import Parameter
 from advsearch.settings import Config, settings
+from advsearch.watching import BarProgress, LineProgress
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL")
 
@@ -948,7 +948,7 @@ def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
 def test_lines_come_where_nothing_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr("sys.stderr", stream)
-    monkeypatch.setattr("advsearch.api.watching.PATIENCE", 0.0)
+    monkeypatch.setattr("advsearch.watching.PATIENCE", 0.0)
     with watching() as progress:
         progress.stage("compiling")
         for _ in range(100):
