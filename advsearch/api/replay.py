@@ -24,11 +24,13 @@ from advsearch.engine.rows import control_group, verified_rate
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.runs import made_with
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.replay import NOT_DONE, ReplayResult, ReplayRow
+from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import attack_of
 from advsearch.scene.exporting.cycles import BlenderError
 from advsearch.viewer.pages import write_page
@@ -94,6 +96,7 @@ def replay_from_config(
     threads = {} if config.threads is None else {"threads": config.threads}
     again = partial(problem_of_parts, parts, **threads)
     problem, warnings = again()
+    warnings += _changed(folder, parts)
     u = kept_answer(folder, problem)
     ways = [*_ways(config, again, problem, summary), *_models(config, again, problem, summary)]
     ending, seed = "done", seeds.stream(parts.config.seed, "replay")
@@ -189,6 +192,15 @@ def _batches(ways: Sequence[Way]) -> list[list[int]]:
     """The places of the conditions that share their renders, and each of the others by itself."""
     sharing = [number for number, way in enumerate(ways) if way.shares]
     return [sharing, *([number] for number, way in enumerate(ways) if not way.shares)]
+
+
+def _changed(folder: Path, parts: AttackParts) -> list[str]:
+    """What a reader has to know of a file that was another one when the run was made."""
+    with Store(folder / NAME, read_only=True) as results:
+        noted = results.noted(made_with.NOTE)
+    before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
+    name = made_with.changed_file(before, made_with.made_with(parts.config.plain()))
+    return [f"{name} is not what it was when the run was made: what does not hold may come from that."] if name else []
 
 
 Again = Callable[..., tuple[Problem, list[str]]]

@@ -90,6 +90,17 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
     assert again.table[0] == first.table[0]
 
 
+def test_a_file_that_has_changed_since_is_said(tmp_path: Path) -> None:
+    names = tmp_path / "names.json"
+    names.write_text('["mug", "vase"]')
+    attack_once(AttackConfig(**SHORT, labels=str(names), label="mug", run=str(tmp_path / "found")))
+    same = advsearch.replay(tmp_path / "found", ways="sampler", trials=6, run=tmp_path / "same")
+    assert not any("names.json" in one for one in same.warnings)
+    names.write_text('["mug", "bowl"]')
+    other = advsearch.replay(tmp_path / "found", ways="sampler", trials=6, run=tmp_path / "other")
+    assert any("names.json is not what it was when the run was made" in one for one in other.warnings)
+
+
 def test_what_changes_only_after_rendering_renders_nothing(attacked: Path, tmp_path: Path) -> None:
     together = advsearch.replay(
         attacked, ways="curve,jpeg,sensor,sampler", model="small_models:hard", trials=6, run=tmp_path / "together"
