@@ -85,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _interruptible(given: list[str]) -> int:
     """As `_status`, with Ctrl-C for as long as there is something to interrupt, and never a traceback of it."""
+    sys.unraisablehook = _unless_interrupted
     try:
         signal.signal(signal.SIGINT, INTERRUPTS)
         status = _status(given)
@@ -93,6 +94,12 @@ def _interruptible(given: list[str]) -> int:
     except KeyboardInterrupt:  # while `_status` told of another
         INTERRUPTS.ended = True
         return INTERRUPTED
+
+
+def _unless_interrupted(unraisable: sys.UnraisableHookArgs) -> None:
+    """Tell an exception that a destructor or a callback could not raise, but for an interrupt: that is counted."""
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
 
 
 def _status(given: list[str]) -> int:

@@ -246,6 +246,20 @@ def test_two_quick_interrupts_leave_no_traceback(delay: float, tmp_path: Path) -
     assert "Traceback" not in error and "Exception ignored" not in error
 
 
+def test_an_interrupt_inside_a_callback_is_counted_and_not_told() -> None:
+    """Imports have weak references whose callbacks can raise nothing."""
+    code = (
+        "import os, sys, weakref; from advsearch.cli import main\n"
+        "class Gone: pass\n"
+        "def given(argv):\n"
+        "    gone = Gone(); ref = weakref.ref(gone, lambda _: (os.kill(os.getpid(), 2), sum(range(10**6)))); del gone\n"
+        "    main.INTERRUPTS.check()\n"
+        "main._run_and_tell = given; sys.argv = ['advsearch']; sys.exit(main.main())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 130 and "Traceback" not in done.stderr and "ignored" not in done.stderr
+
+
 STRUCK = """
 import os, signal, sys
 sys.argv = ["advsearch", "nope"]
