@@ -134,7 +134,7 @@ def test_a_network_of_timm_is_fed_as_timm_says(timm: Any, tmp_path: Path) -> Non
         assert model.labels[0] == "tench, Tinca tinca"
         assert_same(model(PICTURE), theirs(timm, network))
     assert_gradient(model)
-    with pytest.raises(ModelError, match=r"has no classes \(num_classes is 0\)"):
+    with pytest.raises(ModelError, match=r"without a head \(num_classes is 0\), .* use `task=similarity`"):
         load_model(timm.create_model("test_vit", num_classes=0))
 
 
