@@ -122,7 +122,8 @@ def _load_torchscript(path: Path, archive: Archive) -> Source:
     if torchscript.runs_while_loading(archive):
         _try_to_load(path, checked)
     with warnings.catch_warnings(), _damaged(path, "TorchScript"):
-        warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=DeprecationWarning)
+        for kind in (DeprecationWarning, FutureWarning):  # the second from torch 2.14 on
+            warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=kind)
         module = torch.jit.load(checked, map_location="cpu")
     return source_of(module, path.stem)
 

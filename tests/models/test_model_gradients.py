@@ -45,8 +45,7 @@ def test_batch_norm_before_a_transformer_has_its_gradient(kind: str, tmp_path: P
         path = tmp_path / "net.ts"
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # newer versions of torch deprecate it
-            traced = torch.jit.trace(network, images)
-        torch.jit.save(traced, path)
+            torch.jit.save(torch.jit.trace(network, images), path)
     with warnings.catch_warnings():
         warnings.simplefilter("error", ModelWarning)
         model = load_model(network if kind == "module" else path, input_size=SIDE)
