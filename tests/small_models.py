@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -9,6 +11,11 @@ import advsearch
 from advsearch import Model
 
 SIDE = 32
+
+SMALL_ATTACK: dict[str, Any] = {
+    "controls": {"light": {}}, "steps": 2, "trials": 6, "spp": 2, "verify_spp": 2, "resolution": 16, "denoise": "none",
+}  # fmt: skip
+"""Settings of an attack of two evaluations, for a network that is there to be asked."""
 MUG, CORNER = [0.12, 0.12, 0.86, 0.86], [0.02, 0.02, 0.2, 0.2]
 
 

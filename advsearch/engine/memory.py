@@ -109,11 +109,11 @@ class Memory:
             InputError: when called, if another configuration is proposed than the one that was stored.
         """
 
-        def told(index: int, image: Tensor) -> None:
+        def keep(index: int, image: Tensor) -> None:
             if frames is not None:
                 self._pictures[kind, index] = frames.add(image)
 
-        evaluate, count = make(None if frames is None else OnImage(frames.wants, told)), 0
+        evaluate, count = make(None if frames is None else OnImage(frames.wants, keep)), 0
         if self._run is None:
             return evaluate
 

@@ -25,7 +25,7 @@ MOST = 256
 """Most tokens of an answer."""
 
 
-class Said(TypedDict):
+class Utterance(TypedDict):
     """What a model says of one picture.
 
     Attributes:
@@ -72,9 +72,9 @@ class FreeAnswer(Task):
             raise InputError("minimise: makes the right answer easier to give; leave `target` out")
         return replace(self, target=None if target is None else _words("target", target), minimise=minimise)
 
-    def read(self, answer: Any, count: int) -> list[Said]:
-        """See `Task.read`: what `Said` describes, for each picture."""
-        keys = Said.__required_keys__
+    def read(self, answer: Any, count: int) -> list[Utterance]:
+        """See `Task.read`: what `Utterance` describes, for each picture."""
+        keys = Utterance.__required_keys__
         if isinstance(answer, (list, tuple)) and all(isinstance(one, Mapping) and keys <= one.keys() for one in answer):
             return list(answer)
         raise ValueError("expected a mapping with text, logits and begins for each picture, as answers in words have")
@@ -101,11 +101,11 @@ class FreeAnswer(Task):
         """Return the right words."""
         return truth
 
-    def margin(self, output: Sequence[Said], truth: Words) -> Tensor:
+    def margin(self, output: Sequence[Utterance], truth: Words) -> Tensor:
         """See `FreeAnswer`, (N,): over 0 exactly where the text has none of the words."""
         return torch.stack([_margin(one, truth) for one in output])
 
-    def answers(self, output: Sequence[Said], count: int = 1) -> list[tuple[Answer, ...]]:
+    def answers(self, output: Sequence[Utterance], count: int = 1) -> list[tuple[Answer, ...]]:
         """Return the text of each picture, in one line without signs that steer a terminal."""
         shown = ("".join(sign if sign.isprintable() else " " for sign in one["text"]) for one in output)
         return [(Answer(" ".join(text.split()) or SILENCE),) for text in shown]
@@ -124,7 +124,7 @@ def has_word(text: str, words: Words) -> bool:
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)
 
 
-def _margin(one: Said, words: Words) -> Tensor:
+def _margin(one: Utterance, words: Words) -> Tensor:
     logits, begin = one["logits"], sorted({number for word in words for number in one["begins"](word)})
     if not begin:
         raise InputError(f"label: the model has no token that begins one of {', '.join(words)}; name others")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_models import SMALL_ATTACK
 from torch import Tensor
 
 import advsearch
@@ -291,14 +292,8 @@ def test_it_is_attacked_by_name(tmp_path: Path) -> None:
         labels=list(NAMES),
         prompt=QUESTION,
         label=",".join(NAMES[:4]),
-        controls={"light": {}},
         policy="pgd",
-        steps=2,
-        trials=6,
-        spp=2,
-        verify_spp=2,
-        resolution=16,
-        denoise="none",
+        **SMALL_ATTACK,
         run=tmp_path / "run",
     )
     rows = list(result.rows("verification"))

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from PIL import Image
+from small_models import SMALL_ATTACK
 from torch import Tensor, nn
 
 import advsearch
@@ -266,14 +267,8 @@ def test_it_is_attacked_by_name(tmp_path: Path, family: str) -> None:
         label="mug",
         task={"name": "detection", "confidence": 0.001, "iou": 0.0001},
         objective="vanish",
-        controls={"light": {}},
         policy="random",
-        steps=2,
-        trials=6,
-        spp=2,
-        verify_spp=2,
-        resolution=16,
-        denoise="none",
+        **SMALL_ATTACK,
         run=tmp_path / "run",
     )
     assert result.summary.ending != "already wrong", "the clean picture is right, and the answer was judged"

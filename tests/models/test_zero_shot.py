@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_models import SMALL_ATTACK
 from torch import Tensor, nn
 
 import advsearch
@@ -257,14 +258,8 @@ def test_it_is_attacked_by_name(tmp_path: Path) -> None:
         "mug",
         published(tmp_path / "clip"),
         **given,
-        controls={"light": {}},
         policy="random",
-        steps=2,
-        trials=6,
-        spp=2,
-        verify_spp=2,
-        resolution=SIDE,
-        denoise="none",
+        **SMALL_ATTACK,
         run=tmp_path / "run",
     )
     assert result.summary.ending in ("found", "budget spent"), "the clean picture is right, and the answer was judged"

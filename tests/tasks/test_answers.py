@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.errors import InputError, ModelError
 from advsearch.tasks import Answer, Facts, FreeAnswer, make_task
-from advsearch.tasks.answers import Said, has_word
+from advsearch.tasks.answers import Utterance, has_word
 
 VOCABULARY = ("a", "mug", "cup", "bowl", ".")
 
@@ -21,14 +21,14 @@ def begins(word: str) -> Sequence[int]:
     return [number for number, known in enumerate(VOCABULARY) if known == word]
 
 
-def said(text: str, logits: Tensor) -> Said:
+def said(text: str, logits: Tensor) -> Utterance:
     return {"text": text, "logits": logits, "begins": begins}
 
 
 class Speaker(nn.Module):
     """Says "mug ." of a picture that is bright, and "bowl ." of a dark one."""
 
-    def forward(self, images: Tensor) -> list[Said]:
+    def forward(self, images: Tensor) -> list[Utterance]:
         bright = images.mean(dim=(1, 2, 3)) - 0.5
         found = []
         for one in bright:

@@ -25,7 +25,7 @@ from advsearch.models.zoo.processors import processor_of
 
 
 @dataclass(frozen=True)
-class Kind:
+class Family:
     """Networks of transformers that are loaded and asked alike.
 
     Args:
@@ -48,7 +48,7 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 
 
 def load(spec: str) -> Source:
-    """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `KINDS`.
+    """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `NETWORKS`.
 
     One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`, `language`).
 
@@ -117,15 +117,15 @@ def _part(transformers: Any, spec: str, name: str, where: Mapping[str, Any], loa
         return getattr(transformers, loader).from_pretrained(name, trust_remote_code=False, **where)
 
 
-def _kind(architecture: str, network: Any, spec: str) -> Kind:
-    """Return which of `KINDS` an architecture is of; a ModelError says what it is otherwise.
+def _kind(architecture: str, network: Any, spec: str) -> Family:
+    """Return which of `NETWORKS` an architecture is of; a ModelError says what it is otherwise.
 
     Args:
         architecture: by name.
         network: of it, or its class.
         spec: the model, for messages.
     """
-    for kind in KINDS:
+    for kind in NETWORKS:
         if kind.ours(architecture, network):
             return kind
     raise ModelError(
@@ -237,48 +237,48 @@ def _with_names(make: Callable[[Any], nn.Module]) -> Callable[[Loaded], Source]:
     return lambda loaded: loaded.source(make(loaded.network), labels=names_of(loaded.network.config) or None)
 
 
-KINDS = (
-    Kind(
+NETWORKS = (
+    Family(
         _called("TimmWrapperForImageClassification"),
         "AutoModelForImageClassification",
         lambda loaded: timm.of_wrapped(loaded, names_of(loaded.network.config)),
     ),
-    Kind(
+    Family(
         _called("ForImageClassification"),
         "AutoModelForImageClassification",
         features.also(_with_names(_Classifier)),
     ),
-    Kind(
+    Family(
         _called("ForSemanticSegmentation"),
         "AutoModelForSemanticSegmentation",
         _with_names(_Segmenter),
     ),
-    Kind(
+    Family(
         mask_queries.is_ours,
         "AutoModelForUniversalSegmentation",
         lambda loaded: mask_queries.source(loaded, names_of(loaded.network.config) or None),
     ),
-    Kind(
+    Family(
         lambda architecture, network: open_vocabulary.finds(architecture),
         "AutoModelForZeroShotObjectDetection",
         open_vocabulary.source,
     ),
-    Kind(
+    Family(
         _called("ForObjectDetection"),
         "AutoModelForObjectDetection",
         _with_names(_Detector),
     ),
-    Kind(language.speaks, "AutoModelForImageTextToText", language.source),
-    Kind(
+    Family(language.speaks, "AutoModelForImageTextToText", language.source),
+    Family(
         _called("ForDepthEstimation"),
         "AutoModelForDepthEstimation",
         depth_maps.source,
     ),
-    Kind(
+    Family(
         lambda architecture, network: zero_shot.compares(network),
         "AutoModel",
         features.also(zero_shot.source, reads_text=True),
     ),
-    Kind(features.answers_with_features, "", features.source),
+    Family(features.answers_with_features, "", features.source),
 )
 """Every kind that is read, the particular ones first."""
