@@ -24,11 +24,11 @@ from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
-from advsearch.engine.ahead import Ahead, seen_by
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
 from advsearch.engine.attack_result import AttackParts, AttackResult
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.going_on import check_made_of
+from advsearch.engine.journal import Journal
 from advsearch.engine.loading import (
     SCENE,
     Controls,
@@ -42,7 +42,6 @@ from advsearch.engine.loading import (
     scene_as_settings,
     settings_of,
 )
-from advsearch.engine.memory import Memory
 from advsearch.engine.metrics import Metric, Metrics, check_shared, load_metrics, metrics_as_settings
 from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
@@ -60,8 +59,9 @@ from advsearch.engine.objective import Wanted, objective_for, task_for
 from advsearch.engine.outcome import Question, summarise
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Recorder, Stages
+from advsearch.engine.record import Stages
 from advsearch.engine.run_settings import RunSettings
+from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.stages import Attack
 from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.errors import InputError
@@ -566,25 +566,24 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
             functions = {f"metric {name}": one for name, one in job.metrics.items()}
             objective = {"objective": job.objective} if callable(job.objective) else {}
             check_made_of(kept, [job.loaded[0]], {**functions, **objective, "task": function_of(job.task)})
-        memory = Memory(kept)
-        with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
-            recorder = Recorder(kept, problem, memory, Ahead(executor))
+        with executor_for(job.config, "advsearch.api.attack:answering_of", progress) as executor:
+            journal = Journal(kept, Shared(problem, executor))
             budget = budget_of(job.config, problem)
             if problem.conditions is not None and None in (job.config.steps, job.config.draws):
                 progress.message(
                     f"One answer for many conditions: {count(budget.steps, 'step')}, each over "
                     f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
                 )
-            spent = (budget, policy, recorder, memory, stages, preparation_of(job.config))
-            findings = Attack(problem, *spent, clean=job.clean).carry_out()
-        found = summarise(_question(job), problem, findings, recorder, stages, warnings)
+            findings = Attack(journal, budget, policy, stages, preparation_of(job.config), clean=job.clean).carry_out()
+        found = summarise(_question(job), findings, journal, stages, warnings)
         parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
         return replace(found, parts=lambda: parts)
 
 
-def announced_of(settings: JsonObject) -> Call:
-    """Return what carries out trials and evaluations of the attack that the settings describe: what a worker does."""
-    return seen_by(_problem(_job(AttackConfig(**settings))))
+def answering_of(settings: JsonObject) -> Call:
+    """Return what answers the queries of the attack that the settings describe: what a worker does."""
+    problem = _problem(_job(AttackConfig(**settings)))
+    return answering(lambda name: problem)
 
 
 def executor_for(

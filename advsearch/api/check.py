@@ -31,7 +31,6 @@ from advsearch.engine.gradients import (
 )
 from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
-from advsearch.engine.memory import Memory
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import (
     CONVERGED,
@@ -120,7 +119,7 @@ def check_from_config(
     progress.stage(LOADING)
     parts = parts_of(config)
     with RunDirectory.of(config, resumed) as run:
-        results, measured = Results(Memory(run), config.seconds), 0
+        results, measured = Results(run, config.seconds), 0
 
         def rows() -> Iterator[CheckedRow]:
             nonlocal measured

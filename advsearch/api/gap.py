@@ -19,11 +19,10 @@ from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, GapConfig
-from advsearch.engine.ahead import Ahead, AheadAnswer, PictureAhead, seen_by
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel, different, load_models
-from advsearch.engine.problem import Problem
+from advsearch.engine.sharing import answering
 from advsearch.engine.transfer import Transfer
 from advsearch.engine.transport import CleanMatrix
 from advsearch.files import JsonObject
@@ -386,8 +385,8 @@ def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[
                 parts.progress.stage("loading the models to try the answers on")
                 problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
                 seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
-                with executor_for(config, "advsearch.api.gap:pictures_of", parts.progress) as executor:
-                    kept = (problems, parts.run, parts.progress, Ahead(executor))
+                with executor_for(config, "advsearch.api.gap:answering_of", parts.progress) as executor:
+                    kept = (problems, parts.run, parts.progress, executor)
                     tried = Transfer(*kept, trials=trials, spp=spp, seed=seed)
                     models = tried.clean()
                     for name, u in answers.items():
@@ -401,19 +400,10 @@ def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[
     return models, rows
 
 
-def pictures_of(settings: JsonObject) -> Call:
-    """Return what makes pictures for the models of a configuration: what a worker does."""
-    config, problems = AttackConfig(**settings), dict[str, Problem]()
-
-    def call(asked: Sequence[PictureAhead]) -> list[AheadAnswer]:
-        found = []
-        for one in asked:
-            if one.of not in problems:
-                problems[one.of] = problem_from_config(_alone(config, one.of))[0]
-            found += seen_by(problems[one.of])([one])
-        return found
-
-    return call
+def answering_of(settings: JsonObject) -> Call:
+    """Return what answers queries of the models of a configuration: what a worker does."""
+    config = AttackConfig(**settings)
+    return answering(lambda name: problem_from_config(_alone(config, name))[0])
 
 
 def _alone(config: AttackConfig, name: str) -> AttackConfig:

@@ -15,7 +15,6 @@ from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
 from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
-from advsearch.engine.memory import Memory
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
@@ -86,7 +85,7 @@ def plan_from_config(
     progress, begun = progress or NullProgress(), time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
         progress.stage(LOADING)
-        results = Results(Memory(run), config.seconds)
+        results = Results(run, config.seconds)
         problem, _ = problem_from_config(config)
         work = _Measurements(problem, config, results, progress)
 

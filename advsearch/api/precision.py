@@ -23,7 +23,6 @@ from advsearch.config import PrecisionConfig
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
-from advsearch.engine.memory import Memory
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem
@@ -138,7 +137,7 @@ def _measured(config: PrecisionConfig, run: RunDirectory | None, progress: Progr
         )
     with _executor(config, progress) as executor:
         setup = time.perf_counter() - begun
-        job, results = _Measurement(config, problem, progress, policies, executor), Results(Memory(run))
+        job, results = _Measurement(config, problem, progress, policies, executor), Results(run)
         parts = [one for one in job.parts() if one.quantity in wanted]
 
         def sections() -> Iterator[Section]:
@@ -355,7 +354,9 @@ class _Measurement:
                 counted=True,
                 tick=lambda: self.progress.advance(1),
             )
-        bench = ObjectiveBench(problem.evaluator, problem.domain, policies, config.steps, self._verified, budget)
+        bench = ObjectiveBench(
+            partial(map, problem.evaluate), problem.seed, problem.domain, policies, config.steps, self._verified, budget
+        )
         self.section.start = self._verified(problem.domain.start)
         settings = bench.settings(problem.spp)
         tick = self._timed("searching with each policy", budget)

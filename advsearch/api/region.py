@@ -16,11 +16,12 @@ from advsearch.api.keywords import RegionKeywords, asks, configured
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
+from advsearch.engine.journal import Journal
 from advsearch.engine.loading import Scene
-from advsearch.engine.memory import Memory
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Recorder, Stages
+from advsearch.engine.record import Stages
+from advsearch.engine.sharing import Shared
 from advsearch.engine.verifier import Verifier
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
@@ -99,9 +100,8 @@ def region_from_config(
     varied = _varied(problem, config)
     centre = _centre(problem, config)
     with RunDirectory.of(config, resumed) as run:
-        memory = Memory(run)
         spent = RenderBudget(ladder=verification_ladder(config.pixel_sampler, config.verify_spp))
-        verifier = Verifier(problem, spent, Recorder(run, problem, memory), memory, stages)
+        verifier = Verifier(Journal(run, Shared(problem)), spent, stages)
         try:
             with interruptible():
                 answer, ending = _answer(verifier, config, varied, centre, run), "done"
@@ -154,8 +154,7 @@ def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Te
         checking = True
 
     def same(values: Tensor, number: int) -> bool:
-        trial = verifier.trial("region", number, at(values))
-        stages.progress.advance(1)
+        (trial,) = verifier.trials("region", {number: at(values)}, sought=False)
         return trial.success == verdict and not trial.not_a_number
 
     seed = seeds.stream(config.seed, "region")
@@ -221,10 +220,8 @@ def _verdict(verifier: Verifier, centre: Tensor) -> bool:
     """
     verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
     wrong = nothing = 0
-    for number in range(AT_CENTRE):
-        trial = verifier.trial("centre", number, centre)
+    for trial in verifier.trials("centre", dict.fromkeys(range(AT_CENTRE), centre), sought=False):
         wrong, nothing = wrong + trial.success, nothing + trial.not_a_number
-        verifier.stages.progress.advance(1)
     if nothing:
         raise InputError(
             f"the model's answer is not a number in {nothing} of {AT_CENTRE} trials at the centre, so there is no "
@@ -269,12 +266,9 @@ def _map(verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: Ru
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
 
-    def margin(row: int, column: int) -> float:
-        trial = verifier.trial("map", row * side + column, at(torch.stack([steps[column], steps[row]])))
-        verifier.stages.progress.advance(1)
-        return trial.score
-
-    margins = [[margin(row, column) for column in range(len(steps))] for row in range(len(steps))]
+    places = dict(enumerate(at(torch.stack([column, row])) for row in steps for column in steps))
+    scores = [trial.score for trial in verifier.trials("map", places, sought=False)]
+    margins = [scores[begin : begin + side] for begin in range(0, len(scores), side)]
     ends = [verifier.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []
     for side_of in box:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from advsearch.api.keywords import StabilityKeywords, asks, configured
 from advsearch.config import StabilityConfig
 from advsearch.engine.measuring import Results, kept_rows
-from advsearch.engine.memory import Memory
 from advsearch.evaluation.stability.suite import chosen, run_cases
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.directory import RunDirectory
@@ -63,5 +62,5 @@ def stability_from_config(
                 command_line=config.command_line(),
             )
 
-        results = Results(Memory(run), config.seconds)
+        results = Results(run, config.seconds)
         return kept_rows(run, results, run_cases(cases, results, progress or NullProgress()), result)

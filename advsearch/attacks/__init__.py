@@ -5,7 +5,7 @@ from __future__ import annotations
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Block, Domain
 from advsearch.attacks.ending import Ending
-from advsearch.attacks.evaluation import Evaluate, Evaluation, Wanted
+from advsearch.attacks.evaluation import Evaluate, Evaluation, Query, Wanted
 from advsearch.attacks.objectives import (
     OBJECTIVES,
     Objective,
@@ -66,6 +66,7 @@ __all__ = [
     "Policy",
     "Portfolio",
     "Proposal",
+    "Query",
     "Random",
     "Restarts",
     "Rung",

@@ -1,10 +1,11 @@
-"""What one render of one configuration tells a search: the only thing that passes from a scene to a policy."""
+"""The one question to renderer and model, and its answer: all that passes between a scene and a search or a trial."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -14,10 +15,60 @@ from advsearch.tasks import Judgement
 Wanted = bool | Literal["free"]
 """Which derivative is wanted: none, all of it, or only what costs no extra render, with zeros elsewhere."""
 
+Phase = Literal["search", "ranking"]
+
+MOST, MOST_NUMBERS = 1024, 2**24
+"""Queries that are asked at once, and the numbers that their configurations have together, at most."""
+
+
+def most_at_once(dim: int) -> int:
+    """Return how many configurations of so many numbers are asked about at once, at most."""
+    return max(2, min(MOST, MOST_NUMBERS // dim))
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """One question: what does the model say of this configuration under this noise?
+
+    A query of a search is about the picture as it is rendered, at the search's own samples and light paths, and over
+    the conditions that it draws. A trial is about the picture as a file would hold it, rounded to 8 bits.
+
+    Attributes:
+        u: (d,) float32 in [0, 1], the configuration; must not be written to.
+        seed: of the noise, and of the conditions that are drawn. Equal seeds mean equal noise.
+        kind: which rows the answer belongs to, such as "search" or "verification".
+        number: its place among these rows, from 0.
+        phase: of a search; None for a trial.
+        gradient: whether the derivative is wanted. "free" only ever comes where the domain has `partial_gradients`.
+        samples: of a search: how many times its own samples per pixel to render with, at least 1. The answer costs as
+            many times its renders: samples * (1 + gradient_cost) with a gradient, samples without.
+        spp: of a trial: samples a pixel.
+        drawn: of a trial: whether conditions are drawn; otherwise the scene has those it comes with.
+        described: of a trial: whether its row says u, which trials of one kind may have in common.
+        sought: of a trial: whether a search seeks some answer there, so that there is a success.
+        wanted: what the answer is: a judgement; a picture alone; or "light", from which pictures can be predicted
+            (`advsearch.scene.transport`), at u of the whole space.
+        keep: whether the answer has the picture, too.
+    """
+
+    u: Tensor
+    seed: int
+    kind: str = "search"
+    number: int = 0
+    phase: Phase | None = None
+    gradient: Wanted = False
+    samples: int = 1
+    spp: int = 1
+    drawn: bool = True
+    described: bool = False
+    sought: bool = True
+    wanted: Literal["judgement", "picture", "light"] = "judgement"
+    keep: bool = False
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """One configuration, rendered once and judged.
+    """The answer to a query.
 
     Attributes:
         objective: what is maximised; a noisy number, because a render is.
@@ -27,6 +78,10 @@ class Evaluation:
         cost: pictures that were rendered for it, at least 1: one, and those that differences took, each times
             `samples`. An adjoint is not a picture and counts 0; `SearchResult.gradients` counts it.
         judgement: what the task says of it, for the log; None where there is no task. No policy looks at it.
+        picture: (H, W, 3) 8-bit values in [0, 1], where it was asked for.
+        light: what was asked for as "light".
+        machine: on which it was made, by its name among the workers' machines; None where that is like this one.
+        lost: whether nobody could answer, since every worker that tried died.
     """
 
     objective: float
@@ -35,6 +90,27 @@ class Evaluation:
     non_finite: int = 0
     cost: int = 1
     judgement: Judgement | None = None
+    picture: Tensor | None = None
+    light: Any = None
+    machine: str | None = None
+    lost: bool = False
+
+    @classmethod
+    def of(cls, judgement: Judgement, **more: Any) -> Evaluation:
+        """Return the answer to a query without derivative, from what the task says."""
+        value = math.nan if judgement.objective is None else judgement.objective
+        return cls(value, None, judgement.success, judgement=judgement, **more)
+
+    @property
+    def said(self) -> Judgement:
+        """What the task says.
+
+        Raises:
+            RuntimeError: there is no task, or another answer was wanted.
+        """
+        if self.judgement is None:
+            raise RuntimeError("this answer has no judgement")
+        return self.judgement
 
     @property
     def finite(self) -> bool:
@@ -42,23 +118,9 @@ class Evaluation:
         return math.isfinite(self.objective)
 
 
-class Evaluate(Protocol):
-    """Renders a configuration and judges it; supplied by whoever owns the scene."""
-
-    def __call__(self, u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-        """Evaluate u.
-
-        Args:
-            u: (d,) float32 in [0, 1]; must not be written to.
-            index: which of the search's seeds to render with. Equal indices mean equal seeds, others independent
-                ones.
-            gradient: whether the derivative is wanted. "free" only ever comes where the domain has
-                `partial_gradients`.
-            samples: how many times the search's own samples per pixel to render with, at least 1. The evaluation
-                costs as many times its renders: samples * (1 + gradient_cost) with a gradient, samples without. Only
-                passed where it is not 1, so an evaluation that no policy asks for more need not know it.
-        """
-        ...
+Evaluate = Callable[[Sequence[Query]], Iterable[Evaluation]]
+"""Answers queries, in their order, each when it is asked for; whoever stops asking leaves the rest undone. Supplied by
+whoever owns the scene. `functools.partial(map, f)` makes one of a function of one query."""
 
 
 def usable(evaluation: Evaluation) -> Evaluation:

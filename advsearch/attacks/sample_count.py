@@ -34,8 +34,8 @@ SEEDS = 8
 LOOKS = 2
 """How often the renders of a sample count are looked at: after half of them, and after all."""
 
-MarginOf = Callable[[int, int], float]
-"""(spp, seed) -> margin in logits of one render."""
+MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
+"""(spp, seeds) -> margins in logits, one of each render."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class SampleCount:
 
 
 def choose_spp(
-    margins: Mapping[str, MarginOf],
+    margins: Mapping[str, MarginsOf],
     *,
     seed: int,
     ladder: Sequence[int] = LADDER,
@@ -106,8 +106,8 @@ def choose_spp(
     has not settled, the last rung is taken as it is. That may take `converged` away, but never gives it.
 
     Args:
-        margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each renders once per call. The first
-            should be the one that is least likely to settle.
+        margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each renders what it is asked for. The
+            first should be the one that is least likely to settle.
         seed: root seed; every render gets another seed of the stream "sample count".
         ladder: sample counts, rising, at least one. A single one is returned as it is, unmeasured and not converged.
         seeds: renders per configuration and rung at most, at least 4.
@@ -123,8 +123,8 @@ def choose_spp(
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
     table, renders, reached = list[Rung](), 0, 1
-    for name, margin in margins.items():
-        values = _climbed(margin, seed, ladder, seeds, drift)
+    for name, render in margins.items():
+        values = _climbed(render, seed, ladder, seeds, drift)
         below = None
         for spp, found in zip(ladder, values, strict=False):
             below = _rung(name, spp, found, below, drift)
@@ -135,7 +135,7 @@ def choose_spp(
     return SampleCount(ladder[reached], True, tuple(table), renders)
 
 
-def _climbed(margin: MarginOf, seed: int, ladder: Sequence[int], seeds: int, drift: float) -> list[list[float]]:
+def _climbed(margins: MarginsOf, seed: int, ladder: Sequence[int], seeds: int, drift: float) -> list[list[float]]:
     """Return the margins of one configuration at each rung, up to that at which it settles or beyond which none can
     settle it."""
     values: list[list[float]] = [[] for _ in ladder]
@@ -146,8 +146,8 @@ def _climbed(margin: MarginOf, seed: int, ladder: Sequence[int], seeds: int, dri
         if not _may_settle(values, ladder, level, count, drift):
             continue
         for one in (level - 1, level):
-            for index in range(len(values[one]), count):
-                values[one].append(margin(ladder[one], stream(seed, "sample count", one * seeds + index)))
+            new = range(one * seeds + len(values[one]), one * seeds + count)
+            values[one] += margins(ladder[one], [stream(seed, "sample count", number) for number in new])
         if _rung("", 0, values[level], _rung("", 0, values[level - 1], None, drift), drift).settled:
             break
     return [found for found in values if found]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +16,7 @@ from advsearch.attacks.candidates import Candidate, admit, best, contenders, wit
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import TOLERANCE, Domain
 from advsearch.attacks.ending import Ending
-from advsearch.attacks.evaluation import Evaluate, Evaluation, usable
+from advsearch.attacks.evaluation import Evaluate, Evaluation, Phase, Query, most_at_once, usable
 from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable
 from advsearch.attacks.policies.choices import with_choices
@@ -28,8 +27,6 @@ from advsearch.seeds import stream
 NON_FINITE_LIMIT = 3
 """Non-finite objectives in a row after which a search gives up."""
 
-Phase = Literal["search", "ranking"]
-
 
 @dataclass(frozen=True)
 class StepRecord:
@@ -37,7 +34,7 @@ class StepRecord:
 
     Attributes:
         step: number of the evaluation, from 0; ranking goes on counting.
-        index: the seed index it was rendered with.
+        seed: that it was rendered with.
         phase: "search", or "ranking" for a candidate rendered again at the end.
         objective: raw objective; NaN where it was not finite.
         best: best raw objective of the search so far; NaN before there is one. Biased upwards.
@@ -51,7 +48,7 @@ class StepRecord:
     """
 
     step: int
-    index: int
+    seed: int
     phase: Phase
     objective: float
     best: float
@@ -69,29 +66,6 @@ Late = Callable[[int], bool]
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 """Called after every evaluation, ranking included, with its record, u, and the (usable) evaluation."""
-
-
-@dataclass(frozen=True, eq=False)
-class Coming:
-    """An evaluation that is to come.
-
-    Attributes:
-        proposal: what is evaluated.
-        index: of its seed.
-        step: its number, from 0; ranking goes on counting.
-    """
-
-    proposal: Proposal
-    index: int
-    step: int
-
-
-Line = Generator[Coming, Evaluation, None]
-"""Evaluations each of which waits for the one before: yields what comes next, and is sent what came of it."""
-
-Announce = Callable[[Callable[[], Sequence[Line]]], None]
-"""Told what gives the lines of evaluations that come next, one line after the other. No line waits for another; what is
-given holds as long as each line takes as many renders as it may."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,17 +131,17 @@ def search(
     on_step: OnStep | None = None,
     seconds: float | None = None,
     late: Late | None = None,
-    announce: Announce | None = None,
-    together: int = 1,
+    kind: str = "search",
+    noise: int = 0,
 ) -> SearchResult:
     """Run one policy on one domain and return the worst configuration it found.
 
-    1. Until `steps` renders are spent: the policy proposes; the proposal is checked against the domain; it is evaluated
-       with the seed index of its step (a new one every time, docs/design.md, "The search"); the policy is told. An
-       evaluation costs one render, and a gradient by differences `Domain.gradient_cost` more, all times the `samples`
-       of the proposal. What cannot be paid is not asked for (`affordable`): no more samples than there are renders
-       left, and no gradient after which none would be left to use it, so never in the last evaluation.
-    2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seed indices
+    1. Until `steps` renders are spent: the policy proposes as many configurations as do not wait for each other; they
+       are checked against the domain and evaluated, each with a new seed (docs/design.md, "The search"); the policy is
+       told. An evaluation costs one render, and a gradient by differences `Domain.gradient_cost` more, all times the
+       `samples` of the proposal. What cannot be paid is not asked for (`affordable`): no more samples than there are
+       renders left, and no gradient after which none would be left to use it, so never in the last evaluation.
+    2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seeds
        that are the same for all, without gradient. The best by these renders is the answer (see `candidates`). With
        `candidates=0`, for an objective without noise, the raw best is the answer. Where evaluations draw conditions
        (`Domain.drawn`), the raw best had easy ones, and the last configuration, to which all of them led, takes the
@@ -181,7 +155,7 @@ def search(
     through.
 
     Args:
-        evaluate: renders and judges one configuration.
+        evaluate: renders and judges configurations.
         domain: where to search.
         policy: what proposes.
         steps: renders of the search, at least 1; as many evaluations where no gradient costs any. By default all are
@@ -194,9 +168,8 @@ def search(
             is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
         late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on
             after it was stopped.
-        announce: asked before each evaluation, and each ranking, whether it wants to be told what is coming: see
-            `Announce`.
-        together: how many lines there are at once, at most.
+        kind: of the queries.
+        noise: root seed of the renders.
 
     Raises:
         InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
@@ -211,7 +184,7 @@ def search(
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"seconds: expected a number over 0, got {seconds}")
     begun = time.perf_counter()
-    log = _Log(evaluate, domain, on_step, max(1, candidates), announce or (lambda lines: None), together)
+    log = _Log(evaluate, domain, on_step, max(1, candidates), kind, noise)
     try:
         with interruptible():
             in_time = math.inf if seconds is None else begun + seconds
@@ -233,8 +206,8 @@ class _Log:
     domain: Domain
     on_step: OnStep | None
     size: int
-    announce: Announce
-    together: int
+    kind: str
+    noise: int
     pool: tuple[Candidate, ...] = ()
     last: Candidate | None = None
     best: float = math.nan
@@ -248,42 +221,54 @@ class _Log:
     failures: Callable[[], Failures | None] = lambda: None
     counts: Callable[[], Counts] = lambda: NO_COUNTS
 
-    def render(self, proposal: Proposal, index: int, phase: Phase) -> Evaluation:
-        """Evaluate one proposal and take note of it."""
-        begun = time.perf_counter()
-        more = {} if proposal.samples == 1 else {"samples": proposal.samples}
-        raw = self.evaluate(proposal.u, index=index, gradient=proposal.gradient, **more)
-        seconds = time.perf_counter() - begun
-        _check_gradient(raw, proposal)
-        _check_cost(raw, proposal, self.domain)
-        evaluation = usable(raw)
-        self.gradients += bool(proposal.gradient)
-        self.renders += raw.cost
-        if not evaluation.finite:
-            self.non_finite += 1
-        elif phase == "search":
-            self.best = max(evaluation.objective, self.best) if self.best == self.best else evaluation.objective
-            found = Candidate(proposal.u, evaluation.objective, evaluation.success)
-            self.pool, self.last = admit(self.pool, found, self.size), found
-        record = StepRecord(
-            step=len(self.records),
-            index=index,
-            phase=phase,
-            objective=evaluation.objective if evaluation.finite else math.nan,
-            best=self.best,
-            success=evaluation.success,
-            step_size=proposal.step_size,
-            gradient_norm=math.nan if evaluation.gradient is None else float(evaluation.gradient.norm()),
-            non_finite=evaluation.non_finite,
-            seconds=seconds,
-            renders=self.renders,
-            samples=proposal.samples,
-        )
-        self.records.append(record)
-        self._compare(evaluation.gradient)
-        if self.on_step is not None:
-            self.on_step(record, proposal.u, evaluation)
-        return evaluation
+    def evaluated(self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase) -> Iterator[Evaluation]:
+        """Have proposals evaluated, each with the seed of an index, and take note of each as it comes."""
+        first, begun = len(self.records), time.perf_counter()
+        queries = [
+            Query(
+                one.u,
+                seed=stream(self.noise, self.kind, index),
+                kind=self.kind,
+                number=first + place,
+                phase=phase,
+                gradient=one.gradient,
+                samples=one.samples,
+            )
+            for place, (one, index) in enumerate(zip(proposals, indices, strict=True))
+        ]
+        for proposal, query, raw in zip(proposals, queries, self.evaluate(queries), strict=True):
+            seconds, begun = time.perf_counter() - begun, time.perf_counter()
+            _check_gradient(raw, proposal)
+            _check_cost(raw, proposal, self.domain)
+            evaluation = usable(raw)
+            self.gradients += bool(proposal.gradient)
+            self.renders += raw.cost
+            if not evaluation.finite:
+                self.non_finite += 1
+            elif phase == "search":
+                self.best = max(evaluation.objective, self.best) if self.best == self.best else evaluation.objective
+                found = Candidate(proposal.u, evaluation.objective, evaluation.success)
+                self.pool, self.last = admit(self.pool, found, self.size), found
+            self.records.append(
+                StepRecord(
+                    step=query.number,
+                    seed=query.seed,
+                    phase=phase,
+                    objective=evaluation.objective if evaluation.finite else math.nan,
+                    best=self.best,
+                    success=evaluation.success,
+                    step_size=proposal.step_size,
+                    gradient_norm=math.nan if evaluation.gradient is None else float(evaluation.gradient.norm()),
+                    non_finite=evaluation.non_finite,
+                    seconds=seconds,
+                    renders=self.renders,
+                    samples=proposal.samples,
+                )
+            )
+            self._compare(evaluation.gradient)
+            if self.on_step is not None:
+                self.on_step(self.records[-1], proposal.u, evaluation)
+            yield evaluation
 
     def _compare(self, gradient: Tensor | None) -> None:
         """Note the cosine of a gradient with the one before that was not zero."""
@@ -299,59 +284,33 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name, policy = policy.name, with_choices(policy, log.domain)
     state = policy.start(log.domain, generator, steps)
-    in_a_row = 0
+    in_a_row, most = 0, most_at_once(log.domain.dim)
     while log.renders < steps:
-        step = len(log.records)
-        if log.together > 1:
-            log.announce(partial(_lines, policy, state, step, min(log.together, steps - log.renders)))
-        proposals, state = policy.propose(state, 1)
+        proposals, state = policy.propose(state, min(most, steps - log.renders))
         if not proposals:
             return Ending.STALLED
-        if len(proposals) > 1:
-            raise RuntimeError(f"policy {name!r} proposed {len(proposals)} configurations; expected at most 1")
-        (proposal,) = proposals
-        _check_inside(proposal, log.domain, name)
-        evaluation = log.render(affordable(proposal, log.domain, steps - log.renders), step, "search")
-        in_a_row = 0 if evaluation.finite else in_a_row + 1
-        if in_a_row == NON_FINITE_LIMIT:
-            return Ending.NON_FINITE
+        batch, left = list[Proposal](), steps - log.renders
+        for proposal in proposals:
+            _check_inside(proposal, log.domain, name)
+            if left > 0:
+                batch.append(affordable(proposal, log.domain, left))
+                left -= batch[-1].cost(log.domain)
+        told, over, first = list[tuple[Tensor, Evaluation]](), False, len(log.records)
+        answers = log.evaluated(batch, range(first, first + len(batch)), "search")
+        for proposal, evaluation in zip(batch, answers, strict=True):
+            told.append((proposal.u, evaluation))
+            in_a_row = 0 if evaluation.finite else in_a_row + 1
+            if in_a_row == NON_FINITE_LIMIT:
+                return Ending.NON_FINITE
+            if over := late(len(log.records)):
+                break
         if log.renders < steps:
-            state = policy.update(state, [(proposal.u, evaluation)])
+            state = policy.update(state, told)
             log.answer, log.counts = partial(policy.answer, state), partial(policy.counts, state)
             log.failures = partial(policy.failures, state)
-        if late(len(log.records)):
+        if over:
             break
     return Ending.BUDGET_SPENT
-
-
-def _lines(policy: Policy[Any], state: Any, step: int, most: int) -> list[Line]:
-    """Return up to so many lines of what a policy proposes next: configurations whatever comes of them, of which it
-    wants no more than a picture, or else searches side by side."""
-    proposals, _ = policy.propose(state, most)
-    plain = list(itertools.takewhile(lambda one: not one.gradient and one.samples == 1, proposals))
-    if len(plain) > 1:
-        return [_line_of(Coming(one, number, number)) for number, one in enumerate(plain, step)]
-    lines = []
-    for turn, count in policy.turns(state)[:most]:
-        lines.append(_line(policy, turn, range(step, step + count)))
-        step += count
-    return lines
-
-
-def _line_of(coming: Coming) -> Line:
-    """One evaluation."""
-    yield coming
-
-
-def _line(policy: Policy[Any], state: Any, steps: range) -> Line:
-    """A search from a state on, over so many evaluations."""
-    for step in steps:
-        proposals, state = policy.propose(state, 1)
-        if not proposals:
-            return
-        (proposal,) = proposals
-        evaluation = yield Coming(proposal, step, step)
-        state = policy.update(state, [(proposal.u, usable(evaluation))])
 
 
 def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
@@ -364,20 +323,19 @@ def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
         _look(log, range(index, index + 1))
 
 
-def _look(log: _Log, indices: range) -> None:
-    log.announce(partial(_looks, log.pool, indices, len(log.records)))
-    for candidate in log.pool:
-        evaluations = [log.render(Proposal(candidate.u), index, "ranking") for index in indices]
-        again = (*candidate.again, *(e.objective for e in evaluations))
-        successes = candidate.successes + sum(e.success for e in evaluations)
-        ranked = replace(candidate, again=again, successes=successes)
-        log.pool = tuple(ranked if c is candidate else c for c in log.pool)
-
-
-def _looks(pool: Sequence[Candidate], indices: range, step: int) -> list[Line]:
-    """Return what `_look` renders, as lines."""
-    pairs = [(Proposal(candidate.u), index) for candidate in pool for index in indices]
-    return [_line_of(Coming(proposal, index, step + place)) for place, (proposal, index) in enumerate(pairs)]
+def _look(log: _Log, indices: Sequence[int]) -> None:
+    """Render every candidate again with the same seeds."""
+    pairs = [(candidate, index) for candidate in log.pool for index in indices]
+    proposals = [Proposal(candidate.u) for candidate, _ in pairs]
+    for (candidate, _), evaluation in zip(
+        pairs, log.evaluated(proposals, [index for _, index in pairs], "ranking"), strict=True
+    ):
+        number = next(place for place, one in enumerate(log.pool) if one.u is candidate.u)
+        before = log.pool[number]
+        seen = replace(
+            before, again=(*before.again, evaluation.objective), successes=before.successes + evaluation.success
+        )
+        log.pool = (*log.pool[:number], seen, *log.pool[number + 1 :])
 
 
 def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:

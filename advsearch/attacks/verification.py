@@ -15,6 +15,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.ending import Ending
+from advsearch.attacks.evaluation import Evaluate, Query
 from advsearch.attacks.trials import Trials, clopper_pearson
 from advsearch.errors import InputError
 from advsearch.seeds import stream
@@ -114,13 +115,6 @@ EASIER = Rule(control=False)
 recognised better than the clean one with the same seed."""
 
 
-RenderTrial = Callable[[Tensor, int, int], Judgement]
-"""(u, seed, spp) -> Judgement: renders, rounds to 8 bits, asks the model, judges."""
-
-OnTrial = Callable[[str, int, Judgement], None]
-"""Called after every trial with "clean" or "adversarial", its number from 0, and the trial."""
-
-
 @dataclass(frozen=True, eq=False)
 class Verification:
     """What the trials say.
@@ -161,20 +155,30 @@ class Verification:
 
 
 def run_trials(
-    render_trial: RenderTrial,
+    evaluate: Evaluate,
     u: Tensor,
     *,
     spp: int,
     seed: int,
     trials: int = 20,
-    group: str = "adversarial",
-    on_trial: OnTrial | None = None,
+    kind: str = "verification",
+    keep: int = 0,
     until: Callable[[Sequence[Judgement]], bool] = lambda done: False,
 ) -> tuple[Judgement, ...]:
     """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification".
 
     Two groups run with the same root seed get the same seeds, trial by trial, which is what a control group needs. They
     end sooner where `until`, asked after every trial, says so.
+
+    Args:
+        evaluate: answers the queries; see `Query`.
+        u: (d,) the configuration.
+        spp: samples a pixel.
+        seed: root of the seeds.
+        trials: how many.
+        kind: of their rows.
+        keep: the pictures of so many are wanted.
+        until: see above.
 
     Raises:
         InputError: trials or spp under 1.
@@ -183,12 +187,11 @@ def run_trials(
         raise InputError(f"trials: expected at least 1, got {trials}")
     if spp < 1:
         raise InputError(f"verify_spp: expected at least 1, got {spp}")
+    seeds = [stream(seed, "verification", number) for number in range(trials)]
     done: list[Judgement] = []
-    for number in range(trials):
-        trial = render_trial(u, stream(seed, "verification", number), spp)
-        done.append(trial)
-        if on_trial is not None:
-            on_trial(group, number, trial)
+    queries = [Query(u, one, kind, number, spp=spp, keep=number < keep) for number, one in enumerate(seeds)]
+    for answer in evaluate(queries):
+        done.append(answer.said)
         if until(done):
             break
     return tuple(done)
@@ -200,7 +203,7 @@ def count_right(trials: Sequence[Judgement], spp: int) -> Trials:
 
 
 def verify(
-    render_trial: RenderTrial,
+    evaluate: Evaluate,
     domain: Domain,
     u: Tensor,
     *,
@@ -210,7 +213,8 @@ def verify(
     trials: int = 20,
     clean: Sequence[Judgement] | None = None,
     rule: Rule = WORST_CASE,
-    on_trial: OnTrial | None = None,
+    kind: str = "verification",
+    keep: int = 0,
     curtailed: bool = False,
 ) -> Verification:
     """Check a search's answer in fresh trials against the clean configuration as control group.
@@ -224,7 +228,7 @@ def verify(
     outcome is the better the later it stops (Jennison and Turnbull 1983).
 
     Args:
-        render_trial: renders one configuration with one seed, rounds to 8 bits, asks the model and judges.
+        evaluate: answers the queries; see `Query`.
         domain: the budget; the clean configuration is its start.
         u: (d,) the answer; projected into the domain again.
         claim: the search's ending.
@@ -234,7 +238,8 @@ def verify(
         clean: trials of the clean configuration, where `run_trials` has run them with the same spp, seed and count
             (one control group serves the attack and its baseline).
         rule: when the claim counts.
-        on_trial: called after every trial.
+        kind: of the rows of the answer's trials.
+        keep: the pictures of so many of them are wanted.
         curtailed: see above; for an answer of which only the verdict matters.
 
     Raises:
@@ -242,15 +247,7 @@ def verify(
     """
     own = clean is None
     if clean is None:
-        clean = run_trials(
-            render_trial,
-            domain.start,
-            spp=spp,
-            seed=seed,
-            trials=trials,
-            group="clean",
-            on_trial=on_trial,
-        )
+        clean = run_trials(evaluate, domain.start, spp=spp, seed=seed, trials=trials, kind="control")
     if len(clean) != trials:
         raise InputError(f"clean trials: expected {trials}, as many as `trials`, got {len(clean)}")
     u = domain.project(u)
@@ -262,7 +259,7 @@ def verify(
         return rule.counted(beside) - sum(map(rule.succeeded, done, beside)) > allowed
 
     never = (lambda done: False) if not curtailed else lost
-    adversarial = run_trials(render_trial, u, spp=spp, seed=seed, trials=trials, on_trial=on_trial, until=never)
+    adversarial = run_trials(evaluate, u, spp=spp, seed=seed, trials=trials, kind=kind, keep=keep, until=never)
     outcomes = tuple(
         rule.succeeded(trial, beside) if beside.right or not rule.conditional else None
         for trial, beside in zip(adversarial, clean, strict=False)

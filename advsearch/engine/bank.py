@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -24,12 +24,12 @@ from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.domain import Domain, centre_of_option
 from advsearch.attacks.draws import Draws
-from advsearch.attacks.evaluation import Wanted
-from advsearch.engine.ahead import Ahead, MatrixAhead, line_of
-from advsearch.engine.problem import OnImage, Problem
+from advsearch.attacks.evaluation import Query, Wanted
+from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Conditions, Deviation, Predictor, Tick, deviation_of
 from advsearch.files import scaled
-from advsearch.scene.transport.renderer import MOST_BYTES, LinearRenderer, linear_inputs
+from advsearch.scene.formation import to_8_bit
+from advsearch.scene.transport.renderer import MOST_BYTES, LinearRenderer
 
 FIRST = 8
 """Conditions in the bank at first, in what an evaluation draws."""
@@ -40,9 +40,8 @@ UNSEEN = 16
 """Conditions that a comparison traces, and as many of the bank that it predicts."""
 SURE = 1.0
 """Standard errors by which unseen conditions have to be better for the model."""
-SPP, DEPTH = 4, 4
-"""Samples a pixel of the paths of a condition, and segments of the longest: many conditions with some noise and without
-the last light teach more than few that are right."""
+SPP = 4
+"""Samples a pixel of the paths of a condition (see `problem.LIGHT_DEPTH`)."""
 TOGETHER = 16
 """Pictures that the model is asked about at once."""
 SOBOL_MOST = 64
@@ -83,25 +82,27 @@ class Bank(Predictor):
     Attributes:
         problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
+        answers: what is asked for light, as far as the next comparison.
         grown: the comparisons, by index of the evaluation, after which the bank went on growing; may be filled before a
             search that goes on.
         keep: told of `grown` whenever there is another one.
         gaps: by how much the objective was larger in the bank than under unseen conditions, by comparison.
-        ahead: workers make the matrices, as far as the next comparison, before their turn.
     """
 
     problem: Problem
     steps: int
+    answers: Evaluate
     grown: list[int] = field(default_factory=list)
     keep: Callable[[list[int]], None] = lambda grown: None
     deviations: list[Deviation] = field(default_factory=list)
     gaps: list[float] = field(default_factory=list)
-    ahead: Ahead = field(default_factory=Ahead)
     seconds: float = 0.0
     _held: list[Condition] = field(default_factory=list)
     _places: dict[int, Tensor] = field(default_factory=dict)
     _there: dict[str, Tensor] = field(default_factory=dict)
     _still: LinearRenderer | None = None
+    _coming: Iterator[Evaluation] = field(default_factory=lambda: iter(()))
+    _until: int = 0
     _made: int = 0
     _bytes: int = 0
     _last: int = 0
@@ -128,28 +129,21 @@ class Bank(Predictor):
     def prepare(self, tick: Tick = lambda samples: None) -> None:
         self._fill(0, tick)
 
-    def passed(self, kind: str, index: int, u: Tensor) -> None:
-        if kind == "search" and index < self.steps:
-            self._last = index
-            if index in self.grown:
-                self._places[index] = u.detach().clone()
+    def passed(self, query: Query) -> None:
+        if query.kind == "search" and query.phase == "search":
+            self._last = query.number
+            if query.number in self.grown:
+                self._places[query.number] = query.u.detach().clone()
 
-    def evaluator(self, kind: str, on_image: OnImage | None = None) -> Evaluate:
-        traced = self.problem.evaluator(kind, on_image)
-
-        def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-            if index >= self.steps:
-                return traced(u, index=index, gradient=gradient, samples=samples)
-            if kind == "search":
-                self._last = index
-                if index and index % EVERY == 0:
-                    self._compare(u, index)
-            self._fill(self._last)
-            if on_image is not None and on_image.wants(index):
-                on_image.tell(index, self._picture(u))
-            return self._evaluated(self._drawn(kind, index), u, gradient)
-
-        return evaluate
+    def evaluate(self, query: Query) -> Evaluation:
+        kind, number, u = query.kind, query.number, query.u
+        if kind == "search":
+            self._last = number
+            if number and number % EVERY == 0:
+                self._compare(u, number)
+        self._fill(self._last)
+        answer = self._evaluated(self._drawn(kind, number), u, query.gradient)
+        return replace(answer, picture=to_8_bit(self._picture(u))) if query.keep else answer
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 
@@ -189,7 +183,7 @@ class Bank(Predictor):
         """The picture of u under the conditions that the scene comes with."""
         if self._still is None:
             seed = seeds.stream(self.problem.seed, "bank still")
-            self._still = self._matrix(self.problem.whole(self.problem.domain.start), seed).made(self.problem)
+            self._still = self.problem.linearised(self.problem.whole(self.problem.domain.start), seed, SPP)
             self._made += 1
         with torch.no_grad():
             return self._still(self.problem.whole(u))
@@ -211,9 +205,9 @@ class Bank(Predictor):
         """Make the matrices that there should be by an evaluation, newest last, as far as memory lasts."""
         wanted, begun = self._wanted(index), time.perf_counter()
         first = self._held[-1].number + 1 if self._held else 0
-        if first < wanted and not self.ahead.begun:
-            coming = range(first, self._wanted((index // EVERY + 1) * EVERY - 1))
-            self.ahead.begin([line_of(self._announced(number)) for number in coming])
+        if self._until <= first < wanted:  # as far as the next comparison
+            self._until = self._wanted((index // EVERY + 1) * EVERY - 1)
+            self._coming = iter(self.answers([self._query(number) for number in range(first, self._until)]))
         for number in range(first, wanted):
             self._held.append(self._condition(number))
             self._bytes += self._held[-1].renderer.bytes
@@ -229,15 +223,14 @@ class Bank(Predictor):
         assert self.problem.conditions is not None
         return stratified(self.problem.conditions, number, seeds.stream(self.problem.seed, "bank"))
 
-    def _announced(self, number: int) -> MatrixAhead:
-        """The matrix of the condition with this number."""
-        seed = seeds.stream(self.problem.seed, "bank matrix", number)
-        return self._matrix(torch.cat([self._place(number), self._numbers(number)]), seed)
+    def _query(self, number: int) -> Query:
+        """What is asked for the condition with this number: the light at its place."""
+        whole = torch.cat([self._place(number), self._numbers(number)])
+        return Query(whole, seeds.stream(self.problem.seed, "bank matrix", number), spp=SPP, wanted="light")
 
     def _condition(self, number: int) -> Condition:
-        problem, u, numbers, wanted = self.problem, self._place(number), self._numbers(number), self._announced(number)
-        seen = self.ahead.take(wanted)
-        made = wanted.made(problem, None if seen is None else seen.value)
+        problem, u, numbers, asked = self.problem, self._place(number), self._numbers(number), self._query(number)
+        made = problem.linearised(asked.u, asked.seed, SPP, next(self._coming).light)
         self._made += 1
         with torch.no_grad():
             own = problem.searched_space.inputs(u)
@@ -248,18 +241,6 @@ class Bank(Predictor):
         self._there = dict(made.there)
         return Condition(number, numbers, made, alone)
 
-    def _matrix(self, whole: Tensor, seed: int) -> MatrixAhead:
-        """What a matrix of the whole space is made of."""
-        problem = self.problem
-        names = {name for group in problem.plan.groups for name in self._reached(group.name, group.control)}
-        return MatrixAhead(whole, seed, SPP, min(DEPTH, problem.search_depth or DEPTH), frozenset(names))
-
-    def _reached(self, group: str, control: str) -> frozenset[str]:
-        """The base colours that a group of searched coordinates changes."""
-        if control not in {one.name for one in self.problem.searched_space.controls}:
-            return frozenset()
-        return self.problem.renderer.routes.get(group, frozenset()) & linear_inputs(self.problem.renderer)
-
     def _compare(self, u: Tensor, index: int) -> None:
         """Look at unseen conditions, and let the bank grow while they are clearly better for the model."""
         if index in self.grown:  # in an earlier life, which ended before this evaluation did
@@ -268,7 +249,7 @@ class Bank(Predictor):
         problem, begun = self.problem, time.perf_counter()
         noise = seeds.stream(problem.seed, "bank check", index)
         draws = [seeds.stream(noise, "draw", number) for number in range(UNSEEN)]
-        unseen = [problem.evaluated(problem.whole(u, draw), draw, index, False, 1, None)[0].objective for draw in draws]
+        unseen = [problem.evaluated(Query(u, draw), problem.whole(u, draw), draw)[0].objective for draw in draws]
         generator = torch.Generator().manual_seed(noise)
         order = torch.randperm(len(self._held), generator=generator).tolist()[:UNSEEN]
         chosen = [self._held[number] for number in order]

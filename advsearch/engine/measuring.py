@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter
 
-from advsearch.engine.memory import Memory
 from advsearch.interrupts import interruptible
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Fields, Result
@@ -31,15 +30,15 @@ class Results:
     """What a run has measured, in its store; measures what is not there, until the time is up.
 
     Args:
-        memory: of the run.
+        run: open; None where nothing is kept.
         seconds: after which nothing more is measured; one measurement is always made, so that it gets on.
 
     Attributes:
         made: how many measurements were made. What is stored is read back before the first.
     """
 
-    def __init__(self, memory: Memory, seconds: float | None = None) -> None:
-        self._memory = memory
+    def __init__(self, run: RunDirectory | None, seconds: float | None = None) -> None:
+        self._run = run
         self._end = math.inf if seconds is None else time.monotonic() + seconds
         self.made = 0
 
@@ -49,12 +48,12 @@ class Results:
         Raises:
             OutOfTime: it is not stored, and the time is over.
         """
-        stored = self._memory.note(key)
+        stored = self.stored(key)
         if stored is None:
             self.check_time()
             self.made += 1
             stored = json.loads(json.dumps(measure()))
-            self._memory.set_note(key, stored)
+            self.put(key, stored)
         return stored
 
     def check_time(self) -> None:
@@ -81,11 +80,12 @@ class Results:
 
     def put(self, key: str, value: Any) -> None:
         """Store a JSON value."""
-        self._memory.set_note(key, value)
+        if self._run is not None:
+            self._run.store.set_note(key, json.dumps(value))
 
     def stored(self, key: str) -> Any:
         """Return what is stored under a key, or None."""
-        return self._memory.note(key)
+        return None if self._run is None else self._run.store.noted(key)
 
 
 def kept_rows(

@@ -16,10 +16,11 @@ from advsearch.attacks.smallest import Bracket
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.domains import domain_of
 from advsearch.engine.failures import described_failures, write_failures
+from advsearch.engine.journal import Journal
 from advsearch.engine.pictures import KeptPicture, trial_to_show, write_artifacts, write_object, write_pictures
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.record import Findings, Stages
 from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.searches import UNPRINTED
 from advsearch.engine.transport import remark
@@ -81,10 +82,10 @@ class Question:
 
 
 def summarise(
-    asked: Question, problem: Problem, findings: Findings, recorder: Recorder, stages: Stages, warnings: Sequence[str]
+    asked: Question, findings: Findings, journal: Journal, stages: Stages, warnings: Sequence[str]
 ) -> AttackResult:
     """Put the result together and, if there is a run directory, write its files."""
-    search = findings.search
+    problem, search = journal.problem, findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
     stages.progress.stage("making the pictures and the report")
@@ -92,8 +93,8 @@ def summarise(
     clean, adversarial = (KeptPicture.of(problem, findings, at, trial) for at in (start, u))
     space = problem.searched_space
     artifacts = space.artifacts(u)
-    run = recorder.run
-    warnings = [*warnings, *_remarks(findings, problem, recorder)]
+    run = journal.run
+    warnings = [*warnings, *_remarks(findings, problem, journal)]
     if run is not None:
         write_pictures(run, problem, findings, {"clean": clean, "adversarial": adversarial})
         write_failures(run, problem, findings)
@@ -104,7 +105,7 @@ def summarise(
         write_answer(run.path, u.numpy())
     summary = _summary(asked, problem, findings, clean, adversarial)
     kept = {"run": None if run is None else str(run.path), "warnings": warnings}
-    shared = SharedWork.of_facts(recorder.ahead.facts, recorder.machines.known)
+    shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
     summary = summary.model_copy(
         update={**kept, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
     )
@@ -121,7 +122,7 @@ def summarise(
         adversarial.picture,
         artifacts,
         search,
-        tuple(recorder.rows),
+        tuple(journal.rows),
     )
 
 
@@ -409,7 +410,7 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
     return verified_rate(verification)
 
 
-def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[str]:
+def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str]:
     """What a reader has to know beside the numbers."""
     remarks = [told] if (told := remark(findings.rendered_because)) else []
     count = findings.sample_count
@@ -418,6 +419,6 @@ def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[s
             f"It is not shown that the margin stands still at {count.spp} samples a pixel, the most that a check "
             "takes: noise may take part in the verdict."
         )
-    if not_finite := problem.renderer.non_finite + recorder.ahead.non_finite:
+    if not_finite := problem.renderer.non_finite:
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")
-    return [*remarks, *lost_remarks(recorder.ahead.lost), *recorder.machines.remarks]
+    return [*remarks, *lost_remarks(journal.lost), *journal.machines.remarks]

@@ -14,8 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.attacks import Evaluate, Evaluation
-from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks import Evaluation
 from advsearch.controls import Space
 from advsearch.errors import InputError
 from advsearch.runs.results.attack import PrintTerms
@@ -76,15 +75,6 @@ def print_terms(space: Space, u: Tensor) -> PrintTerms:
     with torch.no_grad():
         rough, off = _terms(space, u)
     return PrintTerms(variation=float(rough), off_print=float(off))
-
-
-def less_print_terms(evaluate: Evaluate, space: Space) -> Evaluate:
-    """Return the evaluation that is `penalised`."""
-
-    def evaluated(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-        return penalised(evaluate(u, index=index, gradient=gradient, samples=samples), space, u)
-
-    return evaluated
 
 
 def penalised(found: Evaluation, space: Space, u: Tensor) -> Evaluation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,8 +12,8 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Domain, Evaluate, Evaluation, Objective
-from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks import Domain, Evaluation, Objective
+from advsearch.attacks.evaluation import Query, Wanted
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.described import Value
@@ -27,21 +28,28 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import GradientPlan
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.renderer import Linearised, LinearRenderer, linear_inputs
 from advsearch.tasks import Facts, Judgement, Mark, Task
 from advsearch.tasks.base import Output, Truth, mean, typical
 
 
-class OnImage(NamedTuple):
-    """Who is told the picture of an evaluation.
+class Prepared(NamedTuple):
+    """What is measured before a search, and holds for its queries.
 
     Attributes:
-        wants: whether that of the evaluation with this index is wanted.
-        tell: called with the index and the picture.
+        spp: samples a pixel.
+        search_depth: longest light path in segments; None for the scene's.
+        plan: how derivatives are obtained.
     """
 
-    wants: Callable[[int], bool]
-    tell: Callable[[int, Tensor], None]
+    spp: int
+    search_depth: int | None
+    plan: GradientPlan
 
+
+LIGHT_DEPTH = 4
+"""Segments of the longest path of light that is collected under one of many conditions: many with some noise and
+without the last light teach more than few that are right."""
 
 BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
 
@@ -109,6 +117,17 @@ class Problem:
         self.conditions = domain_of(controls[self.searched :]) if self._over else None
 
     @property
+    def prepared(self) -> Prepared:
+        """What was measured before the search."""
+        return Prepared(self.spp, self.search_depth, self.plan)
+
+    @prepared.setter
+    def prepared(self, found: Prepared) -> None:
+        self.spp, self.search_depth = found.spp, found.search_depth
+        if self.plan != found.plan:
+            self.plan = found.plan
+
+    @property
     def _over(self) -> bool:
         return self.searched is not None and self.searched < len(self.space.controls)
 
@@ -157,16 +176,6 @@ class Problem:
         """
         with torch.no_grad():
             return to_8_bit(self.renderer(self.whole(u, seed if drawn else None), seed=seed, spp=spp))
-
-    def trial(
-        self, u: Tensor, seed: int, spp: int, *, drawn: bool = True, keep: Callable[[Tensor], None] | None = None
-    ) -> Judgement:
-        """Render, round to 8 bits, ask and judge: one trial of a verification; arguments as for `picture`, and who is
-        told it."""
-        picture = self.picture(u, seed, spp, drawn=drawn)
-        if keep is not None:
-            keep(picture)
-        return self.judge(picture, self.whole(u, seed if drawn else None))
 
     def judge(self, picture: Tensor, whole: Tensor) -> Judgement:
         """Return what task and objective say of the model's output for a picture (H, W, 3), of the whole space at
@@ -232,35 +241,44 @@ class Problem:
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 
-    def evaluator(self, stream: str, on_image: OnImage | None = None) -> Evaluate:
-        """Return the evaluation of configurations whose noise comes from one stream of seeds."""
+    def evaluate(self, query: Query) -> Evaluation:
+        """Answer one query: the only place where a run renders, asks and judges."""
+        u, seed, before = query.u, query.seed, self.renderer.non_finite
+        if query.wanted == "light":
+            return Evaluation(math.nan, None, False, light=self.linearised(u, seed, query.spp).collected)
+        if query.wanted == "picture":
+            return Evaluation(math.nan, None, False, picture=self.picture(u, seed, query.spp))
+        if query.phase is None:
+            picture = self.picture(u, seed, query.spp, drawn=query.drawn)
+            said = self.judge(picture, self.whole(u, seed if query.drawn else None))
+            lost = self.renderer.non_finite - before
+            return Evaluation.of(said, picture=picture if query.keep else None, non_finite=lost)
+        if self.conditions is None:
+            return self.evaluated(query, u, seed)[0]
+        draws = [seeds.stream(seed, "draw", number) for number in range(self.draws)]
+        answer = self.mean([self.evaluated(replace(query, keep=False), self.whole(u, d), d) for d in draws], u)
+        return replace(answer, picture=self.picture(u, seed, self.spp, drawn=False)) if query.keep else answer
 
-        def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-            noise = seeds.stream(self.seed, stream, index)
-            if self.conditions is None:
-                return self.evaluated(u, noise, index, gradient, samples, on_image)[0]
-            draws = [seeds.stream(noise, "draw", number) for number in range(self.draws)]
-            found = [self.evaluated(self.whole(u, d), d, index, gradient, samples, None) for d in draws]
-            if on_image is not None and on_image.wants(index):
-                on_image.tell(index, self.picture(u, noise, self.spp, drawn=False))
-            return self.mean(found, u)
-
-        return evaluate
+    def linearised(self, whole: Tensor, seed: int, spp: int, collected: Linearised | None = None) -> LinearRenderer:
+        """Return what predicts pictures near a configuration of the whole space, from light that was collected there or
+        is collected now."""
+        own, there = {one.name for one in self.searched_space.controls}, linear_inputs(self.renderer)
+        names = frozenset().union(
+            *(self.renderer.routes.get(one.name, frozenset()) for one in self.plan.groups if one.control in own)
+        )
+        with self.renderer.scene.shorter(min(LIGHT_DEPTH, self.search_depth or LIGHT_DEPTH)):
+            return LinearRenderer(
+                self.renderer, whole, seed, spp=spp, quick=True, names=names & there, collected=collected
+            )
 
     def evaluated(
-        self,
-        whole: Tensor,
-        noise: int,
-        index: int,
-        gradient: Wanted,
-        samples: int,
-        on_image: OnImage | None,
-        renderer: Renderer | None = None,
+        self, query: Query, whole: Tensor, seed: int, renderer: Renderer | None = None
     ) -> tuple[Evaluation, Output]:
-        """One picture of the whole space, by the problem's renderer or by another one, judged, with the derivative that
-        is wanted; and the model's output."""
+        """Answer a query of a search by one picture of the whole space, by the problem's renderer or by another one;
+        and return the model's output."""
         renderer = self.renderer if renderer is None else renderer
         before, renders, truth = renderer.non_finite, renderer.renders, self.truth(whole)
+        gradient, samples = query.gradient, query.samples
         seen: list[tuple[Tensor, Output]] = []
         at = whole.detach().clone().requires_grad_(bool(gradient))
         asked, slope = self.asked(at), torch.zeros(())
@@ -278,14 +296,12 @@ class Problem:
         spp, derivative = self.spp * samples, None
         with renderer.scene.shorter(self.search_depth):
             if gradient:
-                value, derivative = renderer.gradient(loss, whole, noise, spp, free=gradient == "free")
+                value, derivative = renderer.gradient(loss, whole, seed, spp, free=gradient == "free")
                 derivative = derivative + slope if asked.used else derivative
             else:
                 with torch.no_grad():
-                    value = loss(renderer(whole, seed=noise, spp=spp))
+                    value = loss(renderer(whole, seed=seed, spp=spp))
         image, output = seen[0]
-        if on_image is not None and on_image.wants(index):
-            on_image.tell(index, image)
         with torch.no_grad():
             judgement = measured(self.task.judge(output, truth)[0], self.metrics, image, output, truth)
         evaluation = Evaluation(
@@ -295,6 +311,7 @@ class Problem:
             non_finite=renderer.non_finite - before,
             cost=max(1, renderer.renders - renders) * samples,
             judgement=judgement,
+            picture=to_8_bit(image) if query.keep else None,
         )
         return evaluation, output
 

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Ending, Verification, run_trials, verify
-from advsearch.engine.ahead import Ahead, PictureAhead, line_of
-from advsearch.engine.memory import Memory
+from advsearch.attacks import Ending, Evaluation, Verification, run_trials, verify
+from advsearch.attacks.evaluation import Query
+from advsearch.cluster.executor import Executor
+from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Recorder
+from advsearch.engine.sharing import Shared
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.scene.formation import to_8_bit
-from advsearch.seeds import stream
 from advsearch.tasks import Judgement
 
 
@@ -59,7 +60,7 @@ class Retrials:
         progress: told of every trial.
         trials: of each answer under each condition.
         seed: root of these trials, which nothing else uses.
-        ahead: workers make the pictures before their turn.
+        executor: of workers that hold the problems by the names of their conditions; None makes pictures here.
     """
 
     def __init__(
@@ -70,28 +71,29 @@ class Retrials:
         *,
         trials: int,
         seed: int,
-        ahead: Ahead | None = None,
+        executor: Executor | None = None,
     ) -> None:
         self._conditions, self._progress, self._count, self._seed = conditions, progress, trials, seed
-        memory = Memory(run)
-        self._stored = memory.trial
-        self._recorders = {one.name: Recorder(run, one.problem, memory) for one in conditions}
+        first = Journal(run, Shared(conditions[0].problem))
+        self._journals = {
+            one.name: replace(first, traced=Shared(one.problem, executor, one.name)) for one in conditions
+        }
         self._clean: dict[str, tuple[Judgement, ...]] = {}
         self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
         self._lights: dict[tuple[Hashable, int, int], Tensor] = {}
         self._sharing = Counter(one.light for one in conditions if one.light is not None)
         self._pictured = ""
-        self._ahead = ahead or Ahead()
 
     def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
         """Try the clean scene under one condition, once."""
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
-                self._trial("clean", condition),
+                partial(self._answers, "clean", condition),
                 condition.problem.domain.start,
                 spp=condition.spp,
                 seed=self._seed,
                 trials=self._count,
+                kind=f"clean under {condition.name}",
             )
         return self._clean[condition.name]
 
@@ -104,7 +106,7 @@ class Retrials:
             condition: one of those.
         """
         return verify(
-            self._trial(kind, condition),
+            partial(self._answers, kind, condition),
             condition.problem.domain,
             u,
             claim=Ending.NOT_VERIFIED,
@@ -113,50 +115,46 @@ class Retrials:
             trials=self._count,
             clean=self.clean(condition),
             rule=condition.problem.rule,
+            kind=f"{kind} under {condition.name}",
         )
 
-    def _trial(self, kind: str, condition: RetrialCondition) -> Callable[[Tensor, int, int], Judgement]:
-        """Trials of one configuration, one after the other."""
-        problem, rows, count = condition.problem, f"{kind} under {condition.name}", 0
-
-        def trial(u: Tensor, seed: int, spp: int) -> Judgement:
-            nonlocal count
-            number, count = count, count + 1
-            judged = self._stored(rows, number)
-            if judged is None:
-                if not self._ahead.begun:
-                    self._announce(kind, condition, u, range(number, self._count))
-                picture = condition.change(self._picture(kind, condition, u, seed), seed)
-                judged = problem.judge(to_8_bit(picture), problem.whole(u, seed))
-            self._recorders[condition.name].trial(rows, number, spp, judged, seed, u)
+    def _answers(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Answer the trials of one configuration under one condition."""
+        changed = partial(self._changed, kind, condition)
+        for answer in self._journals[condition.name].answers(queries, changed):
             self._progress.advance(1)
-            return judged
+            yield answer
 
-        return trial
-
-    def _announce(self, kind: str, condition: RetrialCondition, u: Tensor, numbers: range) -> None:
-        """Have the pictures of these trials made beforehand that are not there."""
-        rows = f"{kind} under {condition.name}"
-        new = [stream(self._seed, "verification", one) for one in numbers if self._stored(rows, one) is None]
-        wanted = [one for one in new if kind != self._pictured or self._key(condition, one) not in self._pictures]
-        pictures = (PictureAhead(u, one, condition.spp, condition.name) for one in wanted)
-        self._ahead.begin([line_of(one) for one in pictures])
-
-    @staticmethod
-    def _key(condition: RetrialCondition, seed: int) -> tuple[Hashable, int, int]:
-        return condition.source, seed, condition.spp
-
-    def _picture(self, kind: str, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
-        """The picture of a trial; those of the configuration that is tried now are kept for other conditions."""
+    def _changed(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Judge pictures as the condition changes them; those of the configuration that is tried now are kept for other
+        conditions."""
         if kind != self._pictured:
             self._pictures.clear()
             self._lights.clear()
             self._pictured = kind
-        key = self._key(condition, seed)
-        if key not in self._pictures:
-            seen = self._ahead.take(PictureAhead(u, seed, condition.spp, condition.name))
-            self._pictures[key] = self._rendered(condition, u, seed) if seen is None else seen.value
-        return self._pictures[key]
+        keys = [(condition.source, one.seed, condition.spp) for one in queries]
+        new = [
+            replace(one, wanted="picture") for one, key in zip(queries, keys, strict=True) if key not in self._pictures
+        ]
+        made = self._made(condition, new)
+        for query, key in zip(queries, keys, strict=True):
+            machine = None
+            if key not in self._pictures:
+                self._pictures[key], machine = next(made)
+            picture = condition.change(self._pictures[key], query.seed)
+            said = condition.problem.judge(to_8_bit(picture), condition.problem.whole(query.u, query.seed))
+            yield Evaluation.of(said, machine=machine)
+
+    def _made(self, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[tuple[Tensor, str | None]]:
+        """Pictures of a condition's problem, by workers where there are some, and on which machine."""
+        shared = self._journals[condition.name].traced
+        if shared.executor is None or len(queries) < 2:
+            for query in queries:
+                yield self._rendered(condition, query.u, query.seed), None
+            return
+        for answer in shared(queries):
+            assert answer.picture is not None
+            yield answer.picture, answer.machine
 
     def _rendered(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """As `Problem.picture`, from the radiance of other conditions with the same light where there are any."""

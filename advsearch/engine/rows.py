@@ -44,9 +44,14 @@ def trial_row(
     sought: bool = True,
     **more: Any,
 ) -> Row:
-    """Return what the store keeps of a trial; arguments as for `Recorder.trial`.
+    """Return what the store keeps of a trial.
 
     Args:
+        kind: of the rows.
+        number: among these.
+        seed: of its render.
+        spp: samples a pixel.
+        trial: what came out.
         values: that describe it.
         sought: whether a search sought some answer there, so that there is a success.
         **more: of the row.

@@ -42,10 +42,9 @@ def find_smallest(searches: Searches, verifier: Verifier) -> None:
         """Whether all trials together pass; so `few` do without a failure."""
         allowed, scores, failures = problem.rule.allowed(budget.trials), list[float](), 0
         while len(scores) < budget.trials and failures <= allowed and (failures or len(scores) < few):
-            trial = verifier.trial(f"check {check}", len(scores), u)
+            (trial,) = verifier.trials(f"check {check}", {len(scores): u})
             scores.append(trial.score)
             failures += not trial.success
-            verifier.stages.progress.advance(1)
         if transport is not None:
             transport.correct(u, scores)
         if failures <= allowed:

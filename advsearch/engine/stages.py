@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Ending, Policy, SearchResult, Verification, count_right, run_trials
+from advsearch.attacks import Ending, Evaluation, Policy, SearchResult, Verification, count_right, run_trials
+from advsearch.attacks.evaluation import Query
 from advsearch.attacks.smallest import scaled
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
 from advsearch.engine.budget import Preparation, RenderBudget
 from advsearch.engine.failures import check_failures
 from advsearch.engine.going_on import finite, same
 from advsearch.engine.gradients import inside
-from advsearch.engine.memory import PLAN, Memory
+from advsearch.engine.journal import PLAN, Journal, other_answers
 from advsearch.engine.planning import cosine_samples, cosines, measured_plan, plan_gradients, tuned
-from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.record import Findings, Stages
 from advsearch.engine.searches import Searches
 from advsearch.engine.smallest_change import find_smallest
 from advsearch.engine.transport import CleanMatrix, reason_against
@@ -40,33 +41,29 @@ class Attack:
     """One search on one problem with its verification; what is known so far is in `findings`.
 
     Attributes:
-        problem: what is attacked.
+        journal: of the run; its problem is what is attacked.
         budget: what it may spend.
         policy: what proposes.
-        recorder: keeps rows.
-        memory: what the run has stored already.
         stages: told which stage runs.
         preparation: what is measured before.
         findings: filled by `carry_out`.
         clean: the matrix of light transport that attacks with other budgets share.
     """
 
-    problem: Problem
+    journal: Journal
     budget: RenderBudget
     policy: Policy[Any]
-    recorder: Recorder
-    memory: Memory
     stages: Stages
     preparation: Preparation = field(default_factory=Preparation)
     findings: Findings = field(default_factory=Findings)
     clean: CleanMatrix = field(default_factory=CleanMatrix)
 
     def __post_init__(self) -> None:
+        self.problem = self.journal.problem
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
-        kept = (self.recorder, self.memory, self.stages, self.findings)
-        self._verifier = Verifier(self.problem, self.budget, *kept)
-        specialise = self.preparation.specialise
-        self._searches = Searches(self.problem, self.budget, self.policy, *kept, specialise, self.clean)
+        self._verifier = Verifier(self.journal, self.budget, self.stages, self.findings)
+        kept = (self.stages, self.findings, self.preparation.specialise, self.clean)
+        self._searches = Searches(self.journal, self.budget, self.policy, *kept)
 
     def carry_out(self) -> Findings:
         """Do everything; what an interrupt leaves undone is missing from the findings."""
@@ -93,12 +90,12 @@ class Attack:
 
     def plan(self) -> None:
         """Measure the gradient plan, or take the one that the run was begun with."""
-        problem, stored = self.problem, self.memory.note(PLAN)
+        problem, stored = self.problem, self.journal.note(PLAN)
         if stored is None:
             self._cut_paths()
             self._measure()
             chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
-            self.memory.set_note(PLAN, chosen)
+            self.journal.set_note(PLAN, chosen)
             return
         problem.plan = problem.plan.restored(stored["plan"])
         problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
@@ -165,14 +162,14 @@ class Attack:
         self.stages.begin(
             "setup", "looking at the clean scene", FIRST_LOOK, hint="the first picture compiles the renderer's code"
         )
-        findings.first_look = run_trials(
-            problem.trial,
-            start,
-            spp=self._asked_spp,
-            seed=seed,
-            trials=FIRST_LOOK,
-            on_trial=lambda *_: self._advance(),
-        )
+
+        def look(query: Query) -> Evaluation:
+            answer = problem.evaluate(query)
+            self._advance()
+            return answer
+
+        spp = self._asked_spp
+        findings.first_look = run_trials(partial(map, look), start, spp=spp, seed=seed, trials=FIRST_LOOK)
         self._check_look(start)
         looks_right = any(trial.right for trial in findings.first_look)
         if not self.problem.rule.control or (looks_right and not budget.smallest):
@@ -190,15 +187,17 @@ class Attack:
             InputError: it does.
         """
         now = [_values(one) for one in self.findings.first_look]
-        before = self.memory.note(LOOK)
+        before = self.journal.note(LOOK)
         if before is None:
-            self.memory.set_note(LOOK, now)
+            self.journal.set_note(LOOK, now)
             return
         if all(map(same, before, now)):
             return
         seed = seeds.stream(seeds.stream(self.problem.seed, "first look"), "verification", 0)
-        if same(_values(self.problem.trial(start, seed, self._asked_spp)), now[0]):
-            raise self.memory.other_answers(dict(zip(LOOKED_AT, zip(before[0], now[0], strict=True), strict=True)))
+        again = self.problem.evaluate(Query(start, seed, spp=self._asked_spp))
+        if same(_values(again.said), now[0]):
+            values = dict(zip(LOOKED_AT, zip(before[0], now[0], strict=True), strict=True))
+            raise other_answers(self.journal.run, values)
 
     def _advance(self, steps: int = 1) -> None:
         self.stages.progress.advance(steps)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from advsearch.attacks import Verification
-from advsearch.engine.ahead import Ahead
+from advsearch.cluster.executor import Executor
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.engine.rows import control_group, verified_rate
@@ -23,7 +23,7 @@ class Transfer:
         problems: of each model, by its name; they have one space.
         run: keeps the rows.
         progress: told how far it is.
-        ahead: workers make the pictures before their turn.
+        executor: of workers that make the pictures; None makes them here.
         trials: of each answer on each model.
         spp: samples a pixel.
         seed: root of the trials.
@@ -34,14 +34,14 @@ class Transfer:
         problems: Mapping[str, Problem],
         run: RunDirectory,
         progress: Progress,
-        ahead: Ahead,
+        executor: Executor | None,
         *,
         trials: int,
         spp: int,
         seed: int,
     ) -> None:
         self._conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
-        self._retrials = Retrials(self._conditions, run, progress, trials=trials, seed=seed, ahead=ahead)
+        self._retrials = Retrials(self._conditions, run, progress, trials=trials, seed=seed, executor=executor)
         self._progress, self._each = progress, trials * len(problems)
 
     def clean(self) -> list[MatrixModel]:

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluate, Evaluation
-from advsearch.attacks.evaluation import Wanted
-from advsearch.engine.problem import OnImage, Problem
+from advsearch.attacks import Evaluation
+from advsearch.attacks.evaluation import Query
+from advsearch.engine.problem import Problem
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import BasisRenderer
@@ -141,12 +141,12 @@ class Predictor(ABC):
         """Make the matrices at the start of the search; told of samples a pixel as they are traced."""
 
     @abstractmethod
-    def passed(self, kind: str, index: int, u: Tensor) -> None:
-        """Remember an evaluation that was read back."""
+    def passed(self, query: Query) -> None:
+        """Remember a query that was read back."""
 
     @abstractmethod
-    def evaluator(self, kind: str, on_image: OnImage | None = None) -> Evaluate:
-        """Return the evaluation of configurations of one search."""
+    def evaluate(self, query: Query) -> Evaluation:
+        """Answer one query of the search itself."""
 
     @abstractmethod
     def size(self) -> tuple[int, int]:
@@ -288,21 +288,16 @@ class Transport(Predictor):
         assert self._start is not None
         return self._start
 
-    def passed(self, kind: str, index: int, u: Tensor) -> None:
-        if index in self.renewals.get(kind, ()):
-            self._present[kind] = ExpansionPoint(u.detach().clone(), index)
+    def passed(self, query: Query) -> None:
+        if query.phase == "search" and query.number in self.renewals.get(query.kind, ()):
+            self._present[query.kind] = ExpansionPoint(query.u.detach().clone(), query.number)
 
-    def evaluator(self, kind: str, on_image: OnImage | None = None) -> Evaluate:
-        traced = self.problem.evaluator(kind, on_image)
-
-        def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-            renderer = self._compared(kind, index, u) if index < self._end(kind) else None
-            if renderer is None:
-                return traced(u, index=index, gradient=gradient, samples=samples)
-            noise = seeds.stream(self.problem.seed, kind, index)
-            return self.problem.evaluated(u, noise, index, gradient, samples, on_image, renderer)[0]
-
-        return evaluate
+    def evaluate(self, query: Query) -> Evaluation:
+        kind, number = query.kind, query.number
+        renderer = self._compared(kind, number, query.u) if number < self._end(kind) else None
+        if renderer is None:
+            return self.problem.evaluate(query)
+        return self.problem.evaluated(query, query.u, query.seed, renderer)[0]
 
     def likely(self, u: Tensor) -> bool:
         """Whether the picture that is predicted from the start would pass its trials, as far as those of the last

@@ -97,7 +97,7 @@ class Told:
     search goes on by being told all of that again.
 
     Attributes:
-        number: of its seed.
+        number: its place among the evaluations of its search.
         u: digest of the configuration.
         non_finite: numbers of the gradient that were not.
         cost: in evaluations.

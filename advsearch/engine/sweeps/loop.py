@@ -21,9 +21,9 @@ from advsearch.attacks.product import batches
 from advsearch.cluster.executor import Done, Executor, InProcess
 from advsearch.described import Value
 from advsearch.engine.going_on import finite, same
+from advsearch.engine.journal import other_answers
 from advsearch.engine.loading import framed
 from advsearch.engine.machines import Machines
-from advsearch.engine.memory import Memory
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import LOST, judgement_of, lost_remarks, trial_row
@@ -276,7 +276,7 @@ class Sweep:
         look = partial(batches, range(number, number + 1))
         now = finite(look().judgements[model][0].margin)
         if not same([row.margin], [now]) and same([now], [finite(look().judgements[model][0].margin)]):
-            raise Memory(self.run).other_answers({"margin": (row.margin, now)})
+            raise other_answers(self.run, {"margin": (row.margin, now)})
 
     def _tell(self, count: int, tally: Tally) -> None:
         self._untold += count

@@ -6,24 +6,37 @@ group: a trial counts where the model is wrong.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 from torch import Tensor
 
-from advsearch.attacks import Trials, choose_spp, run_trials
+from advsearch.attacks import Evaluation, Query, Trials, choose_spp, run_trials
 from advsearch.attacks.sample_count import most_samples
-from advsearch.attacks.verification import RenderTrial
+from advsearch.engine.journal import Journal
 from advsearch.engine.record import Stages
-from advsearch.engine.rows import judgement_of, rate_of, trial_row
+from advsearch.engine.rows import rate_of
+from advsearch.engine.sharing import Shared
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import WorstVerified
-from advsearch.seeds import stream
-from advsearch.tasks import Judgement
 
-KIND, PROBES = "verification", "sample count worst"
-"""Rows of the trials, and of the renders that chose their sample count."""
+PROBES = "sample count worst"
+"""Rows of the renders that chose the sample count."""
+
+
+@dataclass(frozen=True)
+class OneModel:
+    """A swept scene as one of the models sees it: what a `Problem` is to an attack."""
+
+    view: SweptScene
+    model: int
+
+    def evaluate(self, query: Query) -> Evaluation:
+        """Answer one query: a trial."""
+        return Evaluation.of(self.view.trial(self.model, query.u, query.seed, query.spp))
 
 
 def check_worst(
@@ -54,43 +67,31 @@ def check_worst(
         hint="the worst configuration, counted in samples a pixel; `verify_spp=NUMBER` leaves it out",
         at_most=True,
     )
-    probe = _after(_stored(run, PROBES), lambda at, seed, spp: view.trial(model, at, seed, spp))
-    known, number = 0 if run is None else run.store.count(PROBES), 0
+    problem: Any = OneModel(view, model)
+    journal, number = Journal(run, Shared(problem)), 0
 
-    def margin_of(spp: int, seed: int) -> float:
+    def margins(spp: int, seeds: Sequence[int]) -> list[float]:
         nonlocal number
-        trial = probe(u, seed, spp)
-        if run is not None and number >= known:
-            run.record(trial_row(PROBES, number, seed, spp, trial, sought=False))
-        number += 1
-        stages.progress.advance(spp)
-        return trial.score
+        found = []
+        for seed in seeds:
+            (answer,) = journal.answers([Query(u, seed, PROBES, number, spp=spp, drawn=False, sought=False)])
+            found.append(answer.said.score)
+            number += 1
+            stages.progress.advance(spp)
+        return found
 
-    count = choose_spp({"worst": margin_of}, seed=seed, ladder=ladder)
+    count = choose_spp({"worst": margins}, seed=seed, ladder=ladder)
     hint = f"{job.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
     stages.begin("verification", "checking the worst configuration with fresh renders", job.trials, hint=hint)
-    stored = _stored(run, KIND)
 
-    def keep(group: str, number: int, trial: Judgement) -> None:
-        stages.progress.advance(1)
-        if run is not None and number >= len(stored):
-            own = stream(seed, KIND, number)
-            run.record(trial_row(KIND, number, own, count.spp, trial, sought=False))
+    def answers(queries: Sequence[Query]) -> Iterator[Evaluation]:
+        for answer in journal.answers([replace(one, drawn=False, sought=False) for one in queries]):
+            stages.progress.advance(1)
+            yield answer
 
-    render = _after(stored, lambda at, seed, spp: view.trial(model, at, seed, spp))
-    trials = run_trials(render, u, spp=count.spp, seed=seed, trials=job.trials, on_trial=keep)
+    tried = run_trials(answers, u, spp=count.spp, seed=seed, trials=job.trials)
     settled = count.converged or len(ladder) == 1
-    renders = count.renders + len(trials)
-    wrong = [trial for trial in trials if trial.success]
-    rate = rate_of(Trials(len(wrong), len(trials), count.spp), trials, wrong)
+    renders = count.renders + len(tried)
+    wrong = [trial for trial in tried if trial.success]
+    rate = rate_of(Trials(len(wrong), len(tried), count.spp), tried, wrong)
     return WorstVerified(**vars(rate), converged=settled, renders=renders)
-
-
-def _stored(run: RunDirectory | None, kind: str) -> list[Judgement]:
-    return [] if run is None else [judgement_of(row) for row in run.store.rows(kind)]
-
-
-def _after(stored: Sequence[Judgement], render: RenderTrial) -> RenderTrial:
-    """Return the trials that are stored, one after the other, then rendered ones."""
-    left = list(reversed(stored))
-    return lambda u, seed, spp: left.pop() if left else render(u, seed, spp)

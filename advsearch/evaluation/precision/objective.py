@@ -14,8 +14,6 @@ from advsearch.attacks import Domain, Evaluate, Evaluation, Policy, StepRecord, 
 from advsearch.evaluation.precision.points import MeasuredSetting, quartiles
 from advsearch.evaluation.precision.rounds import TimeBudget
 
-EvaluatorOf = Callable[[str], Evaluate]
-"""From the name of a stream of seeds to an evaluation whose noise comes from it."""
 Verified = Callable[[Tensor], float]
 """From a configuration to its objective in fresh renders with enough samples."""
 
@@ -63,7 +61,8 @@ class ObjectiveBench:
     """Runs searches and verifies what they held at each mark.
 
     Args:
-        evaluator: see `EvaluatorOf`.
+        evaluate: answers the queries of the searches.
+        noise: root seed of their renders.
         domain: where to search.
         policies: by name.
         steps: renders of each search.
@@ -73,14 +72,15 @@ class ObjectiveBench:
 
     def __init__(
         self,
-        evaluator: EvaluatorOf,
+        evaluate: Evaluate,
+        noise: int,
         domain: Domain,
         policies: Mapping[str, Policy[Any]],
         steps: int,
         verified: Verified,
         budget: TimeBudget,
     ) -> None:
-        self._evaluator, self._domain, self._policies = evaluator, domain, policies
+        self._evaluate, self._noise, self._domain, self._policies = evaluate, noise, domain, policies
         self._steps, self._verified, self._budget = steps, verified, budget
 
     def settings(self, spp: int) -> list[MeasuredSetting]:
@@ -118,13 +118,15 @@ class ObjectiveBench:
                 held.append((wanted.pop(0), seconds, best[1]))
 
         search(
-            self._evaluator(f"precision {policy} {seed}"),
+            self._evaluate,
             self._domain,
             self._policies[policy],
             steps=self._steps,
             seed=seeds.stream(seed, "policy"),
             candidates=0,
             on_step=on_step,
+            kind=f"precision {policy} {seed}",
+            noise=self._noise,
             seconds=max(1e-9, self._budget.left),
         )
         if time.perf_counter() - begun < self._budget.left:

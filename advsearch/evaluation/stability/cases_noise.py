@@ -173,7 +173,7 @@ def _share_of_optimum(name: str, kind: str, seeds: int = 9) -> float:
             return slope + 2.0 * slope.abs().mean() * _disturbance(kind, index, len(slope), generator)
 
         toy = Toy(value, domain, disturb=disturb)
-        result = search(toy, domain, make_policy(name), steps=100, seed=seed, candidates=0)
+        result = search(partial(map, toy), domain, make_policy(name), steps=100, seed=seed, candidates=0)
         shares.append(result.best_objective / best)
     return sorted(shares)[seeds // 2]
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks import POLICIES, Ending, make_policy, search, verify
+from advsearch.attacks.evaluation import Evaluation, Query
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.search import Toy, numbers, quadratic
@@ -124,7 +125,9 @@ def certain() -> Outcome:
         answer = model(u.float().expand(8, 8, 3))
         return FORMS["margin"](answer, IMAGE, LABELS)[0].double()
 
-    flat = search(Toy(light, numbers([0.9])), numbers([0.9]), make_policy("pgd"), steps=STEPS, seed=0, candidates=0)
+    flat = search(
+        partial(map, Toy(light, numbers([0.9]))), numbers([0.9]), make_policy("pgd"), steps=STEPS, seed=0, candidates=0
+    )
     found = logits_like([[200.0, -200.0, 0.0, -300.0], [-200.0, 200.0, 0.0, -300.0]])
     return Outcome(
         (
@@ -149,8 +152,8 @@ def nan_at(steps: frozenset[int], *, ends: bool) -> Outcome:
     for name in POLICIES:
         toy = Toy(quadratic([0.7, 0.4], [1.0, 2.0]), numbers([0.2, 0.2]), broken=steps)
         policy = make_policy(name, **WITH_OPTIONS.get(name, {}))
-        result = search(toy, toy.domain, policy, steps=STEPS, seed=1, candidates=2, repeats=1)
-        seen = len([one for one in result.history if one.index in steps])
+        result = search(partial(map, toy), toy.domain, policy, steps=STEPS, seed=1, candidates=2, repeats=1)
+        seen = len([one for one in result.history if one.step in steps])
         endings.add(result.ending.value)
         finite &= math.isfinite(result.best_objective) and bool(torch.isfinite(result.best_u).all())
         right = result.non_finite_objectives == seen and (result.ending is Ending.NON_FINITE) == ends
@@ -182,7 +185,7 @@ def constant() -> Outcome:
     for name in POLICIES:
         toy = Toy(lambda u: 0.0 * u.sum() - 1.0, numbers([0.2, 0.2]), threshold=0.0)
         policy = make_policy(name, **WITH_OPTIONS.get(name, {}))
-        result = search(toy, toy.domain, policy, steps=STEPS, seed=1)
+        result = search(partial(map, toy), toy.domain, policy, steps=STEPS, seed=1)
         endings.add(f"{result.ending.value}")
         if result.success_rate > 0.0 or (name in ("pgd", "adam") and result.ending is not Ending.STALLED):
             wrong.append(name)
@@ -199,18 +202,18 @@ def chance(rate: float, runs: int = 100) -> Outcome:
         def margin(seed: int) -> float:
             return float(torch.rand(1, generator=torch.Generator().manual_seed(seed))) - (1.0 - rate)
 
-        def noisy(u: Tensor, *, index: int, gradient: object, samples: int = 1, run: int = run) -> Any:
-            value = margin(stream(run, "search", index))
-            return Toy(lambda v: 0.0 * v.sum() + value, domain, threshold=0.0)(u, index=index, gradient=False)
+        def noisy(query: Query) -> Evaluation:
+            value = margin(query.seed)
+            return Evaluation(value, None, value > 0.0)
 
-        def trial(u: Tensor, seed: int, spp: int, run: int = run) -> Judgement:
+        def trial(query: Query, run: int = run) -> Evaluation:
             # the picture decides, so another configuration gives another answer
-            value = margin(stream(run, f"trial {u.tolist()}", seed))
-            return Judgement(value, value, value <= 0.0, Answer("wrong" if value > 0.0 else "right"))
+            value = margin(stream(run, f"trial {query.u.tolist()}", query.seed))
+            return Evaluation.of(Judgement(value, value, value <= 0.0, Answer("wrong" if value > 0.0 else "right")))
 
-        result = search(noisy, domain, make_policy("random"), steps=STEPS, seed=run)
+        result = search(partial(map, noisy), domain, make_policy("random"), steps=STEPS, seed=run, noise=run)
         claimed += result.ending is Ending.FOUND
-        ending = verify(trial, domain, result.best_u, spp=1, seed=run, claim=result.ending).ending
+        ending = verify(partial(map, trial), domain, result.best_u, spp=1, seed=run, claim=result.ending).ending
         found += ending is Ending.FOUND
     return Outcome(
         (Check(f"findings in {runs} runs", float(found), 0.0, 0.0),),

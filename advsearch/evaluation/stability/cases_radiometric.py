@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import PGD, Adam, Auto, Policy, search
+from advsearch.attacks.evaluation import Query
 from advsearch.errors import InputError
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import Controls, Evaluator, domain_of, examine, small
@@ -159,11 +160,13 @@ def plateau(low: float, high: float) -> Outcome:
     checks, endings, flat = [], [], 0
     for policy in POLICIES:
         evaluate = Evaluator(renderer, darkness, 2)
-        found = search(evaluate, domain_of(renderer, start), policy, steps=PLATEAU_STEPS, seed=0, candidates=0)
+        found = search(
+            partial(map, evaluate), domain_of(renderer, start), policy, steps=PLATEAU_STEPS, seed=0, candidates=0
+        )
         flat += sum(record.gradient_norm == 0.0 for record in found.history)
         checks.append(Check(f"{policy.name} finds a picture that is not white", float(found.best_objective > 0), 1, 1))
         endings.append(f"{policy.name}: {found.ending.value}")
-    first = Evaluator(renderer, darkness, 2)(start, index=0, gradient=True)
+    first = Evaluator(renderer, darkness, 2)(Query(start, 0, gradient=True))
     assert first.gradient is not None
     slope = float(first.gradient.abs().max())
     return Outcome(

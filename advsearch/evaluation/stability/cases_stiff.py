@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -43,7 +44,13 @@ def path(toy: Toy, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0) ->
     """Search, and return the result and the configurations (n, d) that were evaluated."""
     seen: list[Tensor] = []
     result = search(
-        toy, toy.domain, policy, steps=steps, seed=seed, candidates=0, on_step=lambda record, u, found: seen.append(u)
+        partial(map, toy),
+        toy.domain,
+        policy,
+        steps=steps,
+        seed=seed,
+        candidates=0,
+        on_step=lambda record, u, found: seen.append(u),
     )
     return result, torch.stack(seen)
 
@@ -322,5 +329,5 @@ def _walk(renderer: Renderer, u: Tensor, loss: Value, scale: float) -> tuple[Sea
         seen.append(at)
 
     evaluate = Evaluator(renderer, scaled, 8)
-    result = search(evaluate, domain_of(renderer, u), PGD(), steps=18, seed=0, candidates=0, on_step=note)
+    result = search(partial(map, evaluate), domain_of(renderer, u), PGD(), steps=18, seed=0, candidates=0, on_step=note)
     return result, torch.stack(seen)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Domain, Evaluation, Policy, SearchResult, search
-from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import domains
 from advsearch.engine.gradients import Loss, Probe, estimates, probes, reference, scale_of, smooth_loss, verdict
@@ -262,7 +262,9 @@ def searched(renderer: Renderer, u: Tensor, evaluations: int, policy: Policy[Any
 
     domain = domain_of(renderer, u)
     steps = evaluations * (1 + domain.gradient_cost) + 1
-    return search(Evaluator(renderer, margin, spp), domain, policy, steps=steps, seed=0, candidates=1, repeats=1)
+    return search(
+        partial(map, Evaluator(renderer, margin, spp)), domain, policy, steps=steps, seed=0, candidates=1, repeats=1
+    )
 
 
 class Evaluator:
@@ -271,17 +273,18 @@ class Evaluator:
     def __init__(self, renderer: Renderer, loss: Loss, spp: int) -> None:
         self.renderer, self.loss, self.spp = renderer, loss, spp
 
-    def __call__(self, u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-        """See `advsearch.attacks.evaluation.Evaluate`."""
+    def __call__(self, query: Query) -> Evaluation:
+        """Answer a query."""
         renderer, derivative = self.renderer, None
+        u, seed, spp, gradient = query.u, query.seed, self.spp * query.samples, query.gradient
         bad, renders = renderer.non_finite, renderer.renders
         if gradient:
-            value, derivative = renderer.gradient(self.loss, u, index, self.spp * samples, free=gradient == "free")
+            value, derivative = renderer.gradient(self.loss, u, seed, spp, free=gradient == "free")
         else:
             with torch.no_grad():
-                value = self.loss(renderer(u, seed=index, spp=self.spp * samples))
+                value = self.loss(renderer(u, seed=seed, spp=spp))
         objective = float(value)
-        cost = (renderer.renders - renders) * samples
+        cost = (renderer.renders - renders) * query.samples
         return Evaluation(objective, derivative, objective > 0.0, renderer.non_finite - bad, cost)
 
 

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Evaluation
-from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks import Block, Domain, Evaluation, Query
 
 Value = Callable[[Tensor], Tensor]
 """From (d,) float64 in [0, 1] to a number with a graph; the larger the better."""
 Disturb = Callable[[Tensor, int], Tensor]
-"""From a gradient (d,) float32 and the index of its evaluation to the gradient that the policy sees."""
+"""From a gradient (d,) float32 and the number of its evaluation to the gradient that the policy sees."""
 
 
 @dataclass
@@ -27,7 +26,7 @@ class Toy:
         domain: where.
         scale: factor on the objective, as if it were in other units.
         disturb: what becomes of gradients.
-        broken: indices of evaluations whose objective is NaN, as is their gradient.
+        broken: numbers of evaluations whose objective is NaN, as is their gradient.
         threshold: an objective over it is a success.
     """
 
@@ -38,21 +37,21 @@ class Toy:
     broken: frozenset[int] = frozenset()
     threshold: float = math.inf
 
-    def __call__(self, u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-        """See `advsearch.attacks.evaluation.Evaluate`; no cost for gradients."""
-        at = u.detach().double().requires_grad_()
+    def __call__(self, query: Query) -> Evaluation:
+        """Answer a query; gradients cost nothing."""
+        at = query.u.detach().double().requires_grad_()
         value = self.scale * self.value(at)
         slope = None
-        if gradient:
+        if query.gradient:
             (slope,) = torch.autograd.grad(value, at)
             slope = slope.float()
             if self.disturb is not None:
-                slope = self.disturb(slope, index)
+                slope = self.disturb(slope, query.number)
         objective = float(value.detach())
-        if index in self.broken:
+        if query.number in self.broken:
             objective = math.nan
             slope = None if slope is None else torch.full_like(slope, math.nan)
-        return Evaluation(objective, slope, objective > self.threshold, cost=samples)
+        return Evaluation(objective, slope, objective > self.threshold, cost=query.samples)
 
 
 def numbers(start: Sequence[float]) -> Domain:

@@ -1,0 +1,230 @@
+"""The journal of a run: what was asked and answered, as rows of its store. A question that is in it is not asked again.
+
+So a run that was stopped goes on by asking everything once more, in the same order: it reads back what it knows, and a
+search comes to where it was by being told all of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.attacks import Evaluate, Evaluation
+from advsearch.attacks.evaluation import Query, usable
+from advsearch.engine.going_on import same
+from advsearch.engine.machines import Machines
+from advsearch.engine.problem import Problem
+from advsearch.engine.rows import judged, judgement_of, trial_row
+from advsearch.engine.sharing import Shared
+from advsearch.errors import InputError
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row, Told
+from advsearch.scene.formation import levels_of
+
+PLAN = "gradient plan"
+"""The note under which the store keeps how derivatives are obtained."""
+
+TRANSPORT = "transport"
+"""That under which it keeps at which evaluations the matrix of light transport was made anew."""
+
+
+@dataclass
+class Journal:
+    """What a run has asked and was answered. Without a run directory it is kept in memory.
+
+    Attributes:
+        run: the open run directory, or None.
+        traced: answers what nothing predicts.
+        problem: whose questions they are; it describes configurations.
+        rows: what was written, where there is no run directory.
+        lost: queries that nobody could answer.
+    """
+
+    run: RunDirectory | None
+    traced: Shared
+    rows: list[Row] = field(default_factory=list)
+    lost: int = 0
+    _counts: dict[str, int] | None = None
+    _trials: dict[tuple[str, int], Evaluation] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.machines = Machines(self.run)
+        if self._counts is not None:  # that of another problem of the same run
+            return
+        self._counts = {} if self.run is None else self.run.store.counts()
+        for kind in self._counts:
+            assert self.run is not None
+            if not is_search(kind):
+                rows = (row for row in self.run.store.rows(kind) if row.correct is not None)  # old ones don't say it
+                self._trials |= {(kind, row.step): Evaluation.of(judgement_of(row)) for row in rows}
+
+    @property
+    def problem(self) -> Problem:
+        return self.traced.problem
+
+    # ---- queries ----------------------------------------------------------------------------------------------------
+
+    def answers(
+        self,
+        queries: Sequence[Query],
+        evaluate: Evaluate | None = None,
+        passed: Callable[[Query], None] = lambda query: None,
+    ) -> Iterator[Evaluation]:
+        """Answer queries in their order: from the journal, or else by asking, and then they are in it.
+
+        Args:
+            queries: of one kind.
+            evaluate: answers what is not in the journal; None for `traced`.
+            passed: told of every query of a search that is read back.
+
+        Raises:
+            InputError: an evaluation of a search is another one than it was.
+        """
+        stored = [self._read(query) for query in queries]
+        evaluate = self.traced if evaluate is None else evaluate
+        asked = iter(evaluate([query for query, known in zip(queries, stored, strict=True) if known is None]))
+        for query, known in zip(queries, stored, strict=True):
+            begun = time.perf_counter()
+            if known is None:
+                known = usable(next(asked))
+                self._write(query, known, time.perf_counter() - begun)
+            elif query.phase is not None:
+                passed(query)
+            yield known
+
+    def holds(self, query: Query) -> bool:
+        """Whether a query is answered already."""
+        if query.phase is None:
+            return (query.kind, query.number) in self._trials
+        return query.number < (self._counts or {}).get(query.kind, 0)
+
+    def _read(self, query: Query) -> Evaluation | None:
+        if query.phase is None:
+            return self._trials.get((query.kind, query.number))
+        told = self.run.store.told(query.kind, query.number) if self.run is not None and self.holds(query) else None
+        if told is None:
+            return None
+        row, beside = told
+        if beside.u != _digest(query.u) or row.seed != query.seed:
+            path, again = ("", "") if self.run is None else (self.run.path, self.run.again)
+            raise InputError(
+                f"{path}: cannot go on: evaluation {query.number} of the {query.kind} is another one now than it was, "
+                f"so advsearch, its packages or the number of threads have changed since; {again}"
+            )
+        return Evaluation(
+            objective=math.nan if row.objective is None else row.objective,
+            gradient=None if beside.gradient is None else torch.from_numpy(beside.gradient.copy()),
+            success=bool(row.success),
+            non_finite=beside.non_finite,
+            cost=beside.cost,
+            judgement=None if row.correct is None else judgement_of(row),
+            picture=None if beside.picture is None else torch.from_numpy(beside.picture.copy()).float() / 255.0,
+        )
+
+    def _write(self, query: Query, answer: Evaluation, seconds: float) -> None:
+        """Keep an answer as a row, and what a search was told beside it."""
+        problem, told = self.problem, None
+        self.lost += answer.lost
+        self.machines.meet(answer.machine, self.traced.facts)
+        if query.phase is None:
+            self._trials[query.kind, query.number] = replace(answer, picture=None)
+            values = problem.describe(query.u, query.seed) if query.described else {}
+            values |= problem.conditions_of(query.u, query.seed) if query.drawn else {}
+            sought, machine = query.sought, answer.machine
+            row = trial_row(
+                query.kind, query.number, query.seed, query.spp, answer.said, values, sought=sought, machine=machine
+            )
+        else:
+            row = Row(
+                kind=query.kind,
+                step=query.number,
+                seed=query.seed,
+                spp=problem.spp * query.samples,
+                objective=answer.objective if answer.finite else math.nan,
+                success=answer.success,
+                values=problem.describe(query.u),
+                seconds=seconds,
+                renders=answer.cost * problem.draws,
+                phase=query.phase,
+                machine=answer.machine,
+            )
+            row = row if answer.judgement is None else judged(row, answer.judgement)
+            told = Told(
+                number=query.number,
+                u=_digest(query.u),
+                non_finite=answer.non_finite,
+                cost=answer.cost,
+                gradient=None if answer.gradient is None else answer.gradient.detach().numpy(),
+                picture=None if answer.picture is None else levels_of(answer.picture).numpy(),
+            )
+        if query.phase is not None and self.holds(query):  # of a run that was done
+            return
+        if self.run is None:
+            self.rows.append(replace(row, id=len(self.rows) + 1, time=time.time()))
+        else:
+            self.run.record(row, told=told)
+
+    def clock(self, kind: str, seconds: float | None) -> Callable[[int], bool] | None:
+        """Return what says whether the time of a search is over, that of its earlier lives included.
+
+        An evaluation that is read back never ends the search before the one after which it was ended; if the store has
+        renders of the ranking, that is the last one before these.
+
+        Args:
+            kind: of search.
+            seconds: allowed; None for no limit.
+        """
+        if seconds is None:
+            return None
+        stored: Iterable[Row] = () if self.run is None or not self.run.store.goes_on else self.run.store.rows(kind)
+        phases = [(row.phase, row.seconds or 0.0) for row in stored]
+        explored = [spent for phase, spent in phases if phase == "search"]
+        left, begun = seconds - math.fsum(explored), time.perf_counter()
+
+        def late(count: int) -> bool:
+            if count < len(explored):
+                return False
+            return len(phases) > len(explored) or time.perf_counter() - begun >= left
+
+        return late
+
+    # ---- notes ------------------------------------------------------------------------------------------------------
+
+    def note(self, key: str) -> Any:
+        """Return the JSON value that was noted, or None."""
+        return None if self.run is None else self.run.store.noted(key)
+
+    def set_note(self, key: str, value: Any) -> None:
+        """Keep a JSON value."""
+        if self.run is not None:
+            self.run.store.set_note(key, json.dumps(value))
+
+
+def other_answers(run: RunDirectory | None, values: Mapping[str, tuple[float | None, float | None]]) -> InputError:
+    """Return the error of a run that goes on with another model or objective, from what these said and say."""
+    told = ", ".join(
+        f"{name} was {before} and is {now}" for name, (before, now) in values.items() if not same([before], [now])
+    )
+    path, again = ("", "") if run is None else (run.path, run.again)
+    return InputError(
+        f"{path}: cannot go on: the same picture of the clean scene has other values now ({told}), so model, "
+        f"objective or scene are not those that it began with; take these again, or {again}"
+    )
+
+
+def is_search(kind: str) -> bool:
+    """Whether rows of a kind are evaluations of a search; all others are trials."""
+    return kind == "baseline" or kind.startswith("search")
+
+
+def _digest(u: Tensor) -> bytes:
+    return hashlib.blake2b(np.ascontiguousarray(u.detach().numpy()).tobytes(), digest_size=16).digest()
