@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch.api import attack as attacking
-from advsearch.api.attack import answering_of, budget_of, preparation_of
+from advsearch.api.attack import answering_of, search_size
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
 from advsearch.cluster.executor import Done, InProcess, Work, Workforce
@@ -61,6 +61,7 @@ class StandInProblem:
     search_depth: int | None = None
     printable: bool = False
     seed: int = 3
+    steps: int = 0
     draws: int = 1
     plan: StandInPlan = StandInPlan()
 
@@ -106,7 +107,8 @@ def attack_on(
 ) -> Attack:
     """An attack as a configuration describes it, on a problem of one's own."""
     journal = Journal(run, Shared(problem))
-    return Attack(journal, budget_of(config, problem), policy, stages, preparation_of(config))
+    problem.steps, problem.draws = search_size(config, problem)
+    return Attack(journal, config, policy, stages)
 
 
 def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:

@@ -69,6 +69,7 @@ class Problem:
         seed: root of every stream.
         searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
             their whole range for every picture.
+        steps: renders of a search.
         draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
@@ -88,6 +89,7 @@ class Problem:
     spp: int
     seed: int
     searched: int | None = None
+    steps: int = 0
     draws: int = 1
     search_depth: int | None = None
     printable: bool = False

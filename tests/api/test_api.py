@@ -14,7 +14,7 @@ from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.attack import budget_of, problem_from_config
+from advsearch.api.attack import problem_from_config
 from advsearch.cli.attack import answer as answer_text
 from advsearch.config import AttackConfig
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
@@ -315,7 +315,7 @@ def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
 def test_a_search_is_as_long_as_what_is_asked_needs(asked: dict[str, Any], steps: int, draws: int) -> None:
     config = AttackConfig(object="mug", resolution=8, threads=1, **asked)
     problem, _ = problem_from_config(config)
-    assert (budget_of(config, problem).steps, problem.draws) == (steps, draws)
+    assert (problem.steps, problem.draws) == (steps, draws)
 
 
 def test_a_search_over_conditions_says_how_long_it_is(scene: advsearch.Scene, level: float) -> None:
