@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -24,7 +23,7 @@ from advsearch.attacks import (
 from advsearch.attacks.evaluation import Query
 from advsearch.config import AttackConfig
 from advsearch.engine.bank import Bank
-from advsearch.engine.journal import TRANSPORT, Journal
+from advsearch.engine.journal import Journal
 from advsearch.engine.print_terms import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
@@ -70,11 +69,10 @@ class Searches:
         self._renders_because(reason_against(problem, steps, self.config.specialise) or "")
         if findings.rendered_because:
             return
-        stored, keep = self.journal.note(TRANSPORT), partial(self.journal.set_note, TRANSPORT)
         if problem.conditions is None:
-            findings.transport = Transport(problem, steps, renewals=stored or {}, keep=keep, clean=self.clean)
+            findings.transport = Transport(problem, steps, clean=self.clean)
         else:
-            findings.transport = Bank(problem, steps, self.journal.traced, grown=stored or [], keep=keep)
+            findings.transport = Bank(problem, steps, self.journal.traced)
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
         self.stages.begin("transport", "collecting light transport", findings.transport.samples, hint=hint)
         try:
