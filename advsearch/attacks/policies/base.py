@@ -126,14 +126,6 @@ class Policy(ABC, Generic[State]):
         with another seed gives another value, and a maximum over many is biased upwards.
         """
 
-    def turns(self, state: State) -> Sequence[tuple[State, int]]:
-        """Return the searches inside this one that come next and do not wait for each other, in their order.
-
-        Each is the state where it begins and its evaluations, provided that all before it take the renders that they
-        may. None at all where there is but one search.
-        """
-        return ()
-
     def counts(self, state: State) -> Counts:
         """Return what the policy did about the evaluations so far; nothing where it takes them as they come."""
         return NO_COUNTS
