@@ -331,8 +331,8 @@ def _lines(policy: Policy[Any], state: Any, step: int, most: int) -> list[Line]:
     plain = list(itertools.takewhile(lambda one: not one.gradient and one.samples == 1, proposals))
     if len(plain) > 1:
         return [_line_of(Coming(one, number, number)) for number, one in enumerate(plain, step)]
-    lines = []
-    for turn, count in policy.turns(state)[:most]:
+    lines, turns = [], list[tuple[Any, int]]()
+    for turn, count in turns[:most]:
         lines.append(_line(policy, turn, range(step, step + count)))
         step += count
     return lines

@@ -101,18 +101,6 @@ def test_what_was_not_announced_is_done_here() -> None:
 RESTARTS = {"name": "restarts", "times": 3}
 
 
-def test_searches_side_by_side_have_the_rows_of_one_after_the_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Restarts along derivatives, by differences here, each evaluation after the one before in its restart."""
-    settings = {**SMALL, "policy": RESTARTS, "steps": 40, "average": 0, "baseline": False}
-    attack_once(AttackConfig(**settings, run=str(tmp_path / "run")))
-    ready, found = shared(monkeypatch, settings), rows(tmp_path / "run")
-    attack_once(AttackConfig(**settings, workers=2, run=str(tmp_path / "workers")))
-    assert rows(tmp_path / "workers") == found and max(row.renders or 0 for row in found) > 1
-    assert len(ready.given) == len(found), "none is rendered here"
-
-
 Noted = tuple[tuple[float, ...], int, Wanted, int]
 
 
@@ -123,17 +111,10 @@ Noted = tuple[tuple[float, ...], int, Wanted, int]
         ({"name": "cmaes"}, 0, 0, 0),
         ({"name": "sobol"}, 0, 0, 0),
         ({"name": "pgd"}, 0, 0, 60),
-        (RESTARTS, 0, 0, 0),
-        (RESTARTS, 0, 2, 0),
-        ({"name": "restarts", "policy": "adam"}, 0, 5, 0),
-        ({"name": "halving", "policy": "pgd"}, 0, 1, 0),
-        ({"name": "portfolio"}, 0, 1, 0),
-        ({"name": "pgd"}, 3, 2, 0),
     ],
 )
 def test_announcements_are_what_comes_next(policy: dict[str, Any], options: int, cost: int, missed: int) -> None:
-    """Of a population as many as are left of it; of restarts, of races and of choices all turns of a round; of one
-    search along derivatives only the ranking."""
+    """Of a population as many as are left of it; of a search along derivatives only the ranking."""
     dim = 3 + bool(options)
     blocks = (Block(3), *([Block(1, options=options)] if options else []))
     domain = Domain(torch.full((dim,), 0.5), blocks, gradient_cost=cost)

@@ -23,7 +23,6 @@ FORMS: dict[str, Policy[Any]] = {
     "halving of pgd": make_policy("halving", policy="pgd", starts=3),
     "restarts of nes": make_policy("restarts", policy="nes"),
     "restarts of auto": make_policy("restarts", policy="auto", times=3),
-    "halving of auto": make_policy("halving", policy="auto", starts=2),
     "halving of restarts": make_policy("halving", policy={"name": "restarts", "times": 2}, starts=3),
     "restarts of halving": make_policy("restarts", policy={"name": "halving", "policy": "pgd", "starts": 2}, times=3),
     "portfolio of halvings": make_policy("portfolio", policies=["halving", "sobol", {"name": "halving", "eta": 2}]),

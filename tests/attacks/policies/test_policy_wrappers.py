@@ -46,12 +46,14 @@ BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))
 
 @dataclass(frozen=True)
 class Still(Policy[tuple[Tensor, int]]):
-    """Proposes u = (value, where it begins), `times` times; notes what it was promised in `plans`."""
+    """Proposes u = (value, where it begins), `times` times; notes what it was promised in `plans`, and what evaluations
+    cost in `costs`."""
 
     value: float
     times: int = 10**6
     gradient: bool = False
     plans: tuple[list[int], ...] = ()
+    costs: tuple[list[int], ...] = ()
     name: ClassVar[str] = "still"
     handles_choices: ClassVar[bool] = True
 
@@ -71,6 +73,8 @@ class Still(Policy[tuple[Tensor, int]]):
 
     def update(self, state: tuple[Tensor, int], evaluated: Evaluated) -> tuple[Tensor, int]:
         assert all(torch.equal(u, state[0]) for u, _ in evaluated)
+        for costs in self.costs:
+            costs += [evaluation.cost for _, evaluation in evaluated]
         return state
 
 
@@ -287,6 +291,16 @@ def test_no_evaluation_has_too_many_samples() -> None:
     told = halved(Halving(eta=2, starts=2), 1000, first)
     assert max(record.samples for record, _ in told) == 64
     assert told[-1][0].renders == 1000
+
+
+def test_a_policy_in_halving_counts_renders_as_if_its_samples_never_grew() -> None:
+    """Of 64 renders 16 for each of two searches, then 32 for one of them with two samples each: it plans for 32, and
+    has as many."""
+    plans, costs = list[int](), list[int]()
+    policy = Still(0.5, plans=(plans,), costs=(costs,))
+    _, seen = played(Halving(policy, eta=2, starts=2), 64, first)
+    assert plans == [32, 32]
+    assert (len(seen), set(costs)) == (48, {1})
 
 
 def test_halving_with_a_policy_goes_on_from_each_start() -> None:
