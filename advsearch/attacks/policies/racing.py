@@ -17,6 +17,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from heapq import heapify, heappop, heappush
 from typing import Any
 
 from advsearch.attacks.distribution import Distribution
@@ -220,26 +221,31 @@ def _next_round(race: Race) -> Race:
 def _ask(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
     """Return up to n proposals of this round that do not wait for each other; none where it is done."""
     runners, field = list(race.runners), race.field
-    each = -(-n // max(1, sum(runners[k].left > 0 for k in field)))
+    queue = _queue(runners, field)
+    each = -(-n // max(1, len(queue)))
     given, taken = dict[int, tuple[Proposal, ...]](), Counter[int]()
     batch, asked = list[Proposal](), list[int]()
-    while len(batch) < n:
-        k = max(field, key=lambda k: runners[k].left)
-        if not runners[k].left:
-            break
+    while queue and len(batch) < n:
+        _, place = queue[0]
+        k = field[place]
+        runner = runners[k]
         if k not in given:
-            most = min(each, -(-runners[k].left // race.samples))
-            given[k], state = runners[k].policy.propose(runners[k].state, most)
-            runners[k] = replace(runners[k], state=state)
+            most = min(each, -(-runner.left // race.samples))
+            given[k], state = runner.policy.propose(runner.state, most)
+            runner = replace(runner, state=state)
         if not given[k]:
             _leave(runners, field, k)
+            queue = _queue(runners, field)
             continue
         if taken[k] == len(given[k]):  # what it proposes next, these evaluations say
             break
-        batch.append(_paid(race, runners[k], given[k][taken[k]]))
+        batch.append(_paid(race, runner, given[k][taken[k]]))
         asked.append(k)
         taken[k] += 1
-        runners[k] = replace(runners[k], left=runners[k].left - batch[-1].cost(runners[k].domain))
+        runners[k] = replace(runner, left=runner.left - batch[-1].cost(runner.domain))
+        heappop(queue)
+        if runners[k].left:
+            heappush(queue, (-runners[k].left, place))
     for k, count in taken.items():
         if count < len(given[k]):  # it shall not count on more than was taken
             _, state = runners[k].policy.propose(race.runners[k].state, count)
@@ -252,6 +258,13 @@ def _paid(race: Race, runner: Runner, proposal: Proposal) -> Proposal:
     last there will be renders to use a gradient."""
     proposal = replace(proposal, samples=min(runner.left, proposal.samples * race.samples))
     return affordable(proposal, runner.domain, runner.left + (race.round + 1 < race.rounds))
+
+
+def _queue(runners: Sequence[Runner], field: Sequence[int]) -> list[tuple[int, int]]:
+    """Return a heap of places in the field, first that of whoever has most left: the first of equals."""
+    queue = [(-runners[k].left, place) for place, k in enumerate(field) if runners[k].left]
+    heapify(queue)
+    return queue
 
 
 def _leave(runners: list[Runner], field: Sequence[int], k: int) -> None:
