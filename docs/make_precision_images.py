@@ -71,10 +71,11 @@ def page(facts: Mapping[str, Mapping[str, Any]]) -> str:
     some = next(facts[name] for name in shown if "machine" in facts[name])
     machine, side = some["machine"], some["resolution"]
     said = (
-        f"Made by `python docs/make_precision_images.py` on {machine['cpu']}, {machine['cores']} cores, from the "
-        f"bundled mug in the studio at {side} x {side} pixels, with {some['seconds']} seconds for each control. [Error "
-        "against run time](precision.md) explains lines, intervals and references. The gradient is that of a smooth "
-        "linear loss of the raw picture."
+        "How long does a gradient take until it is right to 20 %? The table says it for each control, the diagrams below "
+        f"show all measured points. Scene: the bundled mug in the studio, {side} x {side} pixels. Loss: smooth and linear "
+        f"in the raw picture. Time: {some['seconds']} seconds of measuring for each control, on {machine['cpu']}, "
+        f"{machine['cores']} cores. [Error against run time](precision.md) explains lines, intervals and references. The "
+        "page is made by `python docs/make_precision_images.py`."
     )
     lines = [
         "# Error against run time, control by control",
@@ -83,7 +84,7 @@ def page(facts: Mapping[str, Mapping[str, Any]]) -> str:
         "",
         *textwrap.wrap(said, 118),
         "",
-        "| control | least seconds measured for 20 % error | for 50 % | smallest error measured |",
+        "| control | seconds until 20 % error | seconds until 50 % error | smallest error measured |",
         "| --- | --- | --- | --- |",
     ]
     for name in shown:
