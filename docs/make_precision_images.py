@@ -71,11 +71,10 @@ def page(facts: Mapping[str, Mapping[str, Any]]) -> str:
     some = next(facts[name] for name in shown if "machine" in facts[name])
     machine, side = some["machine"], some["resolution"]
     said = (
-        "How long does a gradient take until it is right to 20 %? The table says it for each control, the diagrams below "
-        f"show all measured points. Scene: the bundled mug in the studio, {side} x {side} pixels. Loss: smooth and linear "
-        f"in the raw picture. Time: {some['seconds']} seconds of measuring for each control, on {machine['cpu']}, "
-        f"{machine['cores']} cores. [Error against run time](precision.md) explains lines, intervals and references. The "
-        "page is made by `python docs/make_precision_images.py`."
+        "How long does a gradient take? The table has the fastest measured setting with at most that error. Scene: the "
+        f"bundled mug in the studio, {side} x {side} pixels. Loss: smooth and linear in the raw picture. "
+        f"{some['seconds']} seconds of measuring for each control, on {machine['cpu']}, {machine['cores']} cores, by "
+        "`python docs/make_precision_images.py`. [Error against run time](precision.md) explains the diagrams."
     )
     lines = [
         "# Error against run time, control by control",
@@ -84,7 +83,7 @@ def page(facts: Mapping[str, Mapping[str, Any]]) -> str:
         "",
         *textwrap.wrap(said, 118),
         "",
-        "| control | seconds until 20 % error | seconds until 50 % error | smallest error measured |",
+        "| control | seconds for 20 % error | seconds for 50 % error | smallest error measured |",
         "| --- | --- | --- | --- |",
     ]
     for name in shown:
