@@ -186,7 +186,7 @@ class SceneConfig(Config):
         None,
         "run",
         "where the run is stored",
-        "a name (stored in runs/) or the path of a folder",
+        "a name (kept in runs/) or the path of a folder",
         otherwise="runs/OBJECT-CONTROL-NNN",
         min_length=1,
     )
