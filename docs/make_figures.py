@@ -10,7 +10,6 @@ else in a page is written by hand. `--check` writes nothing, names the files tha
 from __future__ import annotations
 
 import argparse
-import importlib
 import inspect
 import json
 import re
@@ -24,7 +23,7 @@ from typing import Any, get_args
 from pydantic.fields import FieldInfo
 
 from advsearch.cli.flags import SCENE, help_text
-from advsearch.cli.main import GROUPS, add_command
+from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
 from advsearch.recipes.description import names as recipe_names
@@ -97,15 +96,6 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 # ---- parts made from the code ---------------------------------------------------------------------------------------
-
-
-def commands(record: Record) -> str:
-    """Every command, in the groups of the help, with what it does."""
-    modules = [
-        (title, name, importlib.import_module(path)) for title, known in GROUPS.items() for name, path in known.items()
-    ]
-    heads = ("group", "command", "what it does")
-    return table(heads, ([title.partition(":")[0], f"[`{name}`](#{name})", one.HELP] for title, name, one in modules))
 
 
 def flags(record: Record) -> str:
@@ -460,7 +450,6 @@ def _text(x: float, y: float, text: str, anchor: str, *, turned: bool = False) -
 
 
 PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
-    ("command-line.md", "commands"): commands,
     ("command-line.md", "flags"): flags,
     **{("command-line.md", f"{command}-flags"): own_flags(command) for command in CONFIGS if command != "attack"},
     ("scenes.md", "parameters"): scene_parameters,
