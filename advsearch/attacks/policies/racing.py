@@ -195,7 +195,7 @@ class Raced(Policy[Race]):
 
 def _samples(growth: int, number: int) -> int:
     """Return what samples are multiplied with in a round."""
-    return min(MOST_SAMPLES, growth**number)
+    return min(MOST_SAMPLES, int(growth**number))
 
 
 def _begin(race: Race, field: Iterable[int], number: int) -> Race:
