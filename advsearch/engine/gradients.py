@@ -37,8 +37,6 @@ CONFIDENCE = 2.5
 """Standard errors within which two means agree."""
 TURNED = 0.0317
 """Share of a full turn by which periodic coordinates are off their start where gradients are measured."""
-EXPENSIVE = frozenset({"guided", "boundary"})
-"""Estimators that are measured only when asked for."""
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
 """Steps of differences that are tried in turn, as multiples of the plan's. A step that moves an outline by a pixel is
 as wide as a classifier's loss allows; a smooth loss allows more, and noise falls with the step. What moves no outline

@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.gradients import EXPENSIVE, Loss, estimated, only
+from advsearch.engine.gradients import Loss, estimated, only
 from advsearch.runs.results.check import GradientStatus
 from advsearch.runs.results.plan import CosineRow
 from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, compared
 from advsearch.scene.renderer import Renderer
 
 GOAL = 0.9
@@ -37,10 +37,6 @@ COUNTS = (8, 16, 32, 64, 128)
 """Sample counts that are tried."""
 ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
-MANY = 16
-"""Coordinates of one control over which differences are not compared with an adjoint: one by one they take too many
-renders, and the error of random directions is which ones they skip, so that no number of samples brings them to the
-goal."""
 CONVERGED, AGAIN = 128, 4
 """Samples a pixel of a gradient that counts as converged, and times as many where these do not agree, or where a
 working gradient has more."""
@@ -85,11 +81,8 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
         sets.setdefault((group.control, group.valid), []).append(group)
     found = []
     for (_, valid), groups in sets.items():
-        usable = [one for one in valid if one not in EXPENSIVE]
+        usable = compared(valid, sum(group.size for group in groups))
         by_differences = [one for one in usable if one in BY_DIFFERENCES]
-        size = sum(group.size for group in groups)
-        if size > MANY:
-            by_differences = []
         adjoints = [one for one in usable if one in BY_ADJOINT]
         candidates = tuple(adjoints + (by_differences if every else by_differences[:1]))
         if len(candidates) > 1 and (every or valid[0] in BY_ADJOINT):
@@ -170,8 +163,7 @@ def _scores(
     keep: Keep,
 ) -> dict[str, float]:
     """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
-    noise is taken off the others' errors. Random directions are no reference: where there are no other differences,
-    each has its own scatter for an error."""
+    noise is taken off the others' errors."""
     names = {group.name for group in groups}
     gradients: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
@@ -195,9 +187,7 @@ def _scores(
         estimator: float((found - found.mean(dim=0)).square().sum() / max(1, repeats - 1))
         for estimator, found in gradients.items()
     }
-    judge = next((one for one in candidates if one in BY_DIFFERENCES - {"simultaneous"}), None)
-    if judge is None:
-        return {estimator: own[estimator] * seconds[estimator] for estimator in gradients}
+    judge = next(one for one in candidates if one in BY_DIFFERENCES)
     truth = gradients[judge].mean(dim=0)
     scores = {}
     for estimator, found_all in gradients.items():
