@@ -79,7 +79,7 @@ def test_the_first_plan_takes_what_is_preferred_and_obeys_force() -> None:
     [
         ({"pose": "magic"}, "unknown estimator for pose 'magic'"),
         ({"*": "magic"}, "unknown estimator 'magic'"),
-        ({"*": "forward"}, "unknown estimator 'forward'.*Known: adjoint, material, differences, secant, image, none"),
+        ({"*": "forward"}, "unknown estimator 'forward'.*Known: adjoint, differences, image, material, none, secant"),
         ({"poze": "secant"}, "unknown control in `estimators` 'poze'"),
         ({"pose.yaw": "adjoint"}, "`estimators` pose.yaw=adjoint: not valid there; expected one of secant, material"),
     ],
