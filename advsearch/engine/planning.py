@@ -59,8 +59,8 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
 
     Args:
         plan: the plan so far. What was forced is not contested.
-        every: compare all that are valid; otherwise only the adjoints and the first kind of differences, and only where
-            an adjoint is preferred so far: over poses, the model's loss is so rough that none has won.
+        every: compare wherever several are valid; otherwise only where the interior adjoint is preferred so far: over
+            poses, the model's loss is so rough that none has won, and over shapes the material form is the quietest.
     """
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in plan.groups:
@@ -69,11 +69,8 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
         sets.setdefault((group.control, group.valid), []).append(group)
     found = []
     for (_, valid), groups in sets.items():
-        usable = compared(valid, sum(group.size for group in groups))
-        by_differences = [one for one in usable if one in BY_DIFFERENCES]
-        adjoints = [one for one in usable if one in BY_ADJOINT]
-        candidates = tuple(adjoints + (by_differences if every else by_differences[:1]))
-        if len(candidates) > 1 and (every or valid[0] in BY_ADJOINT):
+        candidates = compared(valid, sum(group.size for group in groups))
+        if len(candidates) > 1 and (every or valid[0] == "adjoint"):
             found.append((tuple(groups), candidates))
     return found
 
