@@ -397,7 +397,7 @@ CHOOSY = Domain(
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "adam": {"step_size": 1.0, "beta1": 0.0, "beta2": 0.99},
-    "archive": {"cells": 4, "population": 4, "sigma": 0.3, "line": 0.0},
+    "archive": {"cells": 4, "population": 4},
     "auto": {},
     "cmaes": {"sigma": 1.0, "population": 4},
     "grid": {"points": 2},
