@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import pytest
@@ -18,10 +19,12 @@ from advsearch.attacks import (
     Block,
     Domain,
     Ending,
+    Evaluate,
     Evaluated,
     Evaluation,
     Policy,
     Proposal,
+    Query,
     Random,
     StepRecord,
     planned_renders,
@@ -60,14 +63,14 @@ def at(value: float) -> Tensor:
     return torch.full((3,), 0.5 + value)
 
 
-def objective_is(value: Callable[[Tensor, int], float]) -> Callable[..., Evaluation]:
+def objective_is(value: Callable[[Tensor, int], float]) -> Evaluate:
     """An `evaluate` whose margin is a function of u and the seed index."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        v = value(u, index)
-        return Evaluation(v, torch.ones_like(u) if gradient else None, v > 0)
+    def evaluate(query: Query) -> Evaluation:
+        v = value(query.u, query.number)
+        return Evaluation(v, torch.ones_like(query.u) if query.gradient else None, v > 0)
 
-    return evaluate
+    return partial(map, evaluate)
 
 
 RISE = objective_is(lambda u, index: float(u[0] - 0.5))
@@ -151,16 +154,16 @@ def test_ranking_takes_the_winners_curse_out() -> None:
 # ---- what an evaluation costs
 
 
-def priced(cost: int, log: list[tuple[int, bool | str]]) -> Callable[..., Evaluation]:
+def priced(cost: int, log: list[tuple[int, bool | str]]) -> Evaluate:
     """RISE with gradients that cost so many renders more; notes what was asked for."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        log.append((index, gradient))
-        derivative = torch.ones_like(u) if gradient else None
-        extra = cost if gradient is True else 0
-        return Evaluation(float(u[0] - 0.5), derivative, False, cost=1 + extra)
+    def evaluate(query: Query) -> Evaluation:
+        log.append((query.number, query.gradient))
+        derivative = torch.ones_like(query.u) if query.gradient else None
+        extra = cost if query.gradient is True else 0
+        return Evaluation(float(query.u[0] - 0.5), derivative, False, cost=1 + extra)
 
-    return evaluate
+    return partial(map, evaluate)
 
 
 @pytest.mark.parametrize(
@@ -207,11 +210,11 @@ def test_an_interrupt_counts_what_was_rendered() -> None:
 
 @pytest.mark.parametrize("cost", [0, 2])
 def test_an_evaluation_that_costs_what_nobody_said_is_a_bug(cost: int) -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(0.0, torch.ones_like(u) if gradient else None, False, cost=cost)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(0.0, torch.ones_like(query.u) if query.gradient else None, False, cost=cost)
 
     with pytest.raises(RuntimeError, match=f"evaluate took {cost} renders; expected 1 to 1"):
-        search(evaluate, DOMAIN, PGD(), steps=5, seed=0)
+        search(partial(map, evaluate), DOMAIN, PGD(), steps=5, seed=0)
 
 
 # ---- more samples
@@ -229,13 +232,13 @@ class Samples(Script):
         return (Proposal(self.us[state], self.gradient, samples=self.samples[state]),), state + 1
 
 
-def sampled(log: list[tuple[bool, int]], extra: int = 0) -> Callable[..., Evaluation]:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        log.append((bool(gradient), samples))
-        slope = torch.ones_like(u) if gradient else None
-        return Evaluation(float(u[0]), slope, False, cost=samples * (1 + extra * bool(gradient)))
+def sampled(log: list[tuple[bool, int]], extra: int = 0) -> Evaluate:
+    def evaluate(query: Query) -> Evaluation:
+        log.append((bool(query.gradient), query.samples))
+        slope = torch.ones_like(query.u) if query.gradient else None
+        return Evaluation(float(query.u[0]), slope, False, cost=query.samples * (1 + extra * bool(query.gradient)))
 
-    return evaluate
+    return partial(map, evaluate)
 
 
 def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
@@ -249,7 +252,7 @@ def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
 
 
 def test_samples_are_only_named_where_they_are_not_one() -> None:
-    def without_samples(u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
+    def without_samples(query: Query) -> Evaluation:
         return Evaluation(0.0, None, False)
 
     plain: Any = without_samples
@@ -269,13 +272,13 @@ def test_a_gradient_with_samples_is_asked_for_where_a_render_is_left_to_use_it()
 
 
 def test_an_evaluation_that_ignores_its_samples_is_a_bug() -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def evaluate(query: Query) -> Evaluation:
         return Evaluation(0.0, None, False)
 
     with pytest.raises(RuntimeError, match="evaluate took 1 renders; expected 4 to 4"):
-        search(evaluate, DOMAIN, Samples((at(0.0),), samples=(4,)), steps=5, seed=0)
+        search(partial(map, evaluate), DOMAIN, Samples((at(0.0),), samples=(4,)), steps=5, seed=0)
     with pytest.raises(RuntimeError, match="policy 'script' proposed 0 samples; expected at least 1"):
-        search(evaluate, DOMAIN, Samples((at(0.0),), samples=(0,)), steps=5, seed=0)
+        search(partial(map, evaluate), DOMAIN, Samples((at(0.0),), samples=(0,)), steps=5, seed=0)
 
 
 # ---- choices and distributions
@@ -304,11 +307,11 @@ def test_a_policy_that_knows_no_choices_never_sees_one() -> None:
     domain = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, options=3), Block(1), Block(1, options=2)))
     seen: list[tuple[int, int]] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        seen.append((int(u[0] * 3), int(u[2] * 2)))
-        return Evaluation(float(seen[-1] == (1, 0)) + float(u[1]), None, False)
+    def evaluate(query: Query) -> Evaluation:
+        seen.append((int(query.u[0] * 3), int(query.u[2] * 2)))
+        return Evaluation(float(seen[-1] == (1, 0)) + float(query.u[1]), None, False)
 
-    result = search(evaluate, domain, Steps(), steps=60, seed=0, candidates=0)
+    result = search(partial(map, evaluate), domain, Steps(), steps=60, seed=0, candidates=0)
     assert seen[0] == (0, 1)
     assert len(set(seen)) == 6
     assert seen.count((1, 0)) == max(seen.count(pair) for pair in set(seen)) > 25
@@ -339,15 +342,15 @@ def test_a_distribution_is_the_policys_answer() -> None:
 
 
 def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them() -> None:
-    def slow(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def slow(query: Query) -> Evaluation:
         time.sleep(0.02)
-        return Evaluation(float(u[0]), None, False)
+        return Evaluation(float(query.u[0]), None, False)
 
-    result = search(slow, DOMAIN, Random(), steps=10**6, seed=0, seconds=0.1, candidates=0)
+    result = search(partial(map, slow), DOMAIN, Random(), steps=10**6, seed=0, seconds=0.1, candidates=0)
     assert 2 <= len(result.history) <= 5
     assert result.stopped is Ending.BUDGET_SPENT
-    assert len(search(slow, DOMAIN, Random(), steps=9, seed=0, seconds=1e-9, candidates=0).history) == 1
-    assert len(search(slow, DOMAIN, Random(), steps=3, seed=0, seconds=60.0, candidates=0).history) == 3
+    assert len(search(partial(map, slow), DOMAIN, Random(), steps=9, seed=0, seconds=1e-9, candidates=0).history) == 1
+    assert len(search(partial(map, slow), DOMAIN, Random(), steps=3, seed=0, seconds=60.0, candidates=0).history) == 3
 
 
 # ---- non-finite numbers
@@ -356,7 +359,7 @@ def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them() -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_non_finite_objective_is_counted_and_never_best(bad: float) -> None:
     evaluate = objective_is(lambda u, index: bad if index == 1 else float(u[0] - 0.5))
-    result = search(evaluate, DOMAIN, Script((at(0.05), at(0.2), at(0.1))), steps=3, seed=0)
+    result = search(partial(map, evaluate), DOMAIN, Script((at(0.05), at(0.2), at(0.1))), steps=3, seed=0)
     assert torch.equal(result.best_u, at(0.1))
     assert result.non_finite_objectives == 1
     assert math.isnan(result.history[1].objective)
@@ -367,7 +370,7 @@ def test_a_non_finite_objective_is_counted_and_never_best(bad: float) -> None:
 def test_three_in_a_row_end_the_search() -> None:
     bad = {1, 3, 4, 5}
     evaluate = objective_is(lambda u, index: math.nan if index in bad else -1.0)
-    result = search(evaluate, DOMAIN, Script((at(0.0),) * 9), steps=9, seed=0)
+    result = search(partial(map, evaluate), DOMAIN, Script((at(0.0),) * 9), steps=9, seed=0)
     assert result.ending is Ending.NON_FINITE
     assert len(result.history) == 6
     assert result.non_finite_objectives == 4
@@ -383,7 +386,7 @@ def test_nothing_but_nan_returns_the_start() -> None:
 
 def test_a_candidate_that_turns_nan_when_ranked_is_not_the_answer() -> None:
     evaluate = objective_is(lambda u, index: math.nan if index >= 2 and float(u[0]) > 0.55 else float(u[0] - 0.5))
-    result = search(evaluate, DOMAIN, Script((at(0.1), at(0.02))), steps=2, seed=0)
+    result = search(partial(map, evaluate), DOMAIN, Script((at(0.1), at(0.02))), steps=2, seed=0)
     assert torch.equal(result.best_u, at(0.02))
     assert result.non_finite_objectives == 2
 
@@ -391,12 +394,12 @@ def test_a_candidate_that_turns_nan_when_ranked_is_not_the_answer() -> None:
 def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
     gradients = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        value = torch.tensor([math.nan, 1.0, -math.inf]) if gradient else None
+    def evaluate(query: Query) -> Evaluation:
+        value = torch.tensor([math.nan, 1.0, -math.inf]) if query.gradient else None
         return Evaluation(0.5, value, True, non_finite=1)
 
     result = search(
-        evaluate,
+        partial(map, evaluate),
         DOMAIN,
         Script((at(0.0), at(0.1)), gradient=True),
         steps=2,
@@ -418,7 +421,7 @@ def no_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(INTERRUPTS, "count", 0)
 
 
-def interrupt_at(number: int, error: type[BaseException] = KeyboardInterrupt) -> Callable[..., Evaluation]:
+def interrupt_at(number: int, error: type[BaseException] = KeyboardInterrupt) -> Evaluate:
     def value(u: Tensor, index: int) -> float:
         calls.append(index)
         if len(calls) == number:
@@ -456,11 +459,11 @@ def test_an_interrupt_in_the_callback_keeps_that_very_step() -> None:
 
 
 def test_other_exceptions_pass_through() -> None:
-    def broken(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def broken(query: Query) -> Evaluation:
         raise ZeroDivisionError("in the renderer")
 
     with pytest.raises(ZeroDivisionError, match="in the renderer"):
-        search(broken, DOMAIN, PGD(), steps=2, seed=0)
+        search(partial(map, broken), DOMAIN, PGD(), steps=2, seed=0)
 
 
 # ---- bugs and bad input
@@ -496,11 +499,11 @@ def test_a_policy_that_leaves_the_domain_is_a_bug(u: Tensor, message: str) -> No
 def test_a_gradient_that_is_missing_or_misshapen_is_a_bug(gradient: Tensor | None, message: str) -> None:
     answer = gradient
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def evaluate(query: Query) -> Evaluation:
         return Evaluation(0.0, answer, False)
 
     with pytest.raises(RuntimeError, match=message):
-        search(evaluate, DOMAIN, PGD(), steps=2, seed=0)
+        search(partial(map, evaluate), DOMAIN, PGD(), steps=2, seed=0)
 
 
 @pytest.mark.parametrize(
@@ -571,7 +574,7 @@ def test_the_last_configuration_takes_the_place_of_the_worst_candidate() -> None
 
 
 def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> None:
-    def noisy(seed: int) -> Callable[..., Evaluation]:
+    def noisy(seed: int) -> Evaluate:
         noise = 0.1 * torch.randn(4, 100, generator=torch.Generator().manual_seed(seed))
         return objective_is(lambda u, index: float(u[0]) + float(noise[round(float(u[0]) * 100) % 4, index]) - 9.0)
 

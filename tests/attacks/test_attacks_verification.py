@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from advsearch.attacks import (
     Domain,
     Ending,
     Evaluation,
+    Query,
     Random,
     Trials,
     choose_spp,
@@ -352,11 +354,11 @@ def test_a_lucky_claim_is_not_verified(seed: int) -> None:
     """The winner's curse: nothing in the budget beats margin -1, one logit of noise makes 60 renders look otherwise."""
     render = noisy(-1.2, -1.0, 1.0)
 
-    def evaluate(u: torch.Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        margin = render(u, 1_000_003 * (seed + 1) + index, 16).margin
+    def evaluate(query: Query) -> Evaluation:
+        margin = render(query.u, 1_000_003 * (seed + 1) + query.number, 16).margin
         return Evaluation(margin, None, margin > 0)
 
-    claim = search(evaluate, DOMAIN, Random(), steps=60, seed=seed)
+    claim = search(partial(map, evaluate), DOMAIN, Random(), steps=60, seed=seed)
     assert claim.claimed_objective > 0.2  # the raw claim: a success, 1.2 logits over anything there is
     result = verify(render, DOMAIN, claim.best_u, claim=Ending.FOUND, spp=64, seed=seed)
     assert result.ending is Ending.NOT_VERIFIED

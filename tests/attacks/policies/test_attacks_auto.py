@@ -6,6 +6,7 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Random, SearchResult, search
+from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
 from advsearch.attacks.policies.auto import LOW, make_plan
 from advsearch.attacks.policies.base import Policy, one_thread, seeded
 from advsearch.attacks.policies.coordinates import box_coordinates
@@ -57,12 +58,13 @@ class Smooth:
     def value(self, u: Tensor) -> float:
         return float(np.cos(self.frequency @ u.double().numpy() + self.phase).sum()) / math.sqrt(10)
 
-    def __call__(self, u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def __call__(self, query: Query) -> Evaluation:
+        u, gradient = query.u, query.gradient
         assert self.domain.contains(u)
         assert u.dtype == torch.float32
         self.asked.append(gradient)
         self.seen.append(u.clone())
-        rng = np.random.default_rng([self.seed, index, zlib.crc32(u.numpy().tobytes())])
+        rng = np.random.default_rng([self.seed, query.number, zlib.crc32(u.numpy().tobytes())])
         value = self.value(u) + self.noise * rng.normal()
         slope = None
         if gradient:
@@ -74,7 +76,7 @@ class Smooth:
 
 def played(domain: Domain, policy: Policy[Any], steps: int, seed: int = 0) -> tuple[SearchResult, Smooth]:
     problem = Smooth(domain)
-    return search(problem, domain, policy, steps=steps, seed=seed), problem
+    return search(partial(map, problem), domain, policy, steps=steps, seed=seed), problem
 
 
 # ---- rules
@@ -130,7 +132,7 @@ def test_old_states_replay_the_same_future() -> None:
         for k in range(index, index + steps):
             (proposal,), state = policy.propose(state, 1)  # type: ignore[arg-type]
             seen.append(proposal.u)
-            evaluation = problem(proposal.u, index=k, gradient=proposal.gradient)
+            evaluation = problem(Query(proposal.u, k, number=k, gradient=proposal.gradient))
             state = policy.update(state, [(proposal.u, evaluation)])
         return state, seen
 
@@ -145,12 +147,12 @@ def test_old_states_replay_the_same_future() -> None:
 def test_an_interrupt_keeps_the_best_so_far(number: int) -> None:
     problem = Smooth(domain_of(POSE), noise=0.0)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def evaluate(query: Query) -> Evaluation:
         if len(problem.seen) == number:
             raise KeyboardInterrupt
-        return problem(u, index=index, gradient=gradient)
+        return problem(query)
 
-    result = search(evaluate, problem.domain, Auto(), steps=40, seed=0)
+    result = search(partial(map, evaluate), problem.domain, Auto(), steps=40, seed=0)
     assert result.ending is Ending.INTERRUPTED
     assert problem.value(result.best_u) == pytest.approx(max(problem.value(u) for u in problem.seen))
 
@@ -160,12 +162,12 @@ def test_values_that_are_not_finite_are_the_worst(blocks: tuple[Block, ...]) -> 
     """Half of the box cannot be evaluated."""
     problem = Smooth(domain_of(blocks))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        evaluation = problem(u, index=index, gradient=gradient)
-        bad = index % 3 != 0 and float(u[-1]) > 0.6
+    def evaluate(query: Query) -> Evaluation:
+        evaluation = problem(query)
+        bad = query.number % 3 != 0 and float(query.u[-1]) > 0.6
         return Evaluation(math.nan, evaluation.gradient, False) if bad else evaluation
 
-    result = search(evaluate, problem.domain, Auto(), steps=40, seed=0)
+    result = search(partial(map, evaluate), problem.domain, Auto(), steps=40, seed=0)
     assert result.stopped is Ending.BUDGET_SPENT
     assert 0 < result.non_finite_objectives < 25
 
@@ -221,11 +223,11 @@ def test_an_angle_is_searched_across_its_seam() -> None:
     sides, reached = set(), []
     for seed in range(4):
 
-        def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-            sides.add(float(u[0]) < 0.5) if value(u) > 0.9 else None
-            return Evaluation(value(u), None, False)
+        def evaluate(query: Query) -> Evaluation:
+            sides.add(float(query.u[0]) < 0.5) if value(query.u) > 0.9 else None
+            return Evaluation(value(query.u), None, False)
 
-        reached.append(value(search(evaluate, domain, Auto(), steps=40, seed=seed).best_u))
+        reached.append(value(search(partial(map, evaluate), domain, Auto(), steps=40, seed=seed).best_u))
     assert min(reached) > 0.97
     assert sides == {True, False}
 
@@ -306,12 +308,12 @@ def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:
     domain = Domain(torch.full((d,), 0.45), (Block(d),), gradient_cost=2 * d)
 
     def reached(policy: Policy[Any]) -> float:
-        def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-            rng = np.random.default_rng([seed, index, zlib.crc32(u.numpy().tobytes())])
-            value = function(u.double().numpy()) + noise * rng.normal()
+        def evaluate(query: Query) -> Evaluation:
+            rng = np.random.default_rng([seed, query.number, zlib.crc32(query.u.numpy().tobytes())])
+            value = function(query.u.double().numpy()) + noise * rng.normal()
             return Evaluation(value, None, value > 0)
 
-        return function(search(evaluate, domain, policy, steps=40, seed=seed).best_u.double().numpy())
+        return function(search(partial(map, evaluate), domain, policy, steps=40, seed=seed).best_u.double().numpy())
 
     return reached(Auto()) - reached(Random())
 
