@@ -113,13 +113,21 @@ def rendered_cells(
         if evaluation.success and (at not in worst or evaluation.objective > worst[at][0]):
             worst[at] = evaluation.objective, u.clone()
 
-    evaluate = problem.evaluator(policy.name)
-    search(partial(map, evaluate), problem.domain, policy, steps=renders, seed=seed, candidates=0, on_step=note)
+    search(
+        partial(map, problem.evaluate),
+        problem.domain,
+        policy,
+        steps=renders,
+        seed=seed,
+        candidates=0,
+        on_step=note,
+        kind=policy.name,
+        noise=problem.seed,
+    )
 
     def holds(u: Tensor) -> bool:
-        return all(
-            problem.trial(u, stream(problem.seed, "again", number), TRIAL_SPP).success for number in range(TRIALS)
-        )
+        queries = (Query(u, stream(problem.seed, "again", number), spp=TRIAL_SPP) for number in range(TRIALS))
+        return all(problem.evaluate(query).success for query in queries)
 
     return {at for at, (_, u) in worst.items() if holds(u)}, wrong / renders
 

@@ -28,13 +28,14 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds, threads
 from advsearch.api.attack import problem_from_config
-from advsearch.attacks import make_policy, search
+from advsearch.attacks import Query, make_policy, search
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Transport
@@ -89,14 +90,20 @@ def _answer(problem: Problem, policy: str, renders: int, seed: int) -> float:
     problem.seed = seeds.stream(7, "searches", seed)
     steps = max(1, renders - 8)  # the ranking of candidates takes eight
     found = search(
-        problem.evaluator(policy), problem.domain, make_policy(policy), steps=steps, seed=seeds.stream(seed, policy)
+        partial(map, problem.evaluate),
+        problem.domain,
+        make_policy(policy),
+        steps=steps,
+        seed=seeds.stream(seed, policy),
+        kind=policy,
+        noise=problem.seed,
     )
     return _verified(problem, found.best_u)
 
 
 def _verified(problem: Problem, u: Tensor, trials: int = TRIALS) -> float:
-    margins = [problem.trial(u, seeds.stream(99, "trial", number), TRIAL_SPP).margin for number in range(trials)]
-    return statistics.fmean(margins)
+    queries = [Query(u, seeds.stream(99, "trial", number), spp=TRIAL_SPP) for number in range(trials)]
+    return statistics.fmean(problem.evaluate(query).said.margin for query in queries)
 
 
 def _spaces(args: argparse.Namespace) -> None:
@@ -147,11 +154,12 @@ def _transport(args: argparse.Namespace) -> None:
             transport = Transport(problem, args.renders)
             predicted = name == "predicted"
             found = search(
-                transport.evaluator("search") if predicted else problem.evaluator("search"),
+                partial(map, transport.evaluate if predicted else problem.evaluate),
                 replace(problem.domain, exact=predicted),
                 make_policy("auto"),
                 steps=args.renders,
                 seed=seeds.stream(seed, "auto"),
+                noise=problem.seed,
             )
             if seed:  # the first one compiles the renderer's code
                 seconds.append(time.process_time() - begun)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import (
+    CMAES,
     NES,
     PGD,
     Block,
@@ -26,13 +27,16 @@ from advsearch.attacks import (
     Proposal,
     Query,
     Random,
+    Sobol,
     StepRecord,
     planned_renders,
     search,
 )
 from advsearch.attacks.candidates import Candidate, admit, best, contenders, with_last
+from advsearch.attacks.evaluation import MOST
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
+from advsearch.seeds import stream
 
 DOMAIN = Domain(torch.full((3,), 0.5), (Block(3, "linf", 0.2),))
 
@@ -43,6 +47,7 @@ class Script(Policy[int]):
 
     us: tuple[Any, ...]
     gradient: bool = False
+    at_once: int = 1
     name: ClassVar[str] = "script"
     uses_gradient: ClassVar[bool] = False
 
@@ -50,7 +55,8 @@ class Script(Policy[int]):
         return 0
 
     def propose(self, state: int, n: int) -> tuple[tuple[Proposal, ...], int]:
-        return tuple(Proposal(u, self.gradient) for u in self.us[state : state + 1]), state + 1
+        end = state + min(n, self.at_once)
+        return tuple(Proposal(u, self.gradient) for u in self.us[state:end]), end
 
     def update(self, state: int, evaluated: Evaluated) -> int:
         for _, evaluation in evaluated:
@@ -63,11 +69,15 @@ def at(value: float) -> Tensor:
     return torch.full((3,), 0.5 + value)
 
 
+INDEX = {stream(0, "search", index): index for index in range(3000)}
+"""Which of a search's seeds one is."""
+
+
 def objective_is(value: Callable[[Tensor, int], float]) -> Evaluate:
-    """An `evaluate` whose margin is a function of u and the seed index."""
+    """An `evaluate` whose margin is a function of u and the index of the seed."""
 
     def evaluate(query: Query) -> Evaluation:
-        v = value(query.u, query.number)
+        v = value(query.u, INDEX[query.seed])
         return Evaluation(v, torch.ones_like(query.u) if query.gradient else None, v > 0)
 
     return partial(map, evaluate)
@@ -98,8 +108,10 @@ def test_without_a_success_the_ending_is_budget_spent() -> None:
 
 def test_every_evaluation_has_its_own_seed_and_ranking_shares_new_ones() -> None:
     result = search(RISE, DOMAIN, Script((at(-0.1), at(0.1), at(0.0))), steps=3, seed=0, candidates=2, repeats=3)
-    assert [r.index for r in result.history] == [0, 1, 2]
-    assert [r.index for r in result.ranking] == [3, 4, 5, 3, 4, 5]
+    assert [INDEX[r.seed] for r in result.history] == [0, 1, 2]
+    assert [INDEX[r.seed] for r in result.ranking] == [3, 4, 5, 3, 4, 5]
+    other = search(sampled([]), DOMAIN, Script((at(0.0),)), steps=1, seed=0, candidates=0, kind="baseline", noise=7)
+    assert [r.seed for r in other.history] == [stream(7, "baseline", 0)]
 
 
 def test_the_last_gradient_is_not_asked_for() -> None:
@@ -158,7 +170,7 @@ def priced(cost: int, log: list[tuple[int, bool | str]]) -> Evaluate:
     """RISE with gradients that cost so many renders more; notes what was asked for."""
 
     def evaluate(query: Query) -> Evaluation:
-        log.append((query.number, query.gradient))
+        log.append((INDEX[query.seed], query.gradient))
         derivative = torch.ones_like(query.u) if query.gradient else None
         extra = cost if query.gradient is True else 0
         return Evaluation(float(query.u[0] - 0.5), derivative, False, cost=1 + extra)
@@ -251,16 +263,6 @@ def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
     assert torch.equal(result.best_u, at(0.2))
 
 
-def test_samples_are_only_named_where_they_are_not_one() -> None:
-    def without_samples(query: Query) -> Evaluation:
-        return Evaluation(0.0, None, False)
-
-    plain: Any = without_samples
-    assert search(plain, DOMAIN, Samples((at(0.0),), samples=(1,)), steps=1, seed=0).renders == 3
-    with pytest.raises(TypeError, match="samples"):
-        search(plain, DOMAIN, Samples((at(0.0),), samples=(2,)), steps=2, seed=0)
-
-
 def test_a_gradient_with_samples_is_asked_for_where_a_render_is_left_to_use_it() -> None:
     """Three samples and a gradient of two renders more each: nine renders."""
     domain = Domain(DOMAIN.start, DOMAIN.blocks, gradient_cost=2)
@@ -346,11 +348,73 @@ def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them() -> None:
         time.sleep(0.02)
         return Evaluation(float(query.u[0]), None, False)
 
-    result = search(partial(map, slow), DOMAIN, Random(), steps=10**6, seed=0, seconds=0.1, candidates=0)
+    result = search(partial(map, slow), DOMAIN, Random(), steps=100, seed=0, seconds=0.1, candidates=0)
     assert 2 <= len(result.history) <= 5
     assert result.stopped is Ending.BUDGET_SPENT
     assert len(search(partial(map, slow), DOMAIN, Random(), steps=9, seed=0, seconds=1e-9, candidates=0).history) == 1
     assert len(search(partial(map, slow), DOMAIN, Random(), steps=3, seed=0, seconds=60.0, candidates=0).history) == 3
+
+
+# ---- batches
+
+
+@dataclass
+class Asked:
+    """RISE, with notes of what was asked together, and of how much of it was made."""
+
+    batches: list[list[Query]] = field(default_factory=list)
+    made: int = 0
+
+    def __call__(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        self.batches.append(list(queries))
+        for evaluation in RISE(queries):
+            self.made += 1
+            yield evaluation
+
+    @property
+    def sizes(self) -> list[int]:
+        return [len(batch) for batch in self.batches]
+
+
+def test_what_does_not_wait_is_asked_at_once() -> None:
+    asked = Asked()
+    search(asked, DOMAIN, CMAES(population=6), steps=20, seed=0, candidates=3, repeats=2)
+    assert asked.sizes == [6, 6, 6, 2, 6], "three populations, what can be paid of the fourth, and the ranking"
+    assert [query.number for batch in asked.batches for query in batch] == list(range(26))
+    assert [batch[0].phase for batch in asked.batches] == ["search"] * 4 + ["ranking"]
+    asked = Asked()
+    search(asked, DOMAIN, PGD(), steps=5, seed=0, candidates=0)
+    assert asked.sizes == [1] * 5
+
+
+def test_a_search_at_random_asks_for_all_that_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = Asked()
+    search(asked, DOMAIN, Random(), steps=MOST + 3, seed=0, candidates=0)
+    assert asked.sizes == [MOST, 3]
+    monkeypatch.setattr("advsearch.attacks.evaluation.MOST_NUMBERS", 4 * DOMAIN.dim + 2)
+    asked = Asked()
+    search(asked, DOMAIN, Random(), steps=9, seed=0, candidates=0)
+    assert asked.sizes == [4, 4, 1]
+
+
+@pytest.mark.parametrize("policy", [Random(), CMAES(population=6), Sobol()], ids=lambda policy: policy.name)
+def test_rows_do_not_depend_on_when_answers_come(policy: Policy[Any]) -> None:
+    """One by one, or a whole batch before the first of it is looked at; what `late` cuts off included."""
+
+    def rows(evaluate: Evaluate, last: int) -> tuple[list[StepRecord], Tensor]:
+        found = search(evaluate, DOMAIN, policy, steps=30, seed=0, late=lambda done: done >= last)
+        return [replace(one, seconds=0.0) for one in (*found.history, *found.ranking)], found.best_u
+
+    for last in (30, 8):
+        lazy, eager = rows(RISE, last), rows(lambda queries: list(RISE(queries)), last)
+        assert repr(lazy[0]) == repr(eager[0]) and torch.equal(lazy[1], eager[1])
+        assert [one.step for one in lazy[0]] == list(range(last + 8))
+
+
+def test_what_is_too_late_is_not_made() -> None:
+    asked = Asked()
+    found = search(asked, DOMAIN, Random(), steps=50, seed=0, candidates=0, late=lambda done: done >= 7)
+    assert (asked.sizes, asked.made, len(found.history)) == ([50], 7, 7)
 
 
 # ---- non-finite numbers
@@ -359,7 +423,7 @@ def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them() -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_non_finite_objective_is_counted_and_never_best(bad: float) -> None:
     evaluate = objective_is(lambda u, index: bad if index == 1 else float(u[0] - 0.5))
-    result = search(partial(map, evaluate), DOMAIN, Script((at(0.05), at(0.2), at(0.1))), steps=3, seed=0)
+    result = search(evaluate, DOMAIN, Script((at(0.05), at(0.2), at(0.1))), steps=3, seed=0)
     assert torch.equal(result.best_u, at(0.1))
     assert result.non_finite_objectives == 1
     assert math.isnan(result.history[1].objective)
@@ -370,7 +434,7 @@ def test_a_non_finite_objective_is_counted_and_never_best(bad: float) -> None:
 def test_three_in_a_row_end_the_search() -> None:
     bad = {1, 3, 4, 5}
     evaluate = objective_is(lambda u, index: math.nan if index in bad else -1.0)
-    result = search(partial(map, evaluate), DOMAIN, Script((at(0.0),) * 9), steps=9, seed=0)
+    result = search(evaluate, DOMAIN, Script((at(0.0),) * 9), steps=9, seed=0)
     assert result.ending is Ending.NON_FINITE
     assert len(result.history) == 6
     assert result.non_finite_objectives == 4
@@ -386,7 +450,7 @@ def test_nothing_but_nan_returns_the_start() -> None:
 
 def test_a_candidate_that_turns_nan_when_ranked_is_not_the_answer() -> None:
     evaluate = objective_is(lambda u, index: math.nan if index >= 2 and float(u[0]) > 0.55 else float(u[0] - 0.5))
-    result = search(partial(map, evaluate), DOMAIN, Script((at(0.1), at(0.02))), steps=2, seed=0)
+    result = search(evaluate, DOMAIN, Script((at(0.1), at(0.02))), steps=2, seed=0)
     assert torch.equal(result.best_u, at(0.02))
     assert result.non_finite_objectives == 2
 
@@ -474,7 +538,7 @@ def test_a_policy_that_proposes_more_than_it_was_asked_for_is_named() -> None:
         def propose(self, state: int, n: int) -> tuple[tuple[Proposal, ...], int]:
             return (Proposal(at(0.1)),) * (n + 1), state
 
-    with pytest.raises(RuntimeError, match="policy 'script' proposed 2 configurations; expected at most 1"):
+    with pytest.raises(RuntimeError, match="policy 'script' proposed 6 configurations; expected at most 5"):
         search(objective_is(lambda u, index: 0.0), DOMAIN, Eager(()), steps=5, seed=0)
 
 
@@ -590,4 +654,4 @@ def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> Non
     }
     assert right[20] > right[0] + 3 and right[20] >= 45
     found = search(noisy(3), DOMAIN, script, steps=2, seed=0, close=20)
-    assert found.renders <= planned_renders(2, close=20) and len({r.index for r in found.ranking}) >= 2
+    assert found.renders <= planned_renders(2, close=20) and len({r.seed for r in found.ranking}) >= 2

@@ -35,9 +35,9 @@ DOMAINS = {
 }
 
 
-def domain_of(blocks: tuple[Block, ...], cost: int = 0, partial: bool = False) -> Domain:
+def domain_of(blocks: tuple[Block, ...], cost: int = 0, free: bool = False) -> Domain:
     size = sum(block.size for block in blocks)
-    return Domain(0.3 + 0.4 * torch.rand(size, generator=seeded(1, size)), blocks, cost, partial)
+    return Domain(0.3 + 0.4 * torch.rand(size, generator=seeded(1, size)), blocks, cost, free)
 
 
 @dataclass
@@ -102,17 +102,17 @@ def test_without_noise_it_is_pgd_with_more_momentum() -> None:
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 7, 40])
-@pytest.mark.parametrize(("cost", "partial"), [(0, False), (12, False), (12, True)])
+@pytest.mark.parametrize(("cost", "free"), [(0, False), (12, False), (12, True)])
 @pytest.mark.parametrize("name", DOMAINS)
-def test_it_stays_inside_and_spends_its_budget_exactly(name: str, cost: int, partial: bool, steps: int) -> None:
+def test_it_stays_inside_and_spends_its_budget_exactly(name: str, cost: int, free: bool, steps: int) -> None:
     """`Smooth` itself checks that every configuration lies in the domain."""
-    result, problem = played(domain_of(DOMAINS[name], cost, partial), Auto(), steps)
+    result, problem = played(domain_of(DOMAINS[name], cost, free), Auto(), steps)
     assert result.stopped is Ending.BUDGET_SPENT
     assert result.history[-1].renders == steps
     assert torch.equal(problem.seen[0], problem.domain.start)
     if cost == 12:
         ball = "ball" in name or "texture" in name
-        assert set(problem.asked) <= {False, "free" if ball and partial else True}
+        assert set(problem.asked) <= {False, "free" if ball and free else True}
 
 
 @pytest.mark.parametrize("name", DOMAINS)
@@ -193,8 +193,8 @@ def test_free_gradients_end_a_search_and_lead_one_in_many_dimensions() -> None:
 
 
 def test_a_texture_beside_a_pose_takes_free_gradients_where_there_are_some() -> None:
-    for cost, partial, wanted in ((12, True, "free"), (12, False, True), (0, True, True)):
-        domain = domain_of((BALL, *POSE), cost, partial)
+    for cost, free, wanted in ((12, True, "free"), (12, False, True), (0, True, True)):
+        domain = domain_of((BALL, *POSE), cost, free)
         plan = make_plan(domain, box_coordinates(domain), 40)
         assert (plan.screen, plan.until, plan.gradient) == (10, 20, wanted)
     result, problem = played(domain_of((BALL, *POSE), 12, True), Auto(), 40)

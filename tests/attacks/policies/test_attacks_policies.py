@@ -613,7 +613,8 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
             (proposal,), state = policy.propose(state, 1)
             seen.append(proposal.u)
             query = Query(proposal.u, k, number=3 * k, gradient=proposal.gradient, samples=proposal.samples)
-            state = policy.update(state, [(proposal.u, *evaluate([query]))])
+            (evaluation,) = evaluate([query])
+            state = policy.update(state, [(proposal.u, evaluation)])
         return state, torch.stack(seen)
 
     before = np.random.get_state(legacy=False)["state"]["key"].copy(), torch.random.get_rng_state()  # noqa: NPY002

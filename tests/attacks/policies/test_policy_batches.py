@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import POLICIES, Block, Domain, Evaluation, Policy, make_policy
+from advsearch.attacks import POLICIES, Block, Domain, Evaluation, Policy, Query, make_policy, search
 from advsearch.attacks.policies.choices import with_choices
 
 NUMBERS = Domain(torch.tensor([0.3, 0.6, 0.5, 0.5]), (Block(2), Block(2, "linf", 0.2)))
@@ -59,6 +60,29 @@ def test_a_batch_has_what_would_have_come_one_by_one(policy: str, domain: str) -
         together, sizes = proposed(FORMS[policy], DOMAINS[domain], n)
         assert together[: len(alone)] == alone, n  # the last batch may go beyond the renders
         assert max(sizes) <= n
+
+
+@pytest.mark.parametrize("domain", DOMAINS)
+@pytest.mark.parametrize("policy", FORMS)
+def test_a_search_that_time_cuts_off_in_a_batch_has_the_first_rows_of_a_whole_one(policy: str, domain: str) -> None:
+    def rows(late: int) -> list[tuple[float, int, float]]:
+        def evaluate(query: Query) -> Evaluation:
+            return worth(query.u, query.gradient, query.samples, DOMAINS[domain].gradient_cost)
+
+        found = search(
+            partial(map, evaluate),
+            DOMAINS[domain],
+            FORMS[policy],
+            steps=STEPS,
+            seed=0,
+            candidates=0,
+            late=lambda done: done >= late,
+        )
+        return [(one.objective, one.seed, one.step_size) for one in found.history]
+
+    whole = rows(STEPS)
+    for late in (1, 3, 7):
+        assert repr(rows(late)) == repr(whole[:late])
 
 
 @pytest.mark.parametrize("policy", ["cmaes", "halving", "nes", "random", "sobol", "portfolio of halvings"])
