@@ -35,7 +35,7 @@ from torch import Tensor
 
 from advsearch import seeds, threads
 from advsearch.api.attack import problem_from_config
-from advsearch.attacks import Query, make_policy, search
+from advsearch.attacks import Evaluation, Query, make_policy, search
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Transport
@@ -142,6 +142,11 @@ def _texture(args: argparse.Namespace) -> None:
         print(f"| {policy} | {renders} | {median:.2f} | {min(values):.2f} | {max(values):.2f} |", flush=True)
 
 
+def _evaluated(problem: Problem, transport: Transport | None, query: Query) -> Evaluation:
+    """Predicted where something predicts; the ranking is traced."""
+    return (transport if transport is not None and query.phase == "search" else problem).evaluate(query)
+
+
 def _transport(args: argparse.Namespace) -> None:
     problem = _problem(args, "texture")
     print("| pictures are | verified margin: lowest, quartiles, highest | processor's seconds, quartiles |")
@@ -151,10 +156,10 @@ def _transport(args: argparse.Namespace) -> None:
         for seed in range(args.seeds + 1):
             problem.seed = seeds.stream(7, "searches", seed)
             begun = time.process_time()
-            transport = Transport(problem, args.renders)
             predicted = name == "predicted"
+            evaluate = partial(_evaluated, problem, Transport(problem, args.renders) if predicted else None)
             found = search(
-                partial(map, transport.evaluate if predicted else problem.evaluate),
+                partial(map, evaluate),
                 replace(problem.domain, exact=predicted),
                 make_policy("auto"),
                 steps=args.renders,
