@@ -30,12 +30,12 @@ threads.configure()
 
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.controls import Space  # noqa: E402
-from advsearch.engine.budget import verification_ladder  # noqa: E402
 from advsearch.engine.loading import PictureSettings, as_controls, framed, load_scene  # noqa: E402
 from advsearch.engine.sweeps import swept_scene  # noqa: E402
 from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
 from advsearch.engine.sweeps.job import Job, NamedScene  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
+from advsearch.engine.verifier import ladder_of  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
@@ -162,7 +162,7 @@ def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
         sampler=config.sampler,
         batch=config.batch,
         trials=config.trials,
-        ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
+        ladder=ladder_of(config.pixel_sampler, config.verify_spp),
         command_line=config.command_line(),
         warnings=(),
     )

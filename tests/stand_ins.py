@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +14,18 @@ import torch
 from torch import Tensor
 
 from advsearch.api import attack as attacking
-from advsearch.api.attack import announced_of, budget_of, preparation_of
-from advsearch.attacks import Block, Domain, Evaluation, Policy, make_policy
+from advsearch.api.attack import answering_of, search_size
+from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
 from advsearch.cluster.executor import Done, InProcess, Work, Workforce
 from advsearch.config import AttackConfig
-from advsearch.engine.memory import Memory
-from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.journal import Journal
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Findings, Stages
+from advsearch.engine.sharing import Shared
 from advsearch.engine.stages import Attack
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
-from advsearch.seeds import stream
 from advsearch.tasks import Classification, Judgement
 
 
@@ -60,6 +60,7 @@ class StandInProblem:
     search_depth: int | None = None
     printable: bool = False
     seed: int = 3
+    steps: int = 0
     draws: int = 1
     plan: StandInPlan = StandInPlan()
 
@@ -68,25 +69,20 @@ class StandInProblem:
         value = 0.05 - (u - torch.linspace(0.3, 0.8, 6)).square().sum() + noise[0]
         return torch.stack([-value, value])
 
-    def evaluator(self, kind: str, tell: Any = None) -> Any:
-        def evaluate(u: Tensor, *, index: int, gradient: Any, samples: int = 1) -> Evaluation:
-            time.sleep(self.pause)
-            self.on_evaluation()
-            at = u.clone().requires_grad_()
-            logits = self._logits(at, stream(self.seed, kind, index))
-            value = logits[1] - logits[0]
-            slope = torch.autograd.grad(value, at)[0] if gradient else None
-            if tell is not None and tell.wants(index):
-                tell.tell(index, torch.full((2, 2, 3), float(u.mean())))
-            return Evaluation(
-                float(value.detach()), slope, bool(value > 0), cost=samples, judgement=judged(logits.detach())
-            )
-
-        return evaluate
-
-    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True, keep: object = None) -> Judgement:
+    def evaluate(self, query: Query) -> Evaluation:
         time.sleep(self.pause)
-        return judged(self._logits(u, seed))
+        if query.phase is None:
+            return Evaluation.of(judged(self._logits(query.u, query.seed)))
+        self.on_evaluation()
+        at = query.u.clone().requires_grad_()
+        logits = self._logits(at, query.seed)
+        value = logits[1] - logits[0]
+        slope = torch.autograd.grad(value, at)[0] if query.gradient else None
+        picture = torch.full((2, 2, 3), float(query.u.mean())) if query.keep else None
+        said = judged(logits.detach())
+        return Evaluation(
+            float(value.detach()), slope, bool(value > 0), cost=query.samples, judgement=said, picture=picture
+        )
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
         return {f"u.{number}": {"value": float(value), "unit": "1"} for number, value in enumerate(u)}
@@ -105,13 +101,13 @@ def attack_on(
     problem: Any,
     config: AttackConfig,
     policy: Policy[Any],
-    memory: Memory,
     stages: Stages,
     run: RunDirectory | None = None,
 ) -> Attack:
     """An attack as a configuration describes it, on a problem of one's own."""
-    recorder = Recorder(run, problem, memory)
-    return Attack(problem, budget_of(config, problem), policy, recorder, memory, stages, preparation_of(config))
+    journal = Journal(run, Shared(problem))
+    problem.steps, problem.draws = search_size(config, problem)
+    return Attack(journal, config, policy, stages)
 
 
 def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:
@@ -121,9 +117,8 @@ def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume:
     with open_run(folder) as run:
         if not resume:
             run.write_config(config)
-        memory = Memory(run)
         stages = Stages(NullProgress())
-        findings = attack_on(problem, config, make_policy(config.policy_name), memory, stages, run).carry_out()
+        findings = attack_on(problem, config, make_policy(config.policy_name), stages, run).carry_out()
         if not findings.interrupted:
             run.finish()
         return findings
@@ -165,6 +160,21 @@ class Impatient(NullProgress):
             raise KeyboardInterrupt
 
 
+def interrupted(patch: pytest.MonkeyPatch, after: int, phases: Sequence[str | None] = ("search",)) -> list[Query]:
+    """Press Ctrl-C after so many queries of these phases; returns those that were asked."""
+    original, asked = Problem.evaluate, list[Query]()
+
+    def evaluate(self: Problem, query: Query) -> Evaluation:
+        if query.phase in phases:
+            if len(asked) == after:
+                raise KeyboardInterrupt
+            asked.append(query)
+        return original(self, query)
+
+    patch.setattr(Problem, "evaluate", evaluate)
+    return asked
+
+
 @dataclass
 class StandInWorkers:
     """Carries everything out in another problem that it has made from the settings, as a worker does."""
@@ -174,20 +184,18 @@ class StandInWorkers:
     given: list[int] = field(default_factory=list)
     facts: Workforce | None = field(default_factory=lambda: Workforce(workers=2, most=2, busy=1.0, alive=2.0))
 
-    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
-        """The latest of those that are ready comes first, but for what waits for results."""
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
+        """The latest comes first."""
         assert given is not None
-        source, first = iter(ranges), len(self.given)
-        while ready := list(takewhile(lambda one: one is not None, source)):
-            for done in self.made.results(reversed(ready), given):
-                place = len(self.given) - first
-                self.given.append(done.numbers.start)
-                away = "it died" if first + place in self.lost else ""
-                yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
+        first = len(self.given)
+        for place, done in enumerate(self.made.results(reversed(list(ranges)), given)):
+            self.given.append(done.numbers.start)
+            away = "it died" if first + place in self.lost else ""
+            yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
 
 
 def shared(
-    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], call: Callable[[Any], Any] = announced_of, **more: Any
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], call: Callable[[Any], Any] = answering_of, **more: Any
 ) -> StandInWorkers:
     """Let stand-ins carry out a call wherever it is asked for of these settings; all else is done in this process."""
     ready = StandInWorkers(InProcess(call(settings)), **more)

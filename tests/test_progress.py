@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,11 @@ from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 from advsearch.api import carry_out as answered
 from advsearch.api.plan import plan_from_config
 from advsearch.api.sweep import sweep_from_config
-from advsearch.attacks import make_policy, region
+from advsearch.attacks import Evaluation, Query, make_policy, region
 from advsearch.attacks.sample_count import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.plan import answer as plan_text
 from advsearch.config import AttackConfig, PlanConfig, PrecisionConfig, RegionConfig, SweepConfig
-from advsearch.engine.memory import Memory
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
@@ -70,10 +70,10 @@ class Recorded:
 
 def attacked(config: AttackConfig, problem: Any = None) -> tuple[Recorded, Findings]:
     """An attack without the renderer, in memory."""
-    progress, memory = Recorded(), Memory(None)
+    progress = Recorded()
     problem = problem or StandInProblem()
     policy = make_policy(config.policy_name)
-    return progress, attack_on(problem, config, policy, memory, Stages(progress)).carry_out()
+    return progress, attack_on(problem, config, policy, Stages(progress)).carry_out()
 
 
 @pytest.mark.parametrize("policy", ["pgd", "auto", "random", "cmaes"])
@@ -147,10 +147,10 @@ def test_no_smallest_change_is_sought_where_no_change_is_needed() -> None:
 def test_samples_of_the_ladder_have_a_bound() -> None:
     spent = 0
 
-    def never_settles(spp: int, seed: int) -> float:
+    def never_settles(spp: int, seeds: Sequence[int]) -> list[float]:
         nonlocal spent
-        spent += spp
-        return float(torch.randn((), generator=torch.Generator().manual_seed(seed % 2**63)))
+        spent += spp * len(seeds)
+        return [float(torch.randn((), generator=torch.Generator().manual_seed(seed % 2**63))) for seed in seeds]
 
     count = choose_spp({"adversarial": never_settles, "clean": never_settles}, seed=0)
     assert not count.converged and spent <= most_samples(2) == 2 * 8 * 340
@@ -216,15 +216,16 @@ def test_a_resumed_run_takes_its_probes_from_the_store(tmp_path: Path, monkeypat
     config = configuration().model_copy(update={"verify_spp": None})
     whole = carry_out(tmp_path / "whole", config)
     rendered: list[tuple[int, bool]] = []
-    once = StandInProblem.trial
+    once = StandInProblem.evaluate
 
-    def trial(self: Any, u: torch.Tensor, seed: int, spp: int, *, drawn: bool = True, keep: Any = None) -> Any:
-        rendered.append((spp, drawn))
-        if len(rendered) == stop:
-            raise KeyboardInterrupt
-        return once(self, u, seed, spp, drawn=drawn)
+    def evaluate(self: Any, query: Query) -> Evaluation:
+        if query.phase is None:
+            rendered.append((query.spp, query.drawn))
+            if len(rendered) == stop:
+                raise KeyboardInterrupt
+        return once(self, query)
 
-    monkeypatch.setattr(StandInProblem, "trial", trial)
+    monkeypatch.setattr(StandInProblem, "evaluate", evaluate)
     stop = 4 + 10  # the first look, then in the middle of the probes
     assert carry_out(tmp_path / "run", config).interrupted
     stop, before = 0, len([one for one in rendered if not one[1]])

@@ -26,7 +26,6 @@ from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
 from advsearch.engine.attack_result import AttackParts, AttackResult
-from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.journal import Journal
 from advsearch.engine.loading import (
@@ -56,7 +55,7 @@ from advsearch.engine.naming import (
     several,
 )
 from advsearch.engine.objective import Wanted, objective_for, task_for
-from advsearch.engine.outcome import Question, summarise
+from advsearch.engine.outcome import summarise
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
@@ -507,7 +506,7 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
     )
     for name in asked_by(job.objective):
         problem.asked(problem.whole(problem.domain.start))(name)  # refuses what is not there
-    problem.draws = search_size(config, problem)[1]
+    problem.steps, problem.draws = search_size(config, problem)
     return problem
 
 
@@ -520,32 +519,6 @@ def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
     balls = any(block.norm != "box" for block in problem.domain.blocks)
     steps, draws = OVER_PREDICTED if predicted else OVER_RENDERED if balls else OVER_NUMBERS
     return config.steps or steps, config.draws or draws
-
-
-def budget_of(config: AttackConfig, problem: Problem) -> RenderBudget:
-    """Return what an attack may spend."""
-    return RenderBudget(
-        steps=search_size(config, problem)[0],
-        seconds=config.seconds,
-        close_looks=config.close_looks,
-        baseline=config.baseline,
-        smallest=config.smallest,
-        trials=config.trial_count,
-        ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
-        average=config.average,
-    )
-
-
-def preparation_of(config: AttackConfig) -> Preparation:
-    """Return what an attack measures before its search."""
-    return Preparation(config.measure, config.specialise, config.deterministic, config.spp is None)
-
-
-def _question(job: _Job) -> Question:
-    """What the summary repeats of the settings."""
-    config, objective = job.config, job.objective
-    named = objective if isinstance(objective, str) else config.objective
-    return Question(config.object, config.policy_name, named, config.command_line())
 
 
 # ---- carrying it out ------------------------------------------------------------------------------------------------
@@ -568,14 +541,14 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
             check_made_of(kept, [job.loaded[0]], {**functions, **objective, "task": function_of(job.task)})
         with executor_for(job.config, "advsearch.api.attack:answering_of", progress) as executor:
             journal = Journal(kept, Shared(problem, executor))
-            budget = budget_of(job.config, problem)
             if problem.conditions is not None and None in (job.config.steps, job.config.draws):
                 progress.message(
-                    f"One answer for many conditions: {count(budget.steps, 'step')}, each over "
+                    f"One answer for many conditions: {count(problem.steps, 'step')}, each over "
                     f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
                 )
-            findings = Attack(journal, budget, policy, stages, preparation_of(job.config), clean=job.clean).carry_out()
-        found = summarise(_question(job), findings, journal, stages, warnings)
+            findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
+        named = job.objective if isinstance(job.objective, str) else job.config.objective
+        found = summarise(job.config, named, findings, journal, stages, warnings)
         parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
         return replace(found, parts=lambda: parts)
 

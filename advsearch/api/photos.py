@@ -22,6 +22,7 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
 from advsearch.engine.answers import facts_of
 from advsearch.engine.loading import PictureSettings, load_scene
+from advsearch.engine.metrics import judgements
 from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.rows import judged
 from advsearch.engine.sweeps.batch import Batches
@@ -196,7 +197,8 @@ class _PhotoJudge:
         pixels = torch.from_numpy(np.asarray(small, dtype=np.float32) / np.float32(255.0))
         truth = self.truth(rendering, name)
         with torch.no_grad():
-            return self.task.judge(self.model(pixels), truth)[0]
+            (said,) = judgements(self.task, self.model(pixels), pixels[None], [truth])
+        return said
 
 
 def _judges_of(run: Path) -> Sequence[_PhotoJudge]:

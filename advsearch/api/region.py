@@ -15,14 +15,13 @@ from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import RegionKeywords, asks, configured
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
-from advsearch.engine.budget import RenderBudget, verification_ladder
 from advsearch.engine.journal import Journal
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
 from advsearch.engine.sharing import Shared
-from advsearch.engine.verifier import Verifier
+from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
@@ -100,8 +99,7 @@ def region_from_config(
     varied = _varied(problem, config)
     centre = _centre(problem, config)
     with RunDirectory.of(config, resumed) as run:
-        spent = RenderBudget(ladder=verification_ladder(config.pixel_sampler, config.verify_spp))
-        verifier = Verifier(Journal(run, Shared(problem)), spent, stages)
+        verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config.pixel_sampler, config.verify_spp), stages)
         try:
             with interruptible():
                 answer, ending = _answer(verifier, config, varied, centre, run), "done"

@@ -18,7 +18,6 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
 from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.budget import verification_ladder
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, only_here, settings_of
 from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
@@ -40,6 +39,7 @@ from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
 from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
+from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -322,7 +322,7 @@ def _job(
         sampler=config.sampler,
         batch=config.batch,
         trials=config.trials,
-        ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
+        ladder=ladder_of(config.pixel_sampler, config.verify_spp),
         command_line=config.command_line(),
         warnings=tuple(dict.fromkeys(warnings)),
         keep_pictures=config.keep_pictures,

@@ -309,7 +309,9 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
                 return Ending.NON_FINITE
             if over := late(len(log.records)):
                 break
-        if log.renders < steps:
+        if log.renders >= steps:  # nothing comes of the last one
+            told.pop()
+        if told:
             state = policy.update(state, told)
             log.answer, log.counts = partial(policy.answer, state), partial(policy.counts, state)
             log.failures = partial(policy.failures, state)

@@ -4,8 +4,8 @@ Evaluations draw conditions from the bank. It begins with few and grows with eac
 for `GROWTH` that it draws; what is new is looked at at once. The second half is for learning what there is. Every
 `EVERY` evaluations the present configuration is traced under conditions that no matrix was made for: where these are
 not clearly better for the model than those in the bank, the bank does not grow until the next comparison. The oldest
-matrices make room where there is no memory. All of that follows from the seed and from the comparisons after which the
-bank grew, so that a run that goes on makes the same matrices again.
+matrices make room where there is no memory. All of that follows from the seed, so that a run that goes on makes the
+same matrices and comparisons again.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -83,9 +83,7 @@ class Bank(Predictor):
         problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
         answers: what is asked for light, as far as the next comparison.
-        grown: the comparisons, by index of the evaluation, after which the bank went on growing; may be filled before a
-            search that goes on.
-        keep: told of `grown` whenever there is another one.
+        grown: the comparisons, by index of the evaluation, after which the bank went on growing.
         gaps: by how much the objective was larger in the bank than under unseen conditions, by comparison.
     """
 
@@ -93,7 +91,6 @@ class Bank(Predictor):
     steps: int
     answers: Evaluate
     grown: list[int] = field(default_factory=list)
-    keep: Callable[[list[int]], None] = lambda grown: None
     deviations: list[Deviation] = field(default_factory=list)
     gaps: list[float] = field(default_factory=list)
     seconds: float = 0.0
@@ -132,18 +129,15 @@ class Bank(Predictor):
     def passed(self, query: Query) -> None:
         if query.kind == "search" and query.phase == "search":
             self._last = query.number
-            if query.number in self.grown:
-                self._places[query.number] = query.u.detach().clone()
+            if query.number and query.number % EVERY == 0:
+                self._fill(query.number - 1)
+                self._compare(query.u, query.number)
 
     def evaluate(self, query: Query) -> Evaluation:
-        kind, number, u = query.kind, query.number, query.u
-        if kind == "search":
-            self._last = number
-            if number and number % EVERY == 0:
-                self._compare(u, number)
+        self.passed(query)
         self._fill(self._last)
-        answer = self._evaluated(self._drawn(kind, number), u, query.gradient)
-        return replace(answer, picture=to_8_bit(self._picture(u))) if query.keep else answer
+        answer = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
+        return replace(answer, picture=to_8_bit(self._picture(query.u))) if query.keep else answer
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 
@@ -243,9 +237,6 @@ class Bank(Predictor):
 
     def _compare(self, u: Tensor, index: int) -> None:
         """Look at unseen conditions, and let the bank grow while they are clearly better for the model."""
-        if index in self.grown:  # in an earlier life, which ended before this evaluation did
-            self._places[index] = u.detach().clone()
-            return
         problem, begun = self.problem, time.perf_counter()
         noise = seeds.stream(problem.seed, "bank check", index)
         draws = [seeds.stream(noise, "draw", number) for number in range(UNSEEN)]
@@ -263,5 +254,4 @@ class Bank(Predictor):
         if self.gaps[-1] > SURE * error:
             self._places[index] = u.detach().clone()
             self.grown.append(index)
-            self.keep(self.grown)
         self.seconds += time.perf_counter() - begun

@@ -41,7 +41,7 @@ def check_failures(verifier: Verifier, found: SearchResult) -> None:
         return
     fewest = rule.fewest
     whole = rule.control and not all(trial.right for trial in findings.clean[:fewest])
-    trials = verifier.budget.trials if whole else fewest
+    trials = verifier.count if whole else fewest
     tried = known.listed[:TRIED]
     verifier.begin("checking different failures with fresh renders", len(tried) * trials, at_most=True)
     checked = []

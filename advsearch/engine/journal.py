@@ -33,9 +33,6 @@ from advsearch.scene.formation import levels_of
 PLAN = "gradient plan"
 """The note under which the store keeps how derivatives are obtained."""
 
-TRANSPORT = "transport"
-"""That under which it keeps at which evaluations the matrix of light transport was made anew."""
-
 
 @dataclass
 class Journal:

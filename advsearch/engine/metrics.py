@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from advsearch.errors import InputError
 from advsearch.options import check_takes
 from advsearch.registry import check_import, current_directory_importable
 from advsearch.runs.export import AFTER, OWN
-from advsearch.tasks import Judgement
+from advsearch.tasks import Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean
 
 Metric = Callable[[Tensor, Any, Any], Any]
@@ -113,6 +114,31 @@ def _imported(name: str, text: str) -> Metric:
         raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {found!r:.80}")
     metric: Metric = found
     return metric
+
+
+def judgements(
+    task: Task, output: Output, pictures: Tensor, truths: Sequence[Truth], metrics: Metrics = MappingProxyType({})
+) -> list[Judgement]:
+    """Return what a task and metrics say of pictures: the one place where a run judges.
+
+    Args:
+        task: on its model.
+        output: of the model.
+        pictures: (N, H, W, 3) sRGB in [0, 1].
+        truths: one of each picture, or one for all.
+        metrics: by name.
+
+    Raises:
+        InputError: a metric returns something else than numbers.
+    """
+    with torch.no_grad():
+        if len(truths) == 1:
+            said, truths = task.judge(output, truths[0]), [truths[0]] * len(pictures)
+        else:
+            said = [task.judge(output[k : k + 1], truth)[0] for k, truth in enumerate(truths)]
+    if not metrics:
+        return said
+    return [measured(said[k], metrics, pictures[k], output[k : k + 1], truth) for k, truth in enumerate(truths)]
 
 
 def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth) -> Judgement:

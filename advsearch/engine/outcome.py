@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from torch import Tensor
@@ -13,6 +12,7 @@ from torch import Tensor
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
+from advsearch.config import AttackConfig
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.domains import domain_of
 from advsearch.engine.failures import described_failures, write_failures
@@ -64,27 +64,24 @@ MOST_NUMBERS = 4096
 """Numbers of a distribution that a summary names, at most."""
 
 
-@dataclass(frozen=True)
-class Question:
-    """What was asked, in the words of whoever asked it, as the summary repeats them.
-
-    Attributes:
-        object: its name or file.
-        policy: its name.
-        objective: its name; None for the task's own.
-        command_line: the command that asks the same again.
-    """
-
-    object: str
-    policy: str
-    objective: str | None
-    command_line: str
-
-
 def summarise(
-    asked: Question, findings: Findings, journal: Journal, stages: Stages, warnings: Sequence[str]
+    config: AttackConfig,
+    objective: str | None,
+    findings: Findings,
+    journal: Journal,
+    stages: Stages,
+    warnings: Sequence[str],
 ) -> AttackResult:
-    """Put the result together and, if there is a run directory, write its files."""
+    """Put the result together and, if there is a run directory, write its files.
+
+    Args:
+        config: the settings.
+        objective: its name; None for the task's own.
+        findings: of the attack.
+        journal: of the run.
+        stages: how long each took.
+        warnings: on the way.
+    """
     problem, search = journal.problem, findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
@@ -103,7 +100,7 @@ def summarise(
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         write_answer(run.path, u.numpy())
-    summary = _summary(asked, problem, findings, clean, adversarial)
+    summary = _summary(config, objective, problem, findings, clean, adversarial)
     kept = {"run": None if run is None else str(run.path), "warnings": warnings}
     shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
     summary = summary.model_copy(
@@ -130,7 +127,12 @@ def summarise(
 
 
 def _summary(
-    asked: Question, problem: Problem, findings: Findings, clean: KeptPicture, adversarial: KeptPicture
+    config: AttackConfig,
+    objective: str | None,
+    problem: Problem,
+    findings: Findings,
+    clean: KeptPicture,
+    adversarial: KeptPicture,
 ) -> AttackSummary:
     """All but where it is kept, how long it took and what there is to say."""
     task, search, baseline = problem.task, findings.search, findings.baseline
@@ -140,13 +142,13 @@ def _summary(
     count = findings.sample_count
     return AttackSummary(
         run=None,
-        object=asked.object,
+        object=config.object,
         model=problem.model.name,
         task=task.title,
         environment=problem.environment,
         controls=list(budgets),
-        policy=asked.policy,
-        objective=asked.objective or task.objective,
+        policy=config.policy_name,
+        objective=objective or task.objective,
         epsilon=_alone({name: budget.epsilon for name, budget in budgets.items()}),
         norm=_alone({name: budget.norm for name, budget in budgets.items()}),
         label_set=list(task.truth_names(problem.truth())),
@@ -202,7 +204,7 @@ def _summary(
         warnings=[],
         seconds={"total": 0.0},
         seed=problem.seed,
-        command_line=asked.command_line,
+        command_line=config.command_line(),
     )
 
 

@@ -20,7 +20,7 @@ from advsearch.described import Value
 from advsearch.engine.answers import Described, Looked
 from advsearch.engine.asked import Asked
 from advsearch.engine.domains import domain_of
-from advsearch.engine.metrics import Metrics, mean_metrics, measured
+from advsearch.engine.metrics import Metrics, judgements, mean_metrics
 from advsearch.models import Model
 from advsearch.runs.results.plan import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
@@ -69,6 +69,7 @@ class Problem:
         seed: root of every stream.
         searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
             their whole range for every picture.
+        steps: renders of a search.
         draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
@@ -88,6 +89,7 @@ class Problem:
     spp: int
     seed: int
     searched: int | None = None
+    steps: int = 0
     draws: int = 1
     search_depth: int | None = None
     printable: bool = False
@@ -183,8 +185,8 @@ class Problem:
         with torch.no_grad():
             output, truth = self.model(picture), self.truth(whole)
             objective = float(self.objective(output, picture[None], truth, self.asked(whole))[0])
-            judgement = replace(self.task.judge(output, truth)[0], objective=objective)
-            return measured(judgement, self.metrics, picture, output, truth)
+            (said,) = judgements(self.task, output, picture[None], [truth], self.metrics)
+            return replace(said, objective=objective)
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
         """Return what shows the model's answer to a picture (H, W, 3) of the whole space at `whole`."""
@@ -302,8 +304,7 @@ class Problem:
                 with torch.no_grad():
                     value = loss(renderer(whole, seed=seed, spp=spp))
         image, output = seen[0]
-        with torch.no_grad():
-            judgement = measured(self.task.judge(output, truth)[0], self.metrics, image, output, truth)
+        (judgement,) = judgements(self.task, output, image[None], [truth], self.metrics)
         evaluation = Evaluation(
             objective=float(value),
             gradient=derivative,
@@ -343,11 +344,7 @@ class Problem:
             else:
                 values = self.objective(outputs, pictures, truths[0], self.asked(*places))
             derivative = torch.autograd.grad(values.sum(), at)[0] if values.requires_grad else None
-        with torch.no_grad():
-            said = [
-                measured(self.task.judge(output, truth)[0], self.metrics, picture, output, truth)
-                for output, truth, picture in zip(each, truths, pictures, strict=True)
-            ]
+        said = judgements(self.task, outputs, pictures, truths, self.metrics)
         evaluations = [
             Evaluation(float(value), None, judgement.success, judgement=judgement)
             for value, judgement in zip(values.detach(), said, strict=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -22,9 +21,9 @@ from advsearch.attacks import (
     search,
 )
 from advsearch.attacks.evaluation import Query
+from advsearch.config import AttackConfig
 from advsearch.engine.bank import Bank
-from advsearch.engine.budget import RenderBudget
-from advsearch.engine.journal import TRANSPORT, Journal
+from advsearch.engine.journal import Journal
 from advsearch.engine.print_terms import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
@@ -45,20 +44,18 @@ class Searches:
 
     Attributes:
         journal: of the run.
-        budget: how many evaluations.
+        config: how long it searches, and what for.
         policy: what proposes.
         stages: told which stage runs.
         findings: gets the searches, their pictures and what predicts them.
-        specialise: whether pictures may be predicted.
         clean: the matrix that other attacks share.
     """
 
     journal: Journal
-    budget: RenderBudget
+    config: AttackConfig
     policy: Policy[Any]
     stages: Stages
     findings: Findings
-    specialise: bool
     clean: CleanMatrix
 
     @property
@@ -68,15 +65,14 @@ class Searches:
 
     def collect_transport(self) -> None:
         """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
-        problem, steps, findings = self.problem, self.budget.steps, self.findings
-        self._renders_because(reason_against(problem, steps, self.specialise) or "")
+        problem, steps, findings = self.problem, self.problem.steps, self.findings
+        self._renders_because(reason_against(problem, steps, self.config.specialise) or "")
         if findings.rendered_because:
             return
-        stored, keep = self.journal.note(TRANSPORT), partial(self.journal.set_note, TRANSPORT)
         if problem.conditions is None:
-            findings.transport = Transport(problem, steps, renewals=stored or {}, keep=keep, clean=self.clean)
+            findings.transport = Transport(problem, steps, clean=self.clean)
         else:
-            findings.transport = Bank(problem, steps, self.journal.traced, grown=stored or [], keep=keep)
+            findings.transport = Bank(problem, steps, self.journal.traced)
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
         self.stages.begin("transport", "collecting light transport", findings.transport.samples, hint=hint)
         try:
@@ -93,17 +89,16 @@ class Searches:
 
     def run(self) -> None:
         """The search, the same without print terms where it has them, and the random one, each with as many renders."""
-        budget, findings, seed = self.budget, self.findings, self.problem.seed
-        self.begin("search", f"searching with {self.policy.name}", budget.steps, "`steps` or `seconds` shorten it")
-        findings.search = self.search(
-            "search", self.policy, budget.steps, self.problem.seed, findings.frames, budget.seconds
-        )
-        steps = budget.steps if budget.seconds is None else _spent(findings.search)
+        config, findings, steps = self.config, self.findings, self.problem.steps
+        self.begin("search", f"searching with {self.policy.name}", steps, "`steps` or `seconds` shorten it")
+        seed, frames = self.problem.seed, findings.frames
+        findings.search = self.search("search", self.policy, steps, seed, frames, config.seconds)
+        steps = steps if config.seconds is None else _spent(findings.search)
         if self.problem.printable:
             title = "searching without print terms, to see what they cost"
             self.begin("without print terms", title, steps, "`printable=false` leaves both out")
             findings.unprinted = self.search(UNPRINTED, self.policy, steps, seed)
-        if not budget.baseline or self.policy.name == "random":
+        if not config.baseline or self.policy.name == "random":
             return
         self.begin("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
         findings.baseline = self.search("baseline", make_policy("random"), steps, seeds.stream(seed, "baseline"))
@@ -150,7 +145,7 @@ class Searches:
             steps=steps,
             seed=seed,
             candidates=4 if ranked else 0,
-            close=self.budget.close_looks,
+            close=self.config.close_looks,
             late=self.journal.clock(kind, seconds),
             on_step=on_step,
             kind=kind,
@@ -173,7 +168,7 @@ class Searches:
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
         """Begin the stage of a search of at most so many steps, and its ranking."""
-        renders = planned_renders(steps, close=self.budget.close_looks)
+        renders = planned_renders(steps, close=self.config.close_looks)
         hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
         if self.findings.transport is not None:
             hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"

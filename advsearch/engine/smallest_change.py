@@ -23,25 +23,25 @@ def find_smallest(searches: Searches, verifier: Verifier) -> None:
     On the way the fewest trials that can verify anything are enough where none fails. The upper end is tried again in
     full, and what is verified at the end is the configuration there.
     """
-    problem, budget, findings = searches.problem, searches.budget, searches.findings
+    problem, findings, trials = searches.problem, searches.findings, verifier.count
     results: list[SearchResult] = []
     transport = findings.transport if isinstance(findings.transport, Transport) else None
 
     def found(inside: Domain, number: int) -> Tensor:
         searches.begin(
-            "search", f"search {number + 1} of at most {ROUNDS}", budget.steps, "`steps` shortens each search"
+            "search", f"search {number + 1} of at most {ROUNDS}", problem.steps, "`steps` shortens each search"
         )
         kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
         ranked = transport is None  # what is predicted has no noise
-        results.append(searches.search(kind, searches.policy, budget.steps, seed, domain=inside, ranked=ranked))
+        results.append(searches.search(kind, searches.policy, problem.steps, seed, domain=inside, ranked=ranked))
         findings.search = findings.search or results[0]  # the answer if this is interrupted
-        verifier.begin("trying smaller changes", MOST_CHECKS * budget.trials, at_most=True)
+        verifier.begin("trying smaller changes", MOST_CHECKS * trials, at_most=True)
         return results[-1].best_u
 
-    def passes(u: Tensor, check: int, few: int = budget.trials) -> bool:
+    def passes(u: Tensor, check: int, few: int = trials) -> bool:
         """Whether all trials together pass; so `few` do without a failure."""
-        allowed, scores, failures = problem.rule.allowed(budget.trials), list[float](), 0
-        while len(scores) < budget.trials and failures <= allowed and (failures or len(scores) < few):
+        allowed, scores, failures = problem.rule.allowed(trials), list[float](), 0
+        while len(scores) < trials and failures <= allowed and (failures or len(scores) < few):
             (trial,) = verifier.trials(f"check {check}", {len(scores): u})
             scores.append(trial.score)
             failures += not trial.success
@@ -54,10 +54,10 @@ def find_smallest(searches: Searches, verifier: Verifier) -> None:
     def seems(u: Tensor, check: int) -> bool:
         return passes(u, check, problem.rule.fewest)
 
-    times = -(-CONFIRMED // budget.trials)
+    times = -(-CONFIRMED // trials)
     bracket = smallest(found, seems, problem.domain, likely=None if transport is None else transport.likely)
     if bracket.u is not None:
-        most = ATTEMPTS * times * budget.trials
+        most = ATTEMPTS * times * trials
         verifier.begin("checking the smallest change", most, at_most=True)
     bracket = confirmed(bracket, passes, problem.domain, times=times)
     renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)

@@ -13,8 +13,8 @@ from advsearch import seeds
 from advsearch.attacks import Ending, Evaluation, Policy, SearchResult, Verification, count_right, run_trials
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.smallest import scaled
+from advsearch.config import AttackConfig
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
-from advsearch.engine.budget import Preparation, RenderBudget
 from advsearch.engine.failures import check_failures
 from advsearch.engine.going_on import finite, same
 from advsearch.engine.gradients import inside
@@ -24,7 +24,7 @@ from advsearch.engine.record import Findings, Stages
 from advsearch.engine.searches import Searches
 from advsearch.engine.smallest_change import find_smallest
 from advsearch.engine.transport import CleanMatrix, reason_against
-from advsearch.engine.verifier import Verifier
+from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
 from advsearch.tasks import Judgement
@@ -42,45 +42,44 @@ class Attack:
 
     Attributes:
         journal: of the run; its problem is what is attacked.
-        budget: what it may spend.
+        config: its settings.
         policy: what proposes.
         stages: told which stage runs.
-        preparation: what is measured before.
         findings: filled by `carry_out`.
         clean: the matrix of light transport that attacks with other budgets share.
     """
 
     journal: Journal
-    budget: RenderBudget
+    config: AttackConfig
     policy: Policy[Any]
     stages: Stages
-    preparation: Preparation = field(default_factory=Preparation)
     findings: Findings = field(default_factory=Findings)
     clean: CleanMatrix = field(default_factory=CleanMatrix)
 
     def __post_init__(self) -> None:
         self.problem = self.journal.problem
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
-        self._verifier = Verifier(self.journal, self.budget, self.stages, self.findings)
-        kept = (self.stages, self.findings, self.preparation.specialise, self.clean)
-        self._searches = Searches(self.journal, self.budget, self.policy, *kept)
+        ladder = ladder_of(self.config.pixel_sampler, self.config.verify_spp)
+        self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, self.config.trial_count)
+        kept = (self.stages, self.findings, self.clean)
+        self._searches = Searches(self.journal, self.config, self.policy, *kept)
 
     def carry_out(self) -> Findings:
         """Do everything; what an interrupt leaves undone is missing from the findings."""
-        if self.budget.smallest:
+        if self.config.smallest:
             scaled(self.problem.domain, 1.0)  # refuses what has no budget before anything is rendered
         try:
             with interruptible():
                 self.plan()
                 if self.worth_attacking():
                     self._searches.collect_transport()
-                    if self.budget.smallest:
+                    if self.config.smallest:
                         find_smallest(self._searches, self._verifier)
                     else:
                         self._searches.run()
                     self.verify()
-                if self.budget.average:
-                    self._verifier.average()
+                if self.config.average:
+                    self._verifier.average(self.config.average)
         except KeyboardInterrupt:
             self.findings.interrupted = True
         self.stages.end()
@@ -102,8 +101,8 @@ class Attack:
 
     def _cut_paths(self) -> None:
         """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
-        problem, wanted = self.problem, self.preparation
-        if wanted.specialise and (wanted.measure == "full" or self.budget.steps >= WORTH):
+        problem, config = self.problem, self.config
+        if config.specialise and (config.measure == "full" or problem.steps >= WORTH):
             self.stages.begin(
                 "setup",
                 "finding how many bounces of light the search needs",
@@ -115,11 +114,11 @@ class Attack:
 
     def _measure(self) -> None:
         """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
-        problem, wanted = self.problem, self.preparation
-        full = wanted.measure == "full"
-        if wanted.measure == "no" or not self.policy.uses_gradient:
+        problem, config = self.problem, self.config
+        full = config.measure == "full"
+        if config.measure == "no" or not self.policy.uses_gradient:
             return
-        if not full and reason_against(problem, self.budget.steps, wanted.specialise) is None:
+        if not full and reason_against(problem, problem.steps, config.specialise) is None:
             return  # derivatives will come from what predicts the pictures
         renderer = problem.renderer
         u, seed = inside(renderer), seeds.stream(problem.seed, "measure")
@@ -138,7 +137,7 @@ class Attack:
             seed=seed,
             spp=problem.spp,
             every=full,
-            counted=not full or wanted.counted,
+            counted=not full or config.deterministic,
             tick=self._advance,
         )
         if full:
@@ -152,12 +151,12 @@ class Attack:
             table = list(cosines(renderer, problem.loss, u, seed=seed, tick=self._advance))
             plan, spp = tuned(problem.plan, table)
             problem.plan = plan
-            problem.spp = spp if wanted.chosen_spp and spp is not None else problem.spp
+            problem.spp = spp if config.spp is None and spp is not None else problem.spp
 
     def worth_attacking(self) -> bool:
         """Look at the clean configuration; one that is wrong in every look goes through the full trials at once, as
-        does one whose smallest change is wanted."""
-        problem, budget, findings = self.problem, self.budget, self.findings
+        does one whose smallest change is config."""
+        problem, config, findings = self.problem, self.config, self.findings
         seed, start = seeds.stream(problem.seed, "first look"), problem.domain.start
         self.stages.begin(
             "setup", "looking at the clean scene", FIRST_LOOK, hint="the first picture compiles the renderer's code"
@@ -172,10 +171,10 @@ class Attack:
         findings.first_look = run_trials(partial(map, look), start, spp=spp, seed=seed, trials=FIRST_LOOK)
         self._check_look(start)
         looks_right = any(trial.right for trial in findings.first_look)
-        if not self.problem.rule.control or (looks_right and not budget.smallest):
+        if not self.problem.rule.control or (looks_right and not config.smallest):
             return True
         self._verifier.choose_spp({"clean": start})
-        self._verifier.begin("checking the clean scene with fresh renders", budget.trials)
+        self._verifier.begin("checking the clean scene with fresh renders", config.trial_count)
         self._verifier.try_clean()
         return not self.problem.rule.already_wrong(count_right(findings.clean, findings.spp))
 
@@ -216,10 +215,10 @@ class Attack:
         if found is None:
             raise RuntimeError("nothing was searched, so there is nothing to verify")
         answer = problem.domain.project(found.best_u)
-        if not self.budget.smallest or findings.sample_count is None:
+        if not self.config.smallest or findings.sample_count is None:
             self._verifier.choose_spp({"adversarial": answer, "clean": problem.domain.start})
         groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
-        self._verifier.begin("checking the answer with fresh renders", groups * self.budget.trials, at_most=True)
+        self._verifier.begin("checking the answer with fresh renders", groups * self.config.trial_count, at_most=True)
         self._verifier.try_clean()
         findings.verification = self._verifier.verified("verification", found)
         if findings.verification.ending is Ending.ALREADY_WRONG:
@@ -232,7 +231,7 @@ class Attack:
                 "baseline verification", baseline, curtailed=decided
             )
             self._take_the_worse(found, baseline)
-        if not self.budget.smallest:
+        if not self.config.smallest:
             check_failures(self._verifier, found)
 
     def _take_the_worse(self, found: SearchResult, baseline: SearchResult) -> None:

@@ -183,13 +183,11 @@ class ExpansionPoint:
 
     Attributes:
         u: the configuration.
-        index: of the evaluation there.
-        renderer: None until it is needed, where a run goes on.
+        renderer: the matrix.
     """
 
     u: Tensor
-    index: int
-    renderer: PredictingRenderer | None = None
+    renderer: PredictingRenderer
 
 
 @dataclass
@@ -211,9 +209,8 @@ class Transport(Predictor):
         problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
         renewals: by kind of search, the evaluations at which the matrix was made anew, or, where there is none that
-            could be, from which on pictures are traced; may be filled before a search that goes on.
+            could be, from which on pictures are traced.
         deviations: what the comparisons found, in order.
-        keep: told of `renewals` whenever there is another one.
         clean: where every search begins; made here if it is not there yet.
         seconds: spent on making matrices and on comparing.
     """
@@ -221,7 +218,6 @@ class Transport(Predictor):
     problem: Problem
     steps: int
     renewals: dict[str, list[int]] = field(default_factory=dict)
-    keep: Callable[[dict[str, list[int]]], None] = lambda renewals: None
     clean: CleanMatrix = field(default_factory=CleanMatrix)
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
@@ -279,7 +275,7 @@ class Transport(Predictor):
     @property
     def start(self) -> PredictingRenderer:
         """Where every search begins."""
-        return self._ready(self._begin, "start")[1]
+        return self._begin.renderer
 
     @property
     def _begin(self) -> ExpansionPoint:
@@ -289,12 +285,11 @@ class Transport(Predictor):
         return self._start
 
     def passed(self, query: Query) -> None:
-        if query.phase == "search" and query.number in self.renewals.get(query.kind, ()):
-            self._present[query.kind] = ExpansionPoint(query.u.detach().clone(), query.number)
+        if query.phase == "search":
+            self._compared(query)
 
     def evaluate(self, query: Query) -> Evaluation:
-        kind, number = query.kind, query.number
-        renderer = self._compared(kind, number, query.u) if number < self._end(kind) else None
+        renderer = self._compared(query)
         if renderer is None:
             return self.problem.evaluate(query)
         return self.problem.evaluated(query, query.u, query.seed, renderer)[0]
@@ -315,31 +310,28 @@ class Transport(Predictor):
         with torch.no_grad():
             return self.problem.judge(to_8_bit(self.start(u)), u).score
 
-    def _compared(self, kind: str, index: int, u: Tensor) -> PredictingRenderer | None:
-        """The matrix to predict this evaluation with, compared and made anew where that is due; None gives up."""
-        present, renderer = self._ready(self._present.get(kind, self._begin), kind)
-        if index and index % EVERY == 0 and kind.startswith("search"):
-            found = self.deviation(renderer, present.u, u, index)
+    def _compared(self, query: Query) -> PredictingRenderer | None:
+        """The matrix to predict an evaluation with, compared and made anew where that is due; None gives up."""
+        kind, number = query.kind, query.number
+        if number >= self._end(kind):
+            return None
+        place = self._present.setdefault(kind, self._begin)
+        if number and number % EVERY == 0 and kind.startswith("search"):
+            found = self.deviation(place.renderer, place.u, query.u, number)
             self.deviations.append(found)
             if found.levels > found.most:
-                present = self._made(u, kind, index) if self._renewable else present
-                if index not in self.renewals.setdefault(kind, []):  # else in an earlier life of the run
-                    self.renewals[kind].append(index)
-                    self.keep(self.renewals)
-        self._present[kind], renderer = self._ready(present, kind)
-        return renderer if index < self._end(kind) else None
+                self.renewals.setdefault(kind, []).append(number)
+                if not self._renewable:
+                    return None
+                place = self._present[kind] = self._made(query.u, kind, number)
+        return place.renderer
 
-    def _ready(self, place: ExpansionPoint, kind: str) -> tuple[ExpansionPoint, PredictingRenderer]:
-        made = place if place.renderer is not None else self._made(place.u, kind, place.index)
-        assert made.renderer is not None
-        return made, made.renderer
-
-    def _made(self, u: Tensor, kind: str, index: int, tick: Tick = lambda samples: None) -> ExpansionPoint:
+    def _made(self, u: Tensor, kind: str, number: int, tick: Tick = lambda samples: None) -> ExpansionPoint:
         begun = time.perf_counter()
-        seed = seeds.stream(self.problem.seed, f"transport {kind}", index)
+        seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
         made = predicting(self.problem.renderer, u, seed, tick)
         self.seconds += time.perf_counter() - begun
-        return ExpansionPoint(u.detach().clone(), index, made)
+        return ExpansionPoint(u.detach().clone(), made)
 
     def deviation(self, linear: PredictingRenderer, at: Tensor, u: Tensor, index: int) -> Deviation:
         """Compare what a prediction says of the change since its matrix was made at `at` with what traced pictures

@@ -12,16 +12,22 @@ from advsearch import seeds
 from advsearch.attacks import Evaluation, SearchResult, Verification, choose_spp, run_trials, verify
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.product import batches
-from advsearch.attacks.sample_count import most_samples
-from advsearch.engine.budget import RenderBudget
+from advsearch.attacks.sample_count import LADDER, most_samples
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages
-from advsearch.report.wording import count
+from advsearch.report.wording import count as plural
+from advsearch.scene.formation import next_count
 from advsearch.tasks import Judgement
 
 MANY = 64
 """Of a configuration with more numbers than this, a trial's row does not hold the values."""
+
+
+def ladder_of(sampler: str, asked: int | None) -> Sequence[int]:
+    """Return the samples a pixel that a verification climbs, as a sampler has them; the only count, if one was asked
+    for."""
+    return LADDER if asked is None else (next_count(sampler, asked),)
 
 
 @dataclass
@@ -30,15 +36,17 @@ class Verifier:
 
     Attributes:
         journal: of the run.
-        budget: how many trials, and the sample counts to choose from.
+        ladder: samples a pixel to choose from; a single count is taken as it is.
         stages: told which stage runs.
         findings: gets the sample count, the control group's trials, pictures and the count of renders.
+        count: trials of each group.
     """
 
     journal: Journal
-    budget: RenderBudget
+    ladder: Sequence[int]
     stages: Stages
     findings: Findings = field(default_factory=Findings)
+    count: int = 0
     _clean_spp: int = 0
     _asked: set[tuple[str, int]] = field(default_factory=set)
 
@@ -60,7 +68,7 @@ class Verifier:
     def choose_spp(self, candidates: dict[str, Tensor]) -> None:
         """Raise the samples until no margin drifts, under the conditions that the scene comes with."""
 
-        ladder = self.budget.ladder
+        ladder = self.ladder
         if len(ladder) > 1:
             self.stages.begin(
                 "verification",
@@ -104,7 +112,7 @@ class Verifier:
             self.problem.domain.start,
             spp=self.findings.spp,
             seed=self.problem.seed,
-            trials=self.budget.trials,
+            trials=self.count,
             kind="first control" if self.findings.search is None else "control",
             keep=KEPT,
         )
@@ -119,7 +127,7 @@ class Verifier:
     ) -> Verification:
         """Verify one search's answer against the control group, by as many trials if no other number is given;
         `curtailed` where only the verdict matters."""
-        trials = self.budget.trials if trials is None else trials
+        trials = self.count if trials is None else trials
         return verify(
             self.answers,
             self.problem.domain,
@@ -152,13 +160,13 @@ class Verifier:
         for answer in self.answers(queries):
             yield answer.said
 
-    def average(self) -> None:
+    def average(self, count: int) -> None:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
         problem, found = self.problem, list[Judgement]()
         if self.findings.sample_count is None:
             self.choose_spp({"clean": problem.domain.start})
-        self.begin("trying random configurations", self.budget.average, name="average", flags="`average`")
-        for numbers in batches(0, self.budget.average, most_at_once(problem.domain.dim)):
+        self.begin("trying random configurations", count, name="average", flags="`average`")
+        for numbers in batches(0, count, most_at_once(problem.domain.dim)):
             generators = [torch.Generator().manual_seed(seeds.stream(problem.seed, "draw", one)) for one in numbers]
             drawn = [problem.domain.sample(one)[0] for one in generators]
             found += self.trials("average", dict(zip(numbers, drawn, strict=True)))
@@ -175,5 +183,5 @@ class Verifier:
     ) -> None:
         """Begin a stage of so many trials."""
         most = "at most " if at_most else ""
-        hint = f"{most}{trials} pictures of {count(self.findings.spp, 'sample')} a pixel; {flags} shorten it"
+        hint = f"{most}{trials} pictures of {plural(self.findings.spp, 'sample')} a pixel; {flags} shorten it"
         self.stages.begin(name, title, trials, hint=hint, at_most=at_most)

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.attack import budget_of, problem_from_config
+from advsearch.api.attack import problem_from_config
 from advsearch.cli.attack import answer as answer_text
 from advsearch.config import AttackConfig
-from advsearch.engine.problem import Problem
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.runs.listing import goes_on, listed
@@ -140,20 +140,7 @@ def test_render_runs_in_ordinary_autograd(scene: advsearch.Scene, level: float) 
 def test_ctrl_c_keeps_the_run_so_far(
     scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original, calls = Problem.evaluator, []
-
-    def interrupted(self: Problem, stream: str, on_image: Any = None) -> Any:
-        evaluate = original(self, stream, on_image)
-
-        def stops(u: Tensor, *, index: int, gradient: bool) -> Any:
-            calls.append(index)
-            if len(calls) == 4:
-                raise KeyboardInterrupt
-            return evaluate(u, index=index, gradient=gradient)
-
-        return stops
-
-    monkeypatch.setattr(Problem, "evaluator", interrupted)
+    interrupted(monkeypatch, 3)
     result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
     assert result.summary.ending == "interrupted" and result.summary.verified is None
     assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8"))["ending"] == "interrupted"
@@ -166,19 +153,7 @@ def test_a_stopped_run_goes_on_where_it_was(
     options = {**FAST, "deterministic": True, "baseline": False}
     whole = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "whole", **options)
     with monkeypatch.context() as patch:
-        original = Problem.evaluator
-
-        def interrupted(self: Problem, stream: str, on_image: Any = None) -> Any:
-            evaluate, calls = original(self, stream, on_image), iter(range(3))
-
-            def stops(u: Tensor, **named: Any) -> Any:
-                if next(calls, None) is None:
-                    raise KeyboardInterrupt
-                return evaluate(u, **named)
-
-            return stops
-
-        patch.setattr(Problem, "evaluator", interrupted)
+        interrupted(patch, 3)
         stopped = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **options)
     assert stopped.summary.ending == "interrupted" and goes_on(tmp_path / "run")
     again = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", resume=True, **options)
@@ -340,7 +315,7 @@ def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
 def test_a_search_is_as_long_as_what_is_asked_needs(asked: dict[str, Any], steps: int, draws: int) -> None:
     config = AttackConfig(object="mug", resolution=8, threads=1, **asked)
     problem, _ = problem_from_config(config)
-    assert (budget_of(config, problem).steps, problem.draws) == (steps, draws)
+    assert (problem.steps, problem.draws) == (steps, draws)
 
 
 def test_a_search_over_conditions_says_how_long_it_is(scene: advsearch.Scene, level: float) -> None:

@@ -20,7 +20,6 @@ from advsearch.cli import check as command
 from advsearch.cli.main import main
 from advsearch.config import CheckConfig
 from advsearch.engine.measuring import OutOfTime, Results
-from advsearch.engine.memory import Memory
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
@@ -133,7 +132,7 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
     config = CheckConfig(**SMALL, seconds=0.001, run=str(folder))
     summary = check_from_config(config)
     assert summary.ending == "out of time" and not finished(folder)
-    monkeypatch.setattr(checking, "Results", lambda memory, seconds=None: Results(memory))  # a sitting that is longer
+    monkeypatch.setattr(checking, "Results", lambda run, seconds=None: Results(run))  # a sitting that is longer
     assert values(check_from_config(config, resumed=folder)) == values(whole) and finished(folder)
     assert main(["show", str(folder)]) == 0
     assert command.READING.splitlines()[0] in capsys.readouterr().out
@@ -141,11 +140,11 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
 
 def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
-        results = Results(Memory(run))
+        results = Results(run)
         assert results.get("a", lambda: {"x": (0.1 + 0.2, float("inf"))}) == {"x": [0.1 + 0.2, float("inf")]}
         assert results.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
     with RunDirectory.resume(tmp_path / "run") as run:
-        late = Results(Memory(run), seconds=0.0)
+        late = Results(run, seconds=0.0)
         assert late.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
         assert late.get("b", lambda: 1) == 1  # a sitting always gets on
         with pytest.raises(OutOfTime):

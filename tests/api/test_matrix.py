@@ -16,7 +16,7 @@ from torch import Tensor
 import advsearch
 from advsearch.api import parts
 from advsearch.api.attack import attack_from_config
-from advsearch.api.gap import pictures_of
+from advsearch.api.gap import models_answering
 from advsearch.attacks import get_objective
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, GapConfig
@@ -77,7 +77,7 @@ def test_every_answer_is_tried_on_every_model(whole: MatrixResult, capsys: pytes
 def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     whole: MatrixResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, done = Retrials._picture, 0
+    real, done = Retrials._rendered, 0
 
     def stopped(*given: Any) -> Any:
         nonlocal done
@@ -86,7 +86,7 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
             raise KeyboardInterrupt
         return real(*given)
 
-    monkeypatch.setattr(Retrials, "_picture", stopped)
+    monkeypatch.setattr(Retrials, "_rendered", stopped)
     first = carried_out(tmp_path / "run")
     assert first.ending == "interrupted" and first.goes_on
     again = attack_from_config(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")
@@ -101,7 +101,7 @@ def test_workers_make_the_pictures_of_the_trials(
     """Of three configurations six for each model, whose input sizes differ; the rows stay."""
     run = tmp_path / "run"
     config = AttackConfig(**{**SHORT, "model": BOTH, "run": str(run)})
-    ready = shared(monkeypatch, config.plain(), pictures_of)
+    ready = shared(monkeypatch, config.plain(), models_answering)
     monkeypatch.setattr(parts, "executor_of", lambda work, **_: nullcontext(None))
     result = carried_out(run, workers=2)
     assert isinstance(result, MatrixResult) and len(ready.given) == 3 * 2 * 6

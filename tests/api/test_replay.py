@@ -15,6 +15,7 @@ from advsearch.api import replay as replaying
 from advsearch.api.attack import attack_once, problem_from_config
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, ReplayConfig
+from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.errors import FileFormatError, InputError
 from advsearch.progress import NullProgress
@@ -73,7 +74,7 @@ def test_an_answer_is_rendered_again_under_every_condition(
 
 def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = ReplayConfig(answer=attacked, ways="jpeg", trials=6, run=str(tmp_path / "run"))
-    real, done = Retrials._picture, 0
+    real, done = Problem.judge, 0
 
     def stopped(*given: Any) -> Any:
         nonlocal done
@@ -82,7 +83,7 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
             raise KeyboardInterrupt
         return real(*given)
 
-    monkeypatch.setattr(Retrials, "_picture", stopped)
+    monkeypatch.setattr(Problem, "judge", stopped)
     first = replaying.replay_from_config(config)
     assert first.goes_on and len(first.table) == 1
     again = replaying.replay_from_config(config, resumed=tmp_path / "run")
@@ -119,7 +120,7 @@ def test_a_shared_radiance_gives_the_same_picture(attacked: Path, tmp_path: Path
     u = torch.from_numpy(read_answer(attacked))
     with RunDirectory.create(tmp_path / "run") as run:
         retrials = Retrials(pair, run, NullProgress(), trials=6, seed=0)
-        first, second = (retrials._picture("answer", one, u, 7) for one in pair)
+        first, second = (retrials._rendered(one, u, 7) for one in pair)
     assert torch.equal(first, problem.picture(u, 7, 4)) and torch.equal(second, changed.picture(u, 7, 4))
 
 

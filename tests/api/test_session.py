@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from samples import SUMMARY
+from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
@@ -29,7 +30,6 @@ from advsearch.controls import Control
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
@@ -341,19 +341,8 @@ class Loss:
 
 def stopped(monkeypatch: pytest.MonkeyPatch, after: int = 2) -> Any:
     """Let a search be interrupted after so many evaluations."""
-    patch, original = pytest.MonkeyPatch(), Problem.evaluator
-
-    def interrupted(self: Problem, stream: str, on_image: Any = None) -> Any:
-        evaluate, left = original(self, stream, on_image), iter(range(after))
-
-        def stops(u: Tensor, **named: Any) -> Any:
-            if next(left, None) is None:
-                raise KeyboardInterrupt
-            return evaluate(u, **named)
-
-        return stops
-
-    patch.setattr(Problem, "evaluator", interrupted)
+    patch = pytest.MonkeyPatch()
+    interrupted(patch, after)
     return patch
 
 

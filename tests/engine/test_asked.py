@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.api.attack import problem_of
-from advsearch.attacks import get_objective
+from advsearch.attacks import Query, get_objective
 from advsearch.config import AttackConfig
 from advsearch.engine import bank
 from advsearch.engine.bank import Bank
@@ -74,12 +75,12 @@ def test_it_is_the_same_for_rendered_and_for_predicted_pictures(
     monkeypatch.setattr(bank, "FIRST", 2)
     settings = {"over": over, "draws": 2} if over else {}
     made = problem(scene, pinker, controls=TEXTURE, **settings)
-    predicted: Predictor = Bank(made, 16) if over else Transport(made, 16)
+    predicted: Predictor = Bank(made, 16, partial(map, made.evaluate)) if over else Transport(made, 16)
     at = made.domain.begin.clone().requires_grad_()
     value = pinker(at, at, at, made.searched_space.printed(at)["texture"][None])
     value.sum().backward()
-    for evaluator in (made.evaluator("search"), predicted.evaluator("search")):
-        found = evaluator(at.detach(), index=0, gradient=True)
+    for one in (made, predicted):
+        found = one.evaluate(Query(at.detach(), 0, phase="search", gradient=True))
         assert found.gradient is not None and at.grad is not None
         assert found.objective == pytest.approx(float(value.detach()))
         assert torch.allclose(found.gradient, at.grad, atol=1e-7)
@@ -97,9 +98,9 @@ def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(sc
 
     made = problem(scene, seen, controls={"texture": {"resolution": 8}, "pose": {"yaw": [-20, 30]}})
     u = made.domain.begin
-    picture = made.evaluator("search")(u, index=3, gradient=True)
+    picture = made.evaluate(Query(u, 3, phase="search", gradient=True))
     made.objective = get_objective(asks, made.task)
-    found = made.evaluator("search")(u, index=3, gradient=True)
+    found = made.evaluate(Query(u, 3, phase="search", gradient=True))
     assert found.gradient is not None and picture.gradient is not None
     at = u.clone().requires_grad_()
     space = made.searched_space

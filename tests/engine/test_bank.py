@@ -86,7 +86,7 @@ def test_workers_make_the_matrices_and_the_rows_stay(monkeypatch: pytest.MonkeyP
     assert rows(tmp_path / "shared") == rows(tmp_path / "alone") and torch.equal(result.adversarial, alone.adversarial)
     assert len(ready.given) >= 9 + 2 * 6
     shared(monkeypatch, {"object": "mug", **SMALL}, lost=(2,))
-    with pytest.raises(ClusterError, match=r"matrix of a condition: it died; .advsearch resume"):
+    with pytest.raises(ClusterError, match=r"light of a condition: it died; .advsearch resume"):
         attack_once(AttackConfig(**SMALL, object="mug", workers=2, run=str(tmp_path / "lost")))
 
 

@@ -12,19 +12,17 @@ from samples import attack, make_run
 from stand_ins import StandInProblem, attack_on, configuration
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Ending, SearchResult, make_policy
+from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult, make_policy
 from advsearch.attacks.failure_share import FailureShare
 from advsearch.attacks.failures import Failures, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, Rule
 from advsearch.cli.attack import answer
 from advsearch.engine.failures import TRIED, check_failures, described_failures
-from advsearch.engine.memory import Memory
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.stages import Attack
 from advsearch.progress import NullProgress
 from advsearch.report.failures import failure_rows, failures_text
 from advsearch.runs.results.attack import DifferentFailures
-from advsearch.tasks import Judgement
 from advsearch.viewer.attack_page import write_report
 
 NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))
@@ -33,9 +31,10 @@ NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"
 class Coin(StandInProblem):
     """Wrong wherever the first number is over 0.6, and where it is over 0.3 by a coin that the seed throws."""
 
-    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True, keep: object = None) -> Judgement:
-        lucky = float(u[0]) > 0.3 and seed % 2 == 0
-        return super().trial(torch.linspace(0.3, 0.8, 6) if float(u[0]) > 0.6 or lucky else torch.zeros(6), seed, spp)
+    def evaluate(self, query: Query) -> Evaluation:
+        first = float(query.u[0])
+        wrong = first > 0.6 or (first > 0.3 and query.seed % 2 == 0)
+        return super().evaluate(replace(query, u=torch.linspace(0.3, 0.8, 6) if wrong else torch.zeros(6)))
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
         said = {f"u.{number}": {"value": 90.0 * float(u[number]), "unit": "degrees"} for number in range(2)}
@@ -50,13 +49,13 @@ def checked(known: Failures, *, rule: Rule | None = None, trials: int = 20) -> A
     """An attack of which everything but the different failures has been checked."""
     problem: Any = Coin(domain=NAMED)
     problem.rule = rule or problem.rule
-    attacked = attack_on(problem, configuration(), make_policy("archive"), Memory(None), Stages(NullProgress()))
+    attacked = attack_on(problem, configuration(), make_policy("archive"), Stages(NullProgress()))
     nothing = (0.0, 0.0, 0.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
     found = SearchResult(torch.full((3,), 0.5), *nothing, failures=known)
     attacked.findings.search = found
     verifier = attacked._verifier
     verifier.choose_spp({"clean": NAMED.start})
-    clean = tuple(StandInProblem().trial(torch.zeros(6), seed, 8) for seed in range(trials))
+    clean = tuple(StandInProblem().evaluate(Query(torch.zeros(6), seed)).said for seed in range(trials))
     attacked.findings.clean = clean
     check_failures(verifier, found)
     return attacked

@@ -20,10 +20,11 @@ import torch
 from conftest import ROOT
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
-from advsearch.attacks import Domain, Evaluated, Policy, Proposal, make_policy
+from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
 from advsearch.config import AttackConfig, CheckConfig, PlanConfig, StabilityConfig
-from advsearch.engine.memory import Memory
+from advsearch.engine.journal import Journal
 from advsearch.engine.record import Stages
+from advsearch.engine.sharing import Shared
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
 from advsearch.runs import database
@@ -96,8 +97,7 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
     problem: Any = StandInProblem(on_evaluation=counted)
     with RunDirectory.create(tmp_path / "run") as run:
         run.write_config(config)
-        memory = Memory(run)
-        attack = attack_on(problem, config, make_policy("pgd"), memory, Stages(NullProgress()), run)
+        attack = attack_on(problem, config, make_policy("pgd"), Stages(NullProgress()), run)
         assert attack.carry_out().interrupted
     assert goes_on(tmp_path / "run")
     found = carry_out(tmp_path / "run", config, resume=True)
@@ -114,16 +114,16 @@ def test_an_interrupt_of_the_check_keeps_the_answer_and_going_on_verifies_it(
 ) -> None:
     """In the first of what finds the samples, in the control group, and in the trials of the answer."""
     config = configuration().model_copy(update={"verify_spp": None if trials == 5 else 8})
-    whole, rendered, once = carry_out(tmp_path / "whole", config), 0, StandInProblem.trial
+    whole, rendered, once = carry_out(tmp_path / "whole", config), 0, StandInProblem.evaluate
 
-    def trial(self: Any, *args: Any, **settings: Any) -> Any:
+    def evaluate(self: Any, query: Query) -> Evaluation:
         nonlocal rendered
-        rendered += 1
+        rendered += query.phase is None
         if rendered == trials:
             raise KeyboardInterrupt
-        return once(self, *args, **settings)
+        return once(self, query)
 
-    monkeypatch.setattr(StandInProblem, "trial", trial)
+    monkeypatch.setattr(StandInProblem, "evaluate", evaluate)
     stopped = carry_out(tmp_path / "run", config)
     assert stopped.interrupted and stopped.verification is None
     assert stopped.search is not None and whole.search is not None
@@ -137,12 +137,13 @@ def test_an_interrupt_of_the_check_keeps_the_answer_and_going_on_verifies_it(
 def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         problem: Any = StandInProblem()
-        memory, u = Memory(run), torch.full((6,), 0.5)
-        found = memory.evaluator("search", lambda tell: problem.evaluator("search", tell))(u, index=0, gradient=False)
-        run.record(Row("search", 0, objective=found.objective), told=memory.told("search", 0, u, found))
-        again = Memory(run).evaluator("search", lambda tell: problem.evaluator("search", tell))
-        with pytest.raises(InputError, match="cannot go on: evaluation 0 of the search is another one now"):
-            again(torch.full((6,), 0.4), index=0, gradient=False)
+        query = Query(torch.full((6,), 0.5), 1, phase="search")
+        (found,) = Journal(run, Shared(problem)).answers([query])
+        (again,) = Journal(run, Shared(problem)).answers([query])
+        assert again.objective == found.objective
+        for other in (replace(query, u=torch.full((6,), 0.4)), replace(query, seed=2)):
+            with pytest.raises(InputError, match="cannot go on: evaluation 0 of the search is another one now"):
+                list(Journal(run, Shared(problem)).answers([other]))
 
 
 CHANGES: dict[str, Any] = {
@@ -258,8 +259,7 @@ class Sleeper(Policy[Domain]):
 @pytest.mark.parametrize(("policy", "beaten"), [(Sleeper(), True), (make_policy("pgd"), False)])
 def test_the_random_searchs_answer_is_taken_where_it_is_the_worse_one(policy: Policy[Any], beaten: bool) -> None:
     problem: Any = StandInProblem()
-    memory = Memory(None)
-    attack = attack_on(problem, configuration(), policy, memory, Stages(NullProgress()))
+    attack = attack_on(problem, configuration(), policy, Stages(NullProgress()))
     findings = attack.carry_out()
     assert findings.search is not None and findings.baseline is not None and findings.verification is not None
     assert (findings.beaten is not None) == beaten

@@ -31,14 +31,13 @@ def finding(trial: Callable[[str, int, Tensor], Any]) -> Any:
     def said(*_: Any, **__: Any) -> None:
         pass
 
-    problem = SimpleNamespace(domain=DOMAIN, seed=0, rule=WORST_CASE)
+    def trials(kind: str, configurations: dict[int, Tensor]) -> list[Any]:
+        return [trial(kind, number, u) for number, u in configurations.items()]
+
+    problem = SimpleNamespace(domain=DOMAIN, seed=0, rule=WORST_CASE, steps=1)
     findings = SimpleNamespace(transport=None, smallest=None, search=None)
-    budget = SimpleNamespace(steps=1, trials=20)
-    searches: Any = SimpleNamespace(
-        problem=problem, budget=budget, findings=findings, policy=None, begin=said, search=search
-    )
-    progress = SimpleNamespace(progress=SimpleNamespace(advance=said))
-    verifier: Any = SimpleNamespace(begin=said, trial=trial, stages=progress)
+    searches: Any = SimpleNamespace(problem=problem, findings=findings, policy=None, begin=said, search=search)
+    verifier: Any = SimpleNamespace(begin=said, trials=trials, count=20)
     with suppress(KeyboardInterrupt):
         find_smallest(searches, verifier)
     return findings

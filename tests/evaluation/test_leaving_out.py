@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,12 @@ import torch
 from advsearch import attack, load_scene
 from advsearch.api.attack import problem_from_config
 from advsearch.api.plan import plan_from_config
+from advsearch.attacks import Query
 from advsearch.cli.plan import answer
 from advsearch.config import AttackConfig, PlanConfig
 from advsearch.controls import LightControl, TextureControl
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.path_length import BOUND, measured_bounces
-from advsearch.engine.problem import OnImage
 from advsearch.evaluation.leaving_out import ALL, RENDERS, WHAT, measured_gains, resolved_texels
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
@@ -131,14 +132,15 @@ def test_searches_cut_paths_and_verifications_do_not() -> None:
     problem, _ = problem_from_config(config)
     start = problem.domain.start
     seen: list[torch.Tensor] = []
-    evaluate = problem.evaluator("search", OnImage(lambda index: True, lambda index, image: seen.append(image)))
-    trial = problem.trial(start, 3, 8)
-    evaluate(start, index=0, gradient=False)
-    problem.search_depth = 2
-    evaluate(start, index=0, gradient=False)
-    evaluate(start, index=0, gradient=True)
+    searched, tried = Query(start, 0, phase="search", keep=True), Query(start, 3, spp=8)
+    trial = problem.evaluate(tried)
+    for depth, gradient in ((None, False), (2, False), (2, True)):
+        problem.search_depth = depth
+        picture = problem.evaluate(replace(searched, gradient=gradient)).picture
+        assert picture is not None
+        seen.append(picture)
     assert seen[1].mean() < seen[0].mean() - 0.005 and torch.equal(seen[1], seen[2])
-    assert problem.trial(start, 3, 8) == trial
+    assert problem.evaluate(tried).said == trial.said
 
 
 def test_a_long_search_says_what_paths_it_rendered() -> None:

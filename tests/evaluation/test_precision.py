@@ -639,7 +639,7 @@ def test_workers_make_the_references_and_what_is_timed_stays_here(
     class Watched:
         facts = Workforce(workers=2, most=2, busy=1.0, alive=2.0)
 
-        def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
+        def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
             assert given is not None
             for done in made.results(ranges, given):
                 (one,) = given[done.numbers.start : done.numbers.stop]

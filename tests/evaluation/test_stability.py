@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+from advsearch.attacks import Query
 from advsearch.cli.main import main
 from advsearch.config import StabilityConfig
 from advsearch.errors import InputError, UnknownNameError
@@ -269,5 +270,5 @@ def test_median_of_means_and_clipping_ignore_one_huge_sample() -> None:
 def test_a_toy_counts_its_cost_and_breaks_where_it_is_told_to() -> None:
     toy = Toy(quadratic([0.5], [1.0]), numbers([0.0]), broken=frozenset({3}))
     u = torch.zeros(1)
-    assert toy(u, index=2, gradient=True).finite and not toy(u, index=3, gradient=True).finite
-    assert toy(u, index=2, gradient=False, samples=4).cost == 4
+    assert toy(Query(u, 0, number=2, gradient=True)).finite and not toy(Query(u, 0, number=3, gradient=True)).finite
+    assert toy(Query(u, 0, number=2, samples=4)).cost == 4

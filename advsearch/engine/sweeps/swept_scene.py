@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.described import Value
 from advsearch.engine.loading import framed, make_renderer
-from advsearch.engine.metrics import measured
+from advsearch.engine.metrics import judgements
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.light import Shown, SweptLight
 from advsearch.engine.sweeps.points import Picks, Points
@@ -20,7 +20,7 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Judgement, Mark
-from advsearch.tasks.base import Output, Truth
+from advsearch.tasks.base import Truth
 
 Values = dict[str, Value]
 
@@ -171,21 +171,12 @@ class SweptScene:
         self, number: int, pictures: Tensor, u: Tensor, values: Sequence[Mapping[str, Value]]
     ) -> list[Judgement]:
         """What one model says of pictures (n, H, W, 3); a margin that is not finite becomes NaN."""
-        task = self._job.tasks[number]
+        task, truths = self._job.tasks[number], [self._truths[number]]
+        if task.varies:
+            truths = [self.truth(number, *one) for one in zip(u, values, strict=True)]
         with torch.no_grad():
             output = self._job.models[number](pictures)
-            if not task.varies:
-                truth = self._truths[number]
-                said = [_finite(one) for one in task.judge(output, truth)]
-                return [self._measured(one, k, pictures, output, truth) for k, one in enumerate(said)]
-            truths = [self.truth(number, *one) for one in zip(u, values, strict=True)]
-            said = [_finite(task.judge(output[k : k + 1], one)[0]) for k, one in enumerate(truths)]
-            return [self._measured(said[k], k, pictures, output, one) for k, one in enumerate(truths)]
-
-    def _measured(self, judgement: Judgement, k: int, pictures: Tensor, output: Output, truth: Truth) -> Judgement:
-        """What is said of the picture with the number k among some."""
-        return measured(judgement, self._job.metrics, pictures[k], output[k : k + 1], truth)
-
-
-def _finite(seen: Judgement) -> Judgement:
-    return Judgement.of(seen.score, seen.margin, seen.answer, seen.payload)
+        said = judgements(task, output, pictures, truths, self._job.metrics)
+        return [
+            replace(Judgement.of(one.score, one.margin, one.answer, one.payload), metrics=one.metrics) for one in said
+        ]

@@ -582,7 +582,7 @@ def test_choices_and_angles_are_searched_by_every_policy(policy: Policy[Any]) ->
         cost = query.samples * (3 if query.gradient else 1)
         return Evaluation(value, slope if query.gradient else None, False, cost=cost)
 
-    result = search(partial(map, evaluate), CHOOSY, policy, steps=120, seed=0, candidates=0)
+    result = search(partial(map, evaluate), CHOOSY, policy, steps=144, seed=0, candidates=0)
     assert (int(result.best_u[0] * 3), int(result.best_u[4] * 2)) == (2, 0)
     assert {(int(u[0] * 3), int(u[4] * 2)) for u in seen} == {(a, b) for a in range(3) for b in range(2)}
     assert result.best_objective > 3.1

@@ -48,12 +48,14 @@ BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))
 
 @dataclass(frozen=True)
 class Still(Policy[tuple[Tensor, int]]):
-    """Proposes u = (value, where it begins), `times` times; notes what it was promised in `plans`."""
+    """Proposes u = (value, where it begins), `times` times; notes what it was promised in `plans`, and what evaluations
+    cost in `costs`."""
 
     value: float
     times: int = 10**6
     gradient: bool = False
     plans: tuple[list[int], ...] = ()
+    costs: tuple[list[int], ...] = ()
     name: ClassVar[str] = "still"
     handles_choices: ClassVar[bool] = True
 
@@ -73,6 +75,8 @@ class Still(Policy[tuple[Tensor, int]]):
 
     def update(self, state: tuple[Tensor, int], evaluated: Evaluated) -> tuple[Tensor, int]:
         assert all(torch.equal(u, state[0]) for u, _ in evaluated)
+        for costs in self.costs:
+            costs += [evaluation.cost for _, evaluation in evaluated]
         return state
 
 
@@ -111,11 +115,12 @@ def test_as_many_run_as_can_have_a_whole_evaluation_in_every_round(steps: int, e
 
 
 def test_who_reached_more_goes_on_with_an_equal_share_of_every_round() -> None:
-    """Four policies, 48 renders, three rounds of 16: 4 each, then 8 for the better two, then 16 for the best."""
+    """Four policies, 48 renders, three rounds of 16: 4 each, then 8 for the better two, then 16 for the best. Those of
+    a round take turns."""
     policy = Portfolio(tuple(Still(value) for value in (0.2, 0.8, 0.4, 0.6)))
     result, seen = played(policy, 48, first)
     order = [round(float(u[0]), 1) for u in seen]
-    assert order == [0.2] * 4 + [0.8] * 4 + [0.4] * 4 + [0.6] * 4 + [0.8] * 8 + [0.6] * 8 + [0.8] * 16
+    assert order == [0.2, 0.8, 0.4, 0.6] * 4 + [0.8, 0.6] * 8 + [0.8] * 16
     assert result.stopped is Ending.BUDGET_SPENT
 
 
@@ -135,8 +140,8 @@ def test_renders_that_one_leaves_go_to_the_others() -> None:
     assert (stalled.stopped, stalled.renders) == (Ending.STALLED, 5)
 
 
-def test_a_costly_gradient_does_not_overdraw_a_turn() -> None:
-    """Ten renders a turn, four a gradient: two of them and two renders without."""
+def test_a_costly_gradient_does_not_overdraw_a_share() -> None:
+    """Ten renders each, four a gradient: two of them and two renders without."""
     domain = replace(BOX, gradient_cost=3)
     asked: list[bool] = []
 
@@ -146,7 +151,22 @@ def test_a_costly_gradient_does_not_overdraw_a_turn() -> None:
         return Evaluation(float(query.u[0]), slope, False, cost=1 + 3 * bool(query.gradient))
 
     search(partial(map, evaluate), domain, Restarts(Still(0.5, gradient=True), 2), steps=20, seed=0, candidates=0)
-    assert asked == [True, True, False, False] * 2
+    assert asked == [True] * 4 + [False] * 4
+
+
+def test_renders_that_gradients_did_not_take_are_for_the_rounds_to_come() -> None:
+    """Two searches, 40 renders, two rounds of 20: gradients that may take four renders, and take two."""
+    domain = replace(BOX, gradient_cost=3)
+    seen: list[float] = []
+
+    def evaluate(query: Query) -> Evaluation:
+        seen.append(round(float(query.u[0]), 1))
+        slope = torch.ones_like(query.u) if query.gradient else None
+        return Evaluation(float(query.u[0]), slope, False, cost=2 if query.gradient else 1)
+
+    policy = Portfolio((Still(0.5, gradient=True), Still(0.9, gradient=True)))
+    assert search(partial(map, evaluate), domain, policy, steps=40, seed=0, candidates=0).renders == 40
+    assert seen[:8] == [0.5, 0.9] * 4 and set(seen[8:]) == {0.9}
 
 
 def test_what_is_affordable() -> None:
@@ -167,10 +187,10 @@ def test_what_is_affordable() -> None:
 
 
 def test_restarts_share_the_renders_and_begin_elsewhere() -> None:
+    """Thirty-two renders are ten for each of three, by turns, and two more for the best of them."""
     _, seen = played(Restarts(Still(0.5), times=3), 32, first)
     begins = [float(u[1]) for u in seen]
-    runs = [begins[:10], begins[10:21], begins[21:]]
-    assert all(len(set(run)) == 1 for run in runs)
+    assert begins == begins[:3] * 10 + begins[:1] * 2
     assert begins[0] == pytest.approx(0.6)
     assert len(set(begins)) == 3
 
@@ -179,7 +199,7 @@ def test_restarts_do_not_move_the_ball() -> None:
     domain = Domain(torch.full((8,), 0.5), (Block(8, "linf", 0.1),))
     _, seen = played(Restarts(PGD(), times=4), 40, lambda u: float(u.sum()), domain)
     assert all(domain.contains(u) for u in seen)
-    assert len({tuple(seen[k].tolist()) for k in (0, 10, 20, 30)}) == 4
+    assert len({tuple(seen[k].tolist()) for k in range(4)}) == 4
 
 
 def test_fewer_restarts_where_renders_are_few() -> None:
@@ -276,6 +296,16 @@ def test_no_evaluation_has_too_many_samples() -> None:
     told = halved(Halving(eta=2, starts=2), 1000, first)
     assert max(record.samples for record, _ in told) == 64
     assert told[-1][0].renders == 1000
+
+
+def test_a_policy_in_halving_counts_renders_as_if_its_samples_never_grew() -> None:
+    """Of 64 renders 16 for each of two searches, then 32 for one of them with two samples each: it plans for 32, and
+    has as many."""
+    plans, costs = list[int](), list[int]()
+    policy = Still(0.5, plans=(plans,), costs=(costs,))
+    _, seen = played(Halving(policy, eta=2, starts=2), 64, first)
+    assert plans == [32, 32]
+    assert (len(seen), set(costs)) == (48, {1})
 
 
 def test_halving_with_a_policy_goes_on_from_each_start() -> None:
