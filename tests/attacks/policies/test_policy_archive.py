@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
+from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.policies import archive
 from advsearch.attacks.policies.archive import ArchiveState, MapElites
 from advsearch.errors import InputError, UnknownNameError
@@ -155,10 +156,10 @@ def test_failing_cells_are_told_with_their_ends_and_those_of_a_generation_that_i
 def test_around_an_archive_its_failures_are_still_told(around: str) -> None:
     inner: dict[str, Any] = {"policy": "archive"} if around == "restarts" else {"policies": ["nes", "archive"]}
 
-    def evaluate(u: torch.Tensor, *, index: int, gradient: object, samples: int = 1) -> Evaluation:
-        return Evaluation(float(u[0]) - 0.4, None, float(u[0]) > 0.4)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(float(query.u[0]) - 0.4, None, float(query.u[0]) > 0.4)
 
     domain = Domain(torch.full((2,), 0.5), (Block(2),))
-    found = search(evaluate, domain, make_policy(around, **inner), steps=120, seed=0).failures
+    found = search(partial(map, evaluate), domain, make_policy(around, **inner), steps=120, seed=0).failures
     assert found is not None and found.found > 2
-    assert search(evaluate, domain, make_policy("nes"), steps=20, seed=0).failures is None
+    assert search(partial(map, evaluate), domain, make_policy("nes"), steps=20, seed=0).failures is None

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import pytest
@@ -27,6 +28,7 @@ from advsearch.attacks import (
     Policy,
     Portfolio,
     Proposal,
+    Query,
     Random,
     Restarts,
     SearchResult,
@@ -83,13 +85,13 @@ def played(
 ) -> tuple[SearchResult, list[Tensor]]:
     seen: list[Tensor] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        seen.append(u.clone())
-        slope = torch.ones_like(u) if gradient else None
-        cost = samples * (1 + domain.gradient_cost * (gradient is True))
-        return Evaluation(value(u), slope, False, cost=cost)
+    def evaluate(query: Query) -> Evaluation:
+        seen.append(query.u.clone())
+        slope = torch.ones_like(query.u) if query.gradient else None
+        cost = query.samples * (1 + domain.gradient_cost * (query.gradient is True))
+        return Evaluation(value(query.u), slope, False, cost=cost)
 
-    return search(evaluate, domain, policy, steps=steps, seed=0, candidates=0), seen
+    return search(partial(map, evaluate), domain, policy, steps=steps, seed=0, candidates=0), seen
 
 
 def first(u: Tensor) -> float:
@@ -143,12 +145,12 @@ def test_a_costly_gradient_does_not_overdraw_a_share() -> None:
     domain = replace(BOX, gradient_cost=3)
     asked: list[bool] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        asked.append(bool(gradient))
-        slope = torch.ones_like(u) if gradient else None
-        return Evaluation(float(u[0]), slope, False, cost=1 + 3 * bool(gradient))
+    def evaluate(query: Query) -> Evaluation:
+        asked.append(bool(query.gradient))
+        slope = torch.ones_like(query.u) if query.gradient else None
+        return Evaluation(float(query.u[0]), slope, False, cost=1 + 3 * bool(query.gradient))
 
-    search(evaluate, domain, Restarts(Still(0.5, gradient=True), 2), steps=20, seed=0, candidates=0)
+    search(partial(map, evaluate), domain, Restarts(Still(0.5, gradient=True), 2), steps=20, seed=0, candidates=0)
     assert asked == [True] * 4 + [False] * 4
 
 
@@ -157,12 +159,13 @@ def test_renders_that_gradients_did_not_take_are_for_the_rounds_to_come() -> Non
     domain = replace(BOX, gradient_cost=3)
     seen: list[float] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        seen.append(round(float(u[0]), 1))
-        return Evaluation(float(u[0]), torch.ones_like(u) if gradient else None, False, cost=2 if gradient else 1)
+    def evaluate(query: Query) -> Evaluation:
+        seen.append(round(float(query.u[0]), 1))
+        slope = torch.ones_like(query.u) if query.gradient else None
+        return Evaluation(float(query.u[0]), slope, False, cost=2 if query.gradient else 1)
 
     policy = Portfolio((Still(0.5, gradient=True), Still(0.9, gradient=True)))
-    assert search(evaluate, domain, policy, steps=40, seed=0, candidates=0).renders == 40
+    assert search(partial(map, evaluate), domain, policy, steps=40, seed=0, candidates=0).renders == 40
     assert seen[:8] == [0.5, 0.9] * 4 and set(seen[8:]) == {0.9}
 
 
@@ -214,12 +217,14 @@ def test_restarts_find_the_higher_of_two_hills() -> None:
         low, high = ((math.exp(-20 * float((u - c).square().sum())), c) for c in (0.2, 0.85))
         return -40 * (low[0] * (u - low[1]) + 2 * high[0] * (u - high[1]))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(value(u), slope(u) if gradient else None, False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(value(query.u), slope(query.u) if query.gradient else None, False)
 
     domain = Domain(torch.tensor([0.25, 0.15]), (Block(2),))
-    alone = search(evaluate, domain, PGD(step_size=0.1), steps=80, seed=0, candidates=0)
-    several = search(evaluate, domain, Restarts(PGD(step_size=0.1), times=8), steps=80, seed=0, candidates=0)
+    alone = search(partial(map, evaluate), domain, PGD(step_size=0.1), steps=80, seed=0, candidates=0)
+    several = search(
+        partial(map, evaluate), domain, Restarts(PGD(step_size=0.1), times=8), steps=80, seed=0, candidates=0
+    )
     assert value(alone.best_u) < 1.1
     assert value(several.best_u) > 1.9
 
@@ -248,11 +253,11 @@ def test_a_portfolio_answers_with_its_leaders_distribution() -> None:
 def halved(policy: Halving, steps: int, value: Callable[[Tensor], float]) -> list[tuple[StepRecord, tuple[float, ...]]]:
     told: list[tuple[StepRecord, tuple[float, ...]]] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(value(u), None, False, cost=samples)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(value(query.u), None, False, cost=query.samples)
 
     search(
-        evaluate,
+        partial(map, evaluate),
         BOX,
         policy,
         steps=steps,
@@ -340,13 +345,13 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
     )
     w = torch.tensor([1.0, 0.0, -1.0, 1.0])
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        bonus = 0.3 * (int(u[1] * 3) == 1)
-        return Evaluation(float(w @ u) + bonus, w.clone() if gradient else None, False)
+    def evaluate(query: Query) -> Evaluation:
+        bonus = 0.3 * (int(query.u[1] * 3) == 1)
+        return Evaluation(float(w @ query.u) + bonus, w.clone() if query.gradient else None, False)
 
-    best = search(evaluate, domain, PGD(), steps=60, seed=0, candidates=0)
+    best = search(partial(map, evaluate), domain, PGD(), steps=60, seed=0, candidates=0)
     assert best.best_u.tolist() == pytest.approx([0.6, 0.5, 0.5 - 0.02**0.5, 0.5 + 0.02**0.5], abs=1e-3)
-    spread = search(evaluate, domain, NES(), steps=200, seed=0, candidates=0).distribution
+    spread = search(partial(map, evaluate), domain, NES(), steps=200, seed=0, candidates=0).distribution
     assert spread is not None
     assert (float(spread.mean[1]), float(spread.deviation[1])) == (0.5, 0.0)
     drawn = spread.sample(seeded(0, 0), 5, domain)
