@@ -174,7 +174,7 @@ def search(
 
     Raises:
         InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
-        RuntimeError: the policy left the domain or `evaluate` broke its contract; a bug.
+        RuntimeError, ValueError: the policy left the domain or `evaluate` broke its contract; a bug.
     """
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}")
