@@ -409,7 +409,7 @@ class MitsubaScene:
             own = self.parameters[key]
             if name not in self._base:
                 self._base[name] = type(own)(own.torch().clone() if name in self._buffers else own)
-            given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
+            given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)  # type: ignore[call-overload]
             if fresh is not None and one.write:
                 given = one.write(given)
             if name in self._buffers:
