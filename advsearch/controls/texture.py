@@ -338,6 +338,7 @@ class BoundTexture(BoundControl):
         self._painter = painter
         self._materials = materials
         self.start = painter.start
+        self._unchanged = painter.texels(painter.start)
         self.groups = (painter.group,)
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
@@ -351,7 +352,7 @@ class BoundTexture(BoundControl):
         return original.index_put(self._where.to(u.device).nonzero(as_tuple=True), painted)
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        change = self._painter.texels(u.detach()) - self._painter.texels(self.start.to(u.device))
+        change = self._painter.texels(u.detach()) - self._unchanged.to(u.device)
         named: dict[str, Value] = {f"{self.name}.materials": {"value": self._materials, "unit": "name"}}
         return (named if self._materials else {}) | {
             f"{self.name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},
