@@ -30,9 +30,6 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = False) -> Tensor:
     """Return the denoised linear radiance.
 
-    The picture is brought to the mean logarithmic luminance `KEY` first. The denoiser would do that by itself, but adds
-    up in an order that depends on the number of threads: by a few units in the last place.
-
     Args:
         radiance: (H, W, 3) float32 linear radiance, at least 0.
         albedo: (H, W, 3) float32 reflectance of the first hit in [0, 1].
@@ -50,13 +47,7 @@ def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = F
                 f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use `denoise=none`"
             ) from error
         color, guide, direction, output = _buffers((radiance.shape[0], radiance.shape[1]), threading.get_ident())
-        luminance = (radiance.detach().cpu().numpy() * LUMINANCE).sum(axis=-1)
-        starts = [np.arange(-(-side // BIN)) * side // -(-side // BIN) for side in luminance.shape]
-        high, wide = (np.diff(first, append=side) for first, side in zip(starts, luminance.shape, strict=True))
-        sums = np.add.reduceat(np.add.reduceat(luminance, starts[0], axis=0), starts[1], axis=1)
-        means = sums / np.outer(high, wide)
-        means = means[means > DARKEST]
-        gain = float(KEY / np.exp2(np.log2(means).mean())) if means.size else 1.0
+        gain = _gain(radiance.detach())
         for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
             buffer.copy_(image.detach())
         quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
@@ -69,3 +60,17 @@ def _buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
     """Return what pictures of a size are denoised in, in a thread: the filter is set up anew, for longer than it takes
     to run, whenever it is given other memory."""
     return [torch.zeros(*resolution, 3) for _ in range(4)]
+
+
+def _gain(radiance: Tensor) -> float:
+    """Return the factor that gives a picture (H, W, 3) the mean logarithmic luminance `KEY`.
+
+    The denoiser would find it by itself, but adds up in an order that depends on the number of threads: by a few units
+    in the last place.
+    """
+    luminance = (radiance.cpu().numpy() * LUMINANCE).sum(axis=-1)
+    starts = [np.arange(-(-side // BIN)) * side // -(-side // BIN) for side in luminance.shape]
+    rows, columns = (np.diff(first, append=side) for first, side in zip(starts, luminance.shape, strict=True))
+    means = np.add.reduceat(np.add.reduceat(luminance, starts[0], axis=0), starts[1], axis=1) / np.outer(rows, columns)
+    means = means[means > DARKEST]
+    return float(KEY / np.exp2(np.log2(means).mean())) if means.size else 1.0
