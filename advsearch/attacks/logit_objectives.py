@@ -20,8 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.errors import InputError
-from advsearch.tasks.classes import Labels
-from advsearch.tasks.classification import largest, members, target_lead, wrong_lead
+from advsearch.tasks.classification import Labels, largest, members, target_lead, wrong_lead
 
 SUREST = -15.0
 """Log-odds below which cross-entropy is continued by its tangent. In float32 its own slope, exp(log-odds), would be

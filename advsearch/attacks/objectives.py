@@ -35,7 +35,7 @@ from advsearch.attacks.own_objective import More, Objective, checked, form_of, n
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
 from advsearch.tasks import TASKS, Classification, Depth, Segmentation, Similarity, Task
-from advsearch.tasks.classes import ClassTask
+from advsearch.tasks.classification import ClassTask
 from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import Together

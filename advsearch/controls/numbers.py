@@ -261,6 +261,11 @@ class BoundNumbers(BoundControl):
         self.moved = tuple(control.moved(scene, slots))
         self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
+        ranges = [
+            (one.spec if isinstance(one.spec, Range) else Range(0.0, 1.0)) for one in slots for _ in range(one.width)
+        ]
+        self._low = torch.tensor([one.low for one in ranges], dtype=torch.float64)
+        self._span = torch.tensor([one.high - one.low for one in ranges], dtype=torch.float64)
 
     def _group(self, slot: Slot) -> Group:
         parameter, spec = slot.parameter, slot.spec
@@ -281,10 +286,11 @@ class BoundNumbers(BoundControl):
         Fixed ones are there too.
         """
         found: dict[str, Tensor] = {}
+        every = self._low.to(u) + self._span.to(u) * u  # at once, but for what is searched on a logarithmic scale
         for slot in self.slots:
-            parameter, spec = slot.parameter, slot.spec
+            parameter, spec, place = slot.parameter, slot.spec, slice(slot.begin, slot.begin + slot.size)
             if isinstance(spec, Range):
-                value = to_value(spec, parameter.log, u[slot.begin : slot.begin + slot.size])
+                value = to_value(spec, log=True, u=u[place]) if parameter.log else every[place]
                 found[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
             one = spec.value if isinstance(spec, Fixed) else spec.values[option_index(len(spec.values), u[slot.begin])]

@@ -108,17 +108,19 @@ class Space:
     def _among_others(self, u: Tensor) -> list[tuple[BoundControl, Tensor, Mapping[str, Tensor]]]:
         """Each control with its slice of u and the inputs of those before it, if it takes any."""
         parts, so_far, found = u.detach().split(self.sizes), NOTHING, dict[int, Mapping[str, Tensor]]()
+        last = max((turn for turn, number in enumerate(self._turns) if self.controls[number].refines), default=0)
         for turn, number in enumerate(self._turns):
             control = self.controls[number]
             found[number] = so_far if control.refines else NOTHING
-            if any(self.controls[later].refines for later in self._turns[turn + 1 :]):
+            if turn < last:
                 so_far = {**so_far, **control.inputs(parts[number], so_far)}
         return [(control, parts[number], found[number]) for number, control in enumerate(self.controls)]
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Apply what controls do to the finished picture (H, W, 3) sRGB, in their order; differentiable in both."""
-        for control, part in self.slices(u):
-            image = control.picture(part, image)
+        for control, part in zip(self.controls, u.split(self.sizes), strict=True):
+            if type(control).picture is not BoundControl.picture:
+                image = control.picture(part, image)
         return image
 
     def describe(self, u: Tensor, controls: Sequence[BoundControl] | None = None) -> dict[str, Value]:

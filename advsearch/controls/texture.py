@@ -35,8 +35,8 @@ from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Contr
 from advsearch.controls.values import LARGEST_EPSILON
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
-from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
+from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.surface_map import Mask, texel_area, texels_of_faces
 
@@ -338,6 +338,7 @@ class BoundTexture(BoundControl):
         self._painter = painter
         self._materials = materials
         self.start = painter.start
+        self._unchanged = painter.texels(painter.start)
         self.groups = (painter.group,)
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
@@ -351,7 +352,7 @@ class BoundTexture(BoundControl):
         return original.index_put(self._where.to(u.device).nonzero(as_tuple=True), painted)
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        change = self._painter.texels(u.detach()) - self._painter.texels(self.start.to(u.device))
+        change = self._painter.texels(u.detach()) - self._unchanged.to(u.device)
         named: dict[str, Value] = {f"{self.name}.materials": {"value": self._materials, "unit": "name"}}
         return (named if self._materials else {}) | {
             f"{self.name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},

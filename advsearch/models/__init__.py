@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from advsearch.models.labels import LabelSet, find_label_set, matching_labels, read_labels
 from advsearch.models.loading import load_model
-from advsearch.models.model import Model, ModelWarning
-from advsearch.models.preprocessing import Preprocessing
+from advsearch.models.model import Model, ModelWarning, Preprocessing
 
 __all__ = [
     "LabelSet",

@@ -7,8 +7,7 @@ from typing import Any, final
 
 from torch import Tensor
 
-from advsearch.models.model import Model, joined
-from advsearch.models.preprocessing import Preprocessing
+from advsearch.models.model import Model, Preprocessing, joined
 
 Outputs = tuple[Any, ...]
 """What each of several models answers to one picture."""

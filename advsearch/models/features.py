@@ -75,7 +75,8 @@ class Features:
             InputError: not an image, or values that are clearly not in [0, 1].
         """
         images = checked_images(images)
-        parts = [self.read(x)[:count].float() for x, count in self.model.batches(images)]
+        batches = images.split(self.model.batch_limits[1])
+        parts = [self.read(self.model.prepared(one))[: len(one)].float() for one in batches]
         return (parts[0] if len(parts) == 1 else torch.cat(parts)).to(images.device)
 
 
@@ -83,7 +84,7 @@ def features_of(model: Model) -> Features:
     """Return the penultimate features of a model, found by showing it grey images; see the module's docstring."""
     grey = torch.full((min(2, model.batch_limits[1]), *model.input_size, 3), 0.5)
     with torch.no_grad():
-        x = next(model.batches(grey))[0]
+        x = model.prepared(grey)
         for find in (_layer, _node):
             found = find(model, x)
             if found is not None:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, final
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import LabelSet, find_label_set
-from advsearch.models.preprocessing import Preprocessing
+from advsearch.models.preprocessing import Triple
 
 CPU = torch.device("cpu")
 
@@ -39,6 +40,58 @@ GIVEN_BY = {
 
 class ModelWarning(UserWarning):
     """A model that works, but not as an attack would like it to (probabilities, randomness, no gradient)."""
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """What happens to an image before the network sees it, in this order.
+
+    1. Antialiased bilinear resize to `input_size` (only if the size differs).
+    2. `x -> low + (high - low) x`, from [0, 1] to `value_range`.
+    3. Channel order: RGB, or reversed to BGR.
+    4. `x -> (x - mean) / std`, in the units of `value_range` and in the order of `channels`.
+    5. Layout: NCHW (contiguous), or NHWC.
+
+    Where there is a `processor`, it stands for steps 2 to 4.
+
+    Args:
+        input_size: (height, width) in pixels.
+        mean: three numbers, one per channel.
+        std: three positive numbers, one per channel.
+        value_range: (low, high) that black and white are sent to.
+        layout: ``"NCHW"`` or ``"NHWC"``.
+        channels: ``"RGB"`` or ``"BGR"``.
+        processor: from pictures (N, 3, H, W) in [0, 1], RGB, to what the network takes, of the same shape.
+    """
+
+    input_size: tuple[int, int]
+    mean: Triple = (0.0, 0.0, 0.0)
+    std: Triple = (1.0, 1.0, 1.0)
+    value_range: tuple[float, float] = (0.0, 1.0)
+    layout: str = "NCHW"
+    channels: str = "RGB"
+    processor: Callable[[Tensor], Tensor] | None = None
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Preprocess images (N, H, W, 3), display-referred sRGB in [0, 1], any floating dtype; differentiable."""
+        x = images.permute(0, 3, 1, 2)
+        if (x.shape[2], x.shape[3]) != self.input_size:
+            x = F.interpolate(x, size=self.input_size, mode="bilinear", align_corners=False, antialias=True)
+        if self.processor:
+            x = self.processor(x)
+        else:
+            gain, offset = self._affine
+            x = x.flip(1) if self.channels == "BGR" else x
+            if gain != [1.0] * 3 or offset != [0.0] * 3:
+                x = torch.addcmul(x.new_tensor(offset).view(3, 1, 1), x, x.new_tensor(gain).view(3, 1, 1))
+        return x.contiguous() if self.layout == "NCHW" else x.permute(0, 2, 3, 1).contiguous()
+
+    @cached_property
+    def _affine(self) -> tuple[list[float], list[float]]:
+        """Steps 2 and 4 as a factor and a summand per channel, in the network's channel order."""
+        low, high = self.value_range
+        gain = [(high - low) / std for std in self.std]
+        return gain, [(low - mean) / std for mean, std in zip(self.mean, self.std, strict=True)]
 
 
 @final
@@ -108,39 +161,36 @@ class Model:
             ModelError: the network's answer is not (N, classes), or `read` finds no output in it.
         """
         images = checked_images(images)
-        parts = [self.ask(x)[:count] for x, count in self.batches(images)]
-        together = joined(parts)
-        return each_tensor(together, lambda one: one.to(images.device))
+        parts = [self.ask(self.prepared(part))[: len(part)] for part in images.split(self.batch_limits[1])]
+        output = parts[0] if len(parts) == 1 else joined(parts)
+        if isinstance(output, Tensor):
+            return output.to(images.device)
+        return each_tensor(output, lambda one: one.to(images.device))
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
         """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or ``"#504"``; see `find_label_set`."""
         return find_label_set(text, self.labels, named=self.named)
 
-    def batches(self, images: Tensor) -> Iterator[tuple[Tensor, int]]:
-        """Yield what the network is given for images (N, H, W, 3), and how many rows of each part count.
+    def prepared(self, images: Tensor) -> Tensor:
+        """Return what the network is given for images (N, H, W, 3), no more than it takes at once.
 
-        Parts are within `batch_limits`, preprocessed, and of the network's type and device. A part that is too small is
-        padded with its last image.
+        They are preprocessed, and of the network's type and device. Where they are too few, the last one is repeated.
         """
-        fewest, most = self.batch_limits
-        for part in torch.split(images, most):
-            missing = fewest - len(part)
-            full = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else part
-            yield self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(self.dtype), len(part)
+        missing = self.batch_limits[0] - len(images)
+        full = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else images
+        return self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(self.dtype)
 
-    def ask(self, x: Tensor) -> Any:
-        """Return the output for a batch as `batches` yields it."""
-        answer = self.answer(x)
-        if self.read is not None:
-            return read_by(self.read, answer, len(x), self.name)
-        logits = logits_of(answer, len(x), self.classes, self.name)
-        return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
-
-    def answer(self, x: Tensor) -> Any:
-        """Return what the network itself gives for a batch as `batches` yields it."""
+    def ask(self, x: Tensor, *, raw: bool = False) -> Any:
+        """Return the output for a batch as `prepared` returns it, or, if `raw`, what the network itself gives."""
         mode = Detaching(ignored=True) if self.attached and torch.is_grad_enabled() else nullcontext()
         with mode, torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
-            return self.module(x)
+            answer = self.module(x)
+        if raw:
+            return answer
+        if self.read is not None:
+            return read_by(self.read, answer, len(x), self.name)
+        logits = logits_of(answer, len(x), len(self.labels), self.name)
+        return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
 
 
 class Detaching(TorchFunctionMode):
@@ -213,8 +263,6 @@ def described(answer: Any) -> str:
 
 def joined(parts: Sequence[Any]) -> Any:
     """Return the outputs of several batches as one: tensors (N, ...) and lists are put end to end."""
-    if len(parts) == 1:
-        return parts[0]
     return torch.cat(list(parts)) if isinstance(parts[0], Tensor) else [one for part in parts for one in part]
 
 
@@ -239,7 +287,8 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
         ModelError: there is no such tensor, or its shape or type is not that of logits.
     """
     if isinstance(output, Tensor) and output.is_floating_point() and output.shape == (count, classes):
-        mend_batch_norms(output)
+        if output.requires_grad:
+            mend_batch_norms(output)
         return output.float()
     tensor = _tensor_in(output)
     expected = f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
@@ -271,7 +320,10 @@ def mend_batch_norms(output: Any) -> None:
         waiting.append(one.grad_fn)
         return one
 
-    each_tensor(output, keep)
+    if isinstance(output, Tensor):
+        waiting.append(output.grad_fn)
+    else:
+        each_tensor(output, keep)
     seen = {None}
     while waiting:
         node = waiting.pop()

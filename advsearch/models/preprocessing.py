@@ -1,14 +1,12 @@
-"""From display-referred images to what a network eats: size, value range, channel order, normalisation, layout."""
+"""From what a user writes of preprocessing (Python values, or strings from a command line) to the fields of
+`advsearch.models.model.Preprocessing`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
-import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.errors import InputError
@@ -23,58 +21,6 @@ PRESETS: dict[str, tuple[Triple, Triple]] = {
 }
 LAYOUTS = ("NCHW", "NHWC")
 CHANNELS = ("RGB", "BGR")
-
-
-@dataclass(frozen=True)
-class Preprocessing:
-    """What happens to an image before the network sees it, in this order.
-
-    1. Antialiased bilinear resize to `input_size` (only if the size differs).
-    2. `x -> low + (high - low) x`, from [0, 1] to `value_range`.
-    3. Channel order: RGB, or reversed to BGR.
-    4. `x -> (x - mean) / std`, in the units of `value_range` and in the order of `channels`.
-    5. Layout: NCHW (contiguous), or NHWC.
-
-    Where there is a `processor`, it stands for steps 2 to 4.
-
-    Args:
-        input_size: (height, width) in pixels.
-        mean: three numbers, one per channel.
-        std: three positive numbers, one per channel.
-        value_range: (low, high) that black and white are sent to.
-        layout: ``"NCHW"`` or ``"NHWC"``.
-        channels: ``"RGB"`` or ``"BGR"``.
-        processor: from pictures (N, 3, H, W) in [0, 1], RGB, to what the network takes, of the same shape.
-    """
-
-    input_size: tuple[int, int]
-    mean: Triple = (0.0, 0.0, 0.0)
-    std: Triple = (1.0, 1.0, 1.0)
-    value_range: tuple[float, float] = (0.0, 1.0)
-    layout: str = "NCHW"
-    channels: str = "RGB"
-    processor: Callable[[Tensor], Tensor] | None = None
-
-    def __call__(self, images: Tensor) -> Tensor:
-        """Preprocess images (N, H, W, 3), display-referred sRGB in [0, 1], any floating dtype; differentiable."""
-        x = images.permute(0, 3, 1, 2)
-        if (x.shape[2], x.shape[3]) != self.input_size:
-            x = F.interpolate(x, size=self.input_size, mode="bilinear", align_corners=False, antialias=True)
-        x = self.processor(x) if self.processor else self._normalise(x.flip(1) if self.channels == "BGR" else x)
-        return x.contiguous() if self.layout == "NCHW" else x.permute(0, 2, 3, 1).contiguous()
-
-    def _normalise(self, x: Tensor) -> Tensor:
-        """Steps 2 and 4 as one affine map per channel, on (N, 3, H, W) in the network's channel order."""
-        low, high = self.value_range
-        gain = [(high - low) / std for std in self.std]
-        offset = [(low - mean) / std for mean, std in zip(self.mean, self.std, strict=True)]
-        if gain == [1.0] * 3 and offset == [0.0] * 3:
-            return x
-        return torch.addcmul(x.new_tensor(offset).view(3, 1, 1), x, x.new_tensor(gain).view(3, 1, 1))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# from what a user writes (Python values, or strings from a command line) to the fields above
 
 
 def parse_input_size(value: Any) -> tuple[int, int]:

@@ -147,10 +147,9 @@ def _run(model: Model, images: Tensor) -> Tensor:
 
 def _answer(model: Model, images: Tensor) -> tuple[Any, int]:
     """Return what the network gives for images (N, H, W, 3), and for how many: no fewer than it takes at once."""
-    padded = torch.cat([images, images[-1:].expand(max(model.batch_limits[0] - len(images), 0), -1, -1, -1)])
-    x = model.preprocessing(padded.to(model.device)).to(model.dtype)
+    x = model.prepared(images)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
-        return _guarded(model, lambda: model.answer(x)), len(padded)
+        return _guarded(model, lambda: model.ask(x, raw=True)), len(x)
 
 
 def _numbers(output: Any) -> Tensor:

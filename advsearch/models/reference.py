@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
 from advsearch.errors import ModelError
-from advsearch.models.model import Model
-from advsearch.models.preprocessing import Preprocessing
+from advsearch.models.model import Model, Preprocessing
 from advsearch.models.probe import probe
 from advsearch.models.source import load_weights, source_of
 
@@ -81,17 +80,11 @@ class _Convolution(nn.Module):
     def __init__(self, inputs: int, outputs: int, size: int, *, stride: int = 1) -> None:
         super().__init__()
         self.convolve = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
-        self.normalise: nn.BatchNorm2d | nn.Identity = nn.BatchNorm2d(outputs)
+        self.normalise = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         result: Tensor = self.normalise(self.convolve(x))
         return result
-
-    def fold(self) -> None:
-        """Merge the normalisation into the convolution (inference only)."""
-        if isinstance(self.normalise, nn.BatchNorm2d):
-            self.convolve = fuse_conv_bn_eval(self.convolve, self.normalise)
-            self.normalise = nn.Identity()
 
 
 class _Residual(nn.Module):
@@ -127,9 +120,10 @@ def build(classes: int, *, dropout: float = 0.1) -> ReferenceNet:
 def folded(net: ReferenceNet) -> ReferenceNet:
     """Return a copy for inference: evaluation mode, normalisation merged into the convolutions, parameters frozen."""
     copied = copy.deepcopy(net).eval().requires_grad_(False)
-    for module in copied.modules():
-        if isinstance(module, _Convolution):
-            module.fold()
+    for module in list(copied.modules()):
+        for name, one in module.named_children():
+            if isinstance(one, _Convolution):
+                setattr(module, name, fuse_conv_bn_eval(one.convolve, one.normalise))
     return copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 

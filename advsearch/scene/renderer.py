@@ -91,6 +91,9 @@ class Renderer:
         estimators: estimators forced by "control.parameter", "control" or "*".
     """
 
+    _predicts = False
+    """Whether every derivative runs back through scene inputs, whatever the plan says."""
+
     def __init__(
         self,
         scene: MitsubaScene,
@@ -164,13 +167,11 @@ class Renderer:
             InputError: u has another shape, or values outside [0, 1], or spp is out of range; or u requires a
                 gradient and was made in `torch.inference_mode`.
         """
-        u = _tensor(u)
+        u = u if isinstance(u, Tensor) else _tensor(u)
         if u.ndim == 2 and len(u):
             return torch.stack([self(one, seed, spp) for one in u])
-        self._check(u, spp)
+        u, through = self._given(u, spp)
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-            u = u.clone() if u.is_inference() else u
-            through = self._through(u) if u.requires_grad else u
             image = self._picture(through, seed, spp)
             if through is not u and torch.is_grad_enabled() and self._differenced():
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
@@ -181,10 +182,9 @@ class Renderer:
 
         Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not.
         """
-        u = self._check(_tensor(u), spp)
+        _, through = self._given(u, spp)
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-            through = self._through(u.clone() if u.is_inference() else u)
-            return self._formed(self.scene.assembly(self.space.inputs(through)), seed, spp)
+            return self._picture(through, seed, spp, shown=False)
 
     def mask(self, u: Configuration) -> Tensor:
         """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.
@@ -200,7 +200,7 @@ class Renderer:
             u: (d,) in [0, 1].
             fineness: into how many parts each side of a pixel is cut, to be looked at each.
         """
-        u = self._check(_tensor(u), 1)
+        u, _ = self._given(u, 1)
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
         return self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE}, fineness)
@@ -239,7 +239,16 @@ class Renderer:
                     central(lambda at: loss(self._picture(at, noise, count)), group, u.detach(), derivative)
         return value.detach(), derivative
 
-    def _check(self, u: Tensor, spp: int) -> Tensor:
+    # ---- from u to the picture --------------------------------------------------------------------------------------
+
+    def _given(self, u: Configuration, spp: int) -> tuple[Tensor, Tensor]:
+        """Return a configuration as float32, and with a graph only where the derivative runs back through scene inputs
+        or the picture.
+
+        Raises:
+            InputError: see `__call__`.
+        """
+        u = u.float() if isinstance(u, Tensor) else _tensor(u)
         if u.shape != self._shape:
             raise InputError(f"render: expected u of shape {tuple(self._shape)}, got {tuple(u.shape)}")
         if not 1 <= spp <= MAX_SPP:
@@ -252,21 +261,17 @@ class Renderer:
                 "render: u was made in `torch.inference_mode()`, so that nothing can be differentiated with respect to "
                 "it; make it outside, or pass `u.detach()` for the picture alone"
             )
-        return u
+        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+            u = u.clone() if u.is_inference() else u
+            if self._predicts or not u.requires_grad or bool((mask := self.plan.through).all()):
+                return u, u
+            return u, u.detach() + mask * (u - u.detach())
 
-    # ---- from u to the picture --------------------------------------------------------------------------------------
-
-    def _picture(self, u: Tensor, seed: int, spp: int) -> Tensor:
-        radiance = self._formed(self.scene.assembly(self.space.inputs(u)), seed, spp)
-        return self.space.picture(u, self.formation.display(radiance))
-
-    def _through(self, u: Tensor) -> Tensor:
-        """Return u with a graph only where the derivative runs back through scene inputs or the picture."""
-        mask = self.plan.through_inputs(len(u))
-        return u if bool(mask.all()) else u.detach() + mask * (u - u.detach())
-
-    def _formed(self, inputs: dict[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Radiance of scene inputs with exposure and backdrop."""
+    def _picture(
+        self, u: Tensor, seed: int, spp: int, given: dict[str, Tensor] | None = None, *, shown: bool = True
+    ) -> Tensor:
+        """The picture of u, or with scene inputs in the place of its own; or else the radiance that is to be shown."""
+        inputs = self.scene.assembly(self.space.inputs(u)) if given is None else given
         exposure, backdrop = inputs.pop("camera.exposure", None), inputs.pop("backdrop.color", None)
         rendered = self._rendered(inputs, seed, spp, backdrop is not None)
         radiance = rendered[..., :3]
@@ -275,61 +280,11 @@ class Renderer:
         if backdrop is not None:
             uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
             radiance = radiance + uncovered * (backdrop / self.formation.gain)
-        return radiance
+        return self.space.picture(u, self.formation.display(radiance)) if shown else radiance
 
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
-        """Radiance of scene inputs, with a graph, and with coverage if hidden."""
+        """Radiance of scene inputs, with a graph, and with coverage if hidden; counted in `renders`."""
         found: Tensor = _Radiance.apply(self, tuple(inputs), seed, spp, hide, *inputs.values())  # type: ignore[no-untyped-call]
-        return found
-
-    # ---- the halves of the autograd functions -----------------------------------------------------------------------
-
-    def primal(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool = False) -> Tensor:
-        """Radiance of given scene inputs, without a graph, with coverage if hidden; counted in `renders`."""
-        noise = seeds.stream(self.root_seed, "primal", seed)
-        if self._source is not None:
-            self.renders += 1
-            return self._finite(self._source(inputs, noise, spp))
-        wanted = {"hidden" if hide else "path": noise}
-        if self.formation.denoiser == "oidn":
-            wanted["guides"] = seeds.stream(self.root_seed, "guides", seed)
-        rendered, *guides = self.scene.pictures(inputs, wanted, spp)
-        rendered = self._finite(rendered)
-        for guide in guides:
-            noisy, quick = rendered[..., :3].contiguous(), self.formation.quick
-            clean = denoise(noisy, guide[..., :3], guide[..., 3:], quick=quick)
-            rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
-        self.renders += 1
-        return rendered
-
-    def backward(
-        self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, hide: bool = False
-    ) -> dict[str, Tensor]:
-        """Gradient of `sum(cotangent * radiance)` for the inputs whose coordinates use an adjoint.
-
-        The denoiser counts as the identity. An input that no coordinate needs is left out.
-        """
-        noise = seeds.stream(self.root_seed, "gradient", seed)
-        cotangent = self._finite(cotangent[..., :3])
-        found, left = dict[str, Tensor](), list(inputs)
-        for estimator in ("material", "adjoint"):  # what two reach goes to the more general one
-            groups = [group for group in self.plan.groups if group.estimator == estimator]
-            reached = set[str]().union(*(self.routes.get(group.name, ()) for group in groups))
-            if estimator == "adjoint":
-                reached &= self.scene.interior
-            wrt = [name for name in left if name in reached]
-            if not wrt:
-                continue
-            left = [name for name in left if name not in reached]
-            if estimator == "material":
-                meshes = sorted({name.rpartition(".")[0] for name in wrt})
-                gradients = self.scene.material_adjoint(inputs, cotangent, noise, spp, meshes=meshes)
-            else:
-                method = "hidden" if hide else "path"
-                gradients = self.scene.adjoint(inputs, cotangent, noise, spp, wrt=wrt, method=method)
-            self.gradients += 1
-            for name, gradient in gradients.items():
-                found[name] = self._finite(gradient)
         return found
 
     def _finite(self, values: Tensor) -> Tensor:
@@ -405,7 +360,7 @@ class Renderer:
 
 
 def _tensor(u: Configuration) -> Tensor:
-    """u as float32, with its graph if it has one."""
+    """u as float32."""
     try:
         return torch.as_tensor(u, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError):
@@ -419,16 +374,56 @@ class _Radiance(torch.autograd.Function):
     def forward(
         ctx: Any, renderer: Renderer, names: tuple[str, ...], seed: int, spp: int, hide: bool, *tensors: Tensor
     ) -> Tensor:
+        """Radiance of given scene inputs, with coverage if hidden."""
         ctx.renderer, ctx.names, ctx.seed, ctx.spp, ctx.hide = renderer, names, seed, spp, hide
         ctx.save_for_backward(*tensors)
-        return renderer.primal(dict(zip(names, tensors, strict=True)), seed, spp, hide)
+        inputs, noise = dict(zip(names, tensors, strict=True)), seeds.stream(renderer.root_seed, "primal", seed)
+        if renderer._source is None:
+            wanted = {"hidden" if hide else "path": noise}
+            if renderer.formation.denoiser == "oidn":
+                wanted["guides"] = seeds.stream(renderer.root_seed, "guides", seed)
+            rendered, *guides = renderer.scene.pictures(inputs, wanted, spp)
+        else:
+            rendered, guides = renderer._source(inputs, noise, spp), []
+        rendered = renderer._finite(rendered)
+        for guide in guides:
+            noisy, quick = rendered[..., :3].contiguous(), renderer.formation.quick
+            clean = denoise(noisy, guide[..., :3], guide[..., 3:], quick=quick)
+            rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
+        renderer.renders += 1
+        return rendered
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradient of `sum(cotangent * radiance)` for the inputs whose coordinates use an adjoint.
+
+        The denoiser counts as the identity. An input that no coordinate needs is left out.
+        """
+        renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
-        gradients = ctx.renderer.backward(inputs, cotangent, ctx.seed, ctx.spp, ctx.hide)
-        return None, None, None, None, None, *(gradients.get(name) for name in ctx.names)
+        noise = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
+        cotangent = renderer._finite(cotangent[..., :3])
+        found, left = dict[str, Tensor](), list(inputs)
+        for estimator in ("material", "adjoint"):  # what two reach goes to the more general one
+            groups = [group for group in renderer.plan.groups if group.estimator == estimator]
+            reached = set[str]().union(*(renderer.routes.get(group.name, ()) for group in groups))
+            if estimator == "adjoint":
+                reached &= renderer.scene.interior
+            wrt = [name for name in left if name in reached]
+            if not wrt:
+                continue
+            left = [name for name in left if name not in reached]
+            if estimator == "material":
+                meshes = sorted({name.rpartition(".")[0] for name in wrt})
+                gradients = renderer.scene.material_adjoint(inputs, cotangent, noise, ctx.spp, meshes=meshes)
+            else:
+                method = "hidden" if ctx.hide else "path"
+                gradients = renderer.scene.adjoint(inputs, cotangent, noise, ctx.spp, wrt=wrt, method=method)
+            renderer.gradients += 1
+            for name, gradient in gradients.items():
+                found[name] = renderer._finite(gradient)
+        return None, None, None, None, None, *(found.get(name) for name in ctx.names)
 
 
 class _Differences(torch.autograd.Function):

@@ -26,7 +26,7 @@ from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
 from advsearch.tasks.box_readings import KNOWN, UNITS, Reading, strongest_boxes, unit_in
 from advsearch.tasks.boxes import FORMS, left_over, overlap, share_inside, strongest
-from advsearch.tasks.classes import NO, ClassTask, Labels
+from advsearch.tasks.classification import NO, ClassTask, Labels
 from advsearch.tasks.detector_answers import (
     ORDERS,
     QUERIES,

@@ -14,8 +14,7 @@ from torch import Tensor
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
-from advsearch.tasks.classes import NO, ClassTask, Labels
-from advsearch.tasks.classification import members, target_lead, wrong_lead
+from advsearch.tasks.classification import NO, ClassTask, Labels, members, target_lead, wrong_lead
 
 EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
 

@@ -21,8 +21,7 @@ from advsearch.models import Model
 from advsearch.models.zoo.features import PARTS, pooled
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Judgement
-from advsearch.tasks.classes import Labels
-from advsearch.tasks.classification import Classification
+from advsearch.tasks.classification import Classification, Labels
 from advsearch.tasks.gallery import Gallery, embedded, folders_of, seen_by
 
 METHODS = ("nearest", "linear")

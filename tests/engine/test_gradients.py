@@ -66,7 +66,7 @@ def test_the_first_plan_takes_what_is_preferred_and_obeys_force() -> None:
     steps = torch.full((11,), 0.02)
     plan = first_plan(groups, steps)
     assert [one.estimator for one in plan.groups] == ["secant", "adjoint", "none"]
-    assert plan.renders == 2 and plan.through_inputs(11).tolist() == [0.0] + [1.0] * 9 + [0.0]
+    assert plan.renders == 2 and plan.through.tolist() == [0.0] + [1.0] * 9 + [0.0]
     forced = first_plan(groups, steps, {"pose": "material", "texture.texels": "secant"})
     assert [one.estimator for one in forced.groups] == ["material", "secant", "none"]
     assert "forced" in forced.groups[0].reason

@@ -50,6 +50,28 @@ def test_a_score_over_zero_is_a_success(task: Classification, scores: list[float
     assert task.goal == goal
 
 
+@dataclass(frozen=True, kw_only=True)
+class Doubled(Classification):
+    """Says a lead of its own."""
+
+    def margin(self, output: Tensor, truth: tuple[int, ...]) -> Tensor:
+        return 2.0 * super().margin(output, truth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shifted(Classification):
+    """Says a success of its own."""
+
+    def score(self, output: Tensor, truth: tuple[int, ...]) -> Tensor:
+        return super().score(output, truth) + 1.0
+
+
+def test_a_task_with_a_margin_or_a_score_of_its_own_judges_by_it() -> None:
+    doubled, shifted = Doubled(labels=NAMED.labels), Shifted(labels=NAMED.labels)
+    assert [(one.score, one.margin) for one in doubled.judge(LOGITS[:2], (0,))] == [(-4.0, -4.0), (4.0, 4.0)]
+    assert [(one.score, one.margin) for one in shifted.judge(LOGITS[:2], (0,))] == [(-1.0, -2.0), (3.0, 2.0)]
+
+
 def test_an_answer_is_the_largest_logit_in_words_with_its_probability() -> None:
     first, second, *_ = NAMED.answers(LOGITS[:1], 2)[0]
     shares = LOGITS[0].softmax(dim=0).tolist()

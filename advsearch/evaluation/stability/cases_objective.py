@@ -15,8 +15,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.search import Toy, numbers, quadratic
 from advsearch.files import JsonObject
-from advsearch.models.model import Model
-from advsearch.models.preprocessing import Preprocessing
+from advsearch.models.model import Model, Preprocessing
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Classification, Judgement
 

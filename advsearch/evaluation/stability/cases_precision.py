@@ -27,8 +27,7 @@ from advsearch.evaluation.stability.scene import SIZE, Controls, small
 from advsearch.evaluation.stability.search import Toy
 from advsearch.models import load_model
 from advsearch.scene.assets import Floats
-from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.formation import linear_to_srgb, to_8_bit
 
 LONG = 10_000
 BITS = 1e-5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 BY_DIFFERENCES = frozenset({"differences", "secant"})
 """Estimators that take primal renders."""
@@ -70,7 +71,7 @@ class Group:
         """Where the group lies in u."""
         return slice(self.begin, self.begin + self.size)
 
-    @property
+    @cached_property
     def name(self) -> str:
         """`control.parameter`."""
         return f"{self.control}.{self.parameter}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypedDict
 
 import torch
@@ -93,9 +94,10 @@ class GradientPlan:
         """Primal renders of one gradient, adjoints not counted."""
         return sum(group.renders for group in self.groups)
 
-    def through_inputs(self, dimension: int) -> Tensor:
-        """Return (d,) float32: 1 for coordinates whose derivative runs back through scene inputs or the picture."""
-        mask = torch.zeros(dimension)
+    @cached_property
+    def through(self) -> Tensor:
+        """(d,) float32: 1 for coordinates whose derivative runs back through scene inputs or the picture."""
+        mask = torch.zeros(sum(group.size for group in self.groups))
         for group in self.groups:
             if group.estimator in BY_ADJOINT or group.estimator == "image":
                 mask[group.begin : group.begin + group.size] = 1.0

@@ -27,7 +27,6 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 """Of red, green and blue (ITU-R BT.709); likewise."""
 
 
-@one_at_a_time
 def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = False) -> Tensor:
     """Return the denoised linear radiance.
 
@@ -40,19 +39,20 @@ def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = F
     Raises:
         EnvironmentSetupError: the package is not installed.
     """
-    try:
-        import mitsuba_oidn
-    except ImportError as error:
-        raise EnvironmentSetupError(
-            f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use `denoise=none`"
-        ) from error
-    color, guide, direction, output = _buffers((radiance.shape[0], radiance.shape[1]), threading.get_ident())
-    gain = _gain(radiance.detach())
-    for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
-        buffer.copy_(image.detach())
-    quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
-    mitsuba_oidn.denoise(color, guide, direction, hdr=True, quality=quality, input_scale=1.0, output=output)
-    return (output / gain).to(radiance.device)
+    with one_at_a_time:
+        try:
+            import mitsuba_oidn
+        except ImportError as error:
+            raise EnvironmentSetupError(
+                f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use `denoise=none`"
+            ) from error
+        color, guide, direction, output = _buffers((radiance.shape[0], radiance.shape[1]), threading.get_ident())
+        gain = _gain(radiance.detach())
+        for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
+            buffer.copy_(image.detach())
+        quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
+        mitsuba_oidn.denoise(color, guide, direction, hdr=True, quality=quality, input_scale=1.0, output=output)
+        return (output / gain).to(radiance.device)
 
 
 @lru_cache(maxsize=8)

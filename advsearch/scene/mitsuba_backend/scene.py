@@ -34,7 +34,7 @@ from advsearch.scene.mitsuba_backend.parts import (
     translation,
 )
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, media_in, mitsuba, one_at_a_time, population
+from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, media_in, mitsuba, one_at_a_time, population
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -75,7 +75,6 @@ class MitsubaScene:
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
     """
 
-    @one_at_a_time
     def __init__(
         self,
         description: SceneDescription,
@@ -87,62 +86,64 @@ class MitsubaScene:
         sampler: str = SAMPLER,
         integrator: str = "prb",
     ) -> None:
-        mi = mitsuba()
-        self.made = (description, filter)
-        self.resolution = resolution
-        self.sampler = sampler
-        self.assembly = Assembly(description)
-        self.max_depth = max_depth
-        self._depth = max_depth
-        self._leave_out = frozenset(leave_out)
-        unrecorded = description.thin_lens or any(map(textured_emission, description.meshes.values()))
-        self._freeze = "tracing" in leave_out and not unrecorded  # Dr.Jit can record neither of these
-        self._thin_lens = description.thin_lens
-        self._backdrop = description.backdrop
-        if description.backdrop and description.emits:
-            raise InputError(
-                "background: Mitsuba hides surfaces that emit light together with the environment; leave the plain "
-                "background out, or take an object and surroundings without emission"
-            )
-        self._guides: Plugin = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
-        if description.cut_out:
-            import advsearch.scene.mitsuba_backend.guides  # noqa: F401  (registers the integrator)
+        with one_at_a_time:
+            mi = mitsuba()
+            self.made = (description, filter)
+            self.resolution = resolution
+            self.sampler = sampler
+            self.assembly = Assembly(description)
+            self.max_depth = max_depth
+            self._depth = max_depth
+            self._leave_out = frozenset(leave_out)
+            unrecorded = description.thin_lens or any(map(textured_emission, description.meshes.values()))
+            self._freeze = "tracing" in leave_out and not unrecorded  # Dr.Jit can record neither of these
+            self._thin_lens = description.thin_lens
+            self._backdrop = description.backdrop
+            if description.backdrop and description.emits:
+                raise InputError(
+                    "background: Mitsuba hides surfaces that emit light together with the environment; leave the plain "
+                    "background out, or take an object and surroundings without emission"
+                )
+            self._guides: Plugin = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
+            if description.cut_out:
+                import advsearch.scene.mitsuba_backend.guides  # noqa: F401  (registers the integrator)
 
-            self._guides = {"type": "advsearch_guides"}
-        self.volumetric = any(part.volumetric for part in description.parts)
-        plugins = scene_dict(description, resolution, filter, sampler)
-        translated = [mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)]
-        translated += [translation(description.meshes.get(part.name, part)) for part in description.parts]
-        self._path: Plugin = {"type": integrator}
-        for one in translated:
-            plugins |= one.plugins
-            self._path |= one.integrator
-        if "emitters" in leave_out:
-            leave_dark_lamps_out(plugins, description.parts)
-        self._scene = loaded(plugins, description)
-        self._sensor = self._scene.sensors()[0]
-        self.parameters = mi.traverse(self._scene)
-        for name, weight in sampling_weights(description.meshes.values()).items():
-            self.parameters[f"{name}.emitter.sampling_weight"] = weight
-        self.parameters.update()
-        self._integrators: dict[tuple[str, int], Any] = {}
-        parts = [one for part in translated for one in part.inputs]
-        declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, GROUND_INPUT, *parts]
-        self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one))}
-        self.names = frozenset(self.declared)
-        self.interior = frozenset(name for name, (_, one) in self.declared.items() if one.interior)
-        self._buffers = frozenset(n for n, (key, _) in self.declared.items() if key.endswith((POSITIONS, NORMALS)))
-        self._literals = frozenset(n for n, (_, one) in self.declared.items() if one.write is plain_number)
-        self._base: dict[str, Any] = {}
-        self._applied: dict[str, Tensor] = {}
-        self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
-        self._recorded_at = (0, 0)
-        population.bury()
-        media = media_in(self._scene) if self.volumetric else ()
-        population.add(self, self._scene, self._integrators, self.parameters, media=media)
-        self._every: dict[str, Tensor] = {}
-        if "uploads" not in leave_out:
-            self._every = {name: self.base(name) for name in sorted(self.names)}
+                self._guides = {"type": "advsearch_guides"}
+            self.volumetric = any(part.volumetric for part in description.parts)
+            plugins = scene_dict(description, resolution, filter, sampler)
+            translated = [mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)]
+            translated += [translation(description.meshes.get(part.name, part)) for part in description.parts]
+            self._path: Plugin = {"type": integrator}
+            for one in translated:
+                plugins |= one.plugins
+                self._path |= one.integrator
+            if "emitters" in leave_out:
+                leave_dark_lamps_out(plugins, description.parts)
+            self._scene = loaded(plugins, description)
+            self._sensor = self._scene.sensors()[0]
+            self.parameters = mi.traverse(self._scene)
+            for name, weight in sampling_weights(description.meshes.values()).items():
+                self.parameters[f"{name}.emitter.sampling_weight"] = weight
+            self.parameters.update()
+            self._integrators: dict[tuple[str, int], Any] = {}
+            parts = [one for part in translated for one in part.inputs]
+            declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, GROUND_INPUT, *parts]
+            self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one))}
+            self.names = frozenset(self.declared)
+            self.interior = frozenset(name for name, (_, one) in self.declared.items() if one.interior)
+            self._buffers = frozenset(n for n, (key, _) in self.declared.items() if key.endswith((POSITIONS, NORMALS)))
+            self._literals = frozenset(n for n, (_, one) in self.declared.items() if one.write is plain_number)
+            self._base: dict[str, Any] = {}
+            self._applied: dict[str, Tensor] = {}
+            self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
+            self._recorded_at = (0, 0)
+            if population.unused:
+                population.bury()
+            media = media_in(self._scene) if self.volumetric else ()
+            population.add(self, self._scene, self._integrators, self.parameters, media=media)
+            self._every: dict[str, Tensor] = {}
+            if "uploads" not in leave_out:
+                self._every = {name: self.base(name) for name in sorted(self.names)}
 
     def like(self, **changes: Any) -> MitsubaScene:
         """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
@@ -175,7 +176,6 @@ class MitsubaScene:
         value = as_torch(self.parameters[key])
         return value if one.shape is None else value.reshape(one.shape)
 
-    @one_at_a_time
     def pictures(self, inputs: Mapping[str, Tensor], seeds: Mapping[str, int], spp: int) -> list[Tensor]:
         """Render pictures of one configuration with `spp` independent samples a pixel each.
 
@@ -192,35 +192,37 @@ class MitsubaScene:
             For each of `seeds` (H, W, 3) float32; of a scene with a backdrop (H, W, 4) with the coverage of its
             surfaces; of "guides" (H, W, 6), the first hit's albedo in [0, 1] and its shading normal.
         """
-        import drjit as dr
-        import mitsuba as mi
+        with one_at_a_time:
+            import drjit as dr
+            import mitsuba as mi
 
-        def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
-            image = integrator.render(scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=False)
-            sensor.sampler().seed(0, 1)  # otherwise the sampler's state keeps the whole render alive
-            return image
+            def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
+                image = integrator.render(scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=False)
+                sensor.sampler().seed(0, 1)  # otherwise the sampler's state keeps the whole render alive
+                return image
 
-        self._set(inputs)
-        population.bury()
-        spp = next_count(self.sampler, spp)
-        integrators = [self._integrator(what) for what in seeds]
-        now = (population.changes, dr.thread_count())  # a recording crashes in another thread pool
-        if self._recorded_at != now:
-            self._recorded.clear()
-            self._recorded_at = now
-        media = population.media() if self.volumetric else []
-        found: list[Tensor] = []
-        for (what, seed), integrator in zip(seeds.items(), integrators, strict=True):
-            key = what, spp, self._depth
-            if self._freeze and key not in self._recorded:
-                self._recorded[key] = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
-            function: Callable[..., Any] = self._recorded.get(key, render)
-            image = function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)).torch().clone()
-            if what == "guides":
-                image = image[..., -6:]
-                image[..., :3].clamp_(0.0, 1.0)
-            found.append(image)
-        return found
+            self._set(inputs)
+            if population.unused:
+                population.bury()
+            spp = next_count(self.sampler, spp)
+            integrators = [self._integrators.get((what, self._depth)) or self._integrator(what) for what in seeds]
+            now = (population.changes, dr.thread_count())  # a recording crashes in another thread pool
+            if self._recorded_at != now:
+                self._recorded.clear()
+                self._recorded_at = now
+            media = population.media() if self.volumetric else []
+            found: list[Tensor] = []
+            for (what, seed), integrator in zip(seeds.items(), integrators, strict=True):
+                key = what, spp, self._depth
+                if self._freeze and key not in self._recorded:
+                    self._recorded[key] = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
+                function: Callable[..., Any] = self._recorded.get(key, render)
+                image = function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)).torch().clone()
+                if what == "guides":
+                    image = image[..., -6:]
+                    image[..., :3].clamp_(0.0, 1.0)
+                found.append(image)
+            return found
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
         """Render linear radiance, without what the environment shows directly if hidden; as of `pictures`."""
@@ -231,20 +233,19 @@ class MitsubaScene:
         (both,) = self.pictures(inputs, {"guides": seed}, spp)
         return both[..., :3], both[..., 3:]
 
-    @one_at_a_time
     def held(self, inputs: Mapping[str, Tensor]) -> Any:
         """Return Mitsuba's scene with these inputs set, until the next call of anything here."""
-        self._set(inputs)
-        return self._scene
+        with one_at_a_time:
+            self._set(inputs)
+            return self._scene
 
-    @one_at_a_time
     def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; arguments as for `Renderer.surfaces`."""
-        self._set(inputs)
-        height, width = self.resolution
-        return first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
+        with one_at_a_time:
+            self._set(inputs)
+            height, width = self.resolution
+            return first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
 
-    @one_at_a_time
     def adjoint(
         self,
         inputs: Mapping[str, Tensor],
@@ -270,41 +271,46 @@ class MitsubaScene:
         Returns:
             For each of `wrt` a float32 tensor of the input's shape.
         """
-        import drjit as dr
-        import mitsuba as mi
+        with one_at_a_time:
+            import drjit as dr
+            import mitsuba as mi
 
-        wanted = tuple(inputs if wrt is None else wrt)
-        beside = set() if "gradients" in self._leave_out else set(self.interior)
-        plain = method == "path" and not self._thin_lens and not self.volumetric
-        if "boundary" not in self._leave_out and plain:  # Mitsuba's projective integrator knows no lens and no medium
-            method, beside = "boundary", beside | self._buffers
-        shown = cotangent.detach().to(torch.float32).contiguous()
-        if self._backdrop:
-            shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
-        self._set(inputs)
-        held, tracked = dict[str, Any](), dict[str, Any]()
-        try:
-            for name in (*sorted(beside - set(wanted)), *wanted):
-                key, one = self.declared[name]
-                own = self.parameters[key]
-                held[key] = type(own)(own)
-                value = inputs[name] if name in inputs else as_torch(own)
-                tracked[name] = mi.TensorXf(value.detach().to(torch.float32).contiguous())  # type: ignore[call-overload]
-                dr.enable_grad(tracked[name])
-                self.parameters[key] = one.write(tracked[name]) if one.write else tracked[name]
-            self.parameters.update()
-            spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)  # type: ignore[call-overload]
-            with fewer_warnings():
-                self._integrator(method).render_backward(
+            wanted = tuple(inputs if wrt is None else wrt)
+            beside = set() if "gradients" in self._leave_out else set(self.interior)
+            plain = method == "path" and not self._thin_lens and not self.volumetric
+            if "boundary" not in self._leave_out and plain:  # which knows no lens and no medium
+                method, beside = "boundary", beside | self._buffers
+            shown = cotangent.detach().to(torch.float32).contiguous()
+            if self._backdrop:
+                shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
+            self._set(inputs)
+            held, tracked, gradients = dict[str, Any](), dict[str, Any](), dict[str, Tensor]()
+            level = mi.log_level()
+            try:
+                for name in (*sorted(beside - set(wanted)), *wanted):
+                    key, one = self.declared[name]
+                    own = self.parameters[key]
+                    held[key] = type(own)(own)
+                    value = inputs[name] if name in inputs else as_torch(own)
+                    tracked[name] = mi.TensorXf(value.detach().to(torch.float32).contiguous())  # type: ignore[call-overload]
+                    dr.enable_grad(tracked[name])
+                    self.parameters[key] = one.write(tracked[name]) if one.write else tracked[name]
+                self.parameters.update()
+                spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)  # type: ignore[call-overload]
+                mi.set_log_level(mi.LogLevel.Error)  # it warns at every call of a film that samples beyond its border
+                integrator = self._integrators.get((method, self._depth)) or self._integrator(method)
+                integrator.render_backward(
                     self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
                 )
-            return {name: dr.grad(tracked[name]).torch().clone().reshape(inputs[name].shape) for name in wanted}
-        finally:
-            while held:  # what is put back must have no second owner, see `_set`
-                self.parameters.__setitem__(*held.popitem())
-            self.parameters.update()
+                for name in wanted:
+                    gradients[name] = dr.grad(tracked[name]).torch().clone().reshape(inputs[name].shape)
+                return gradients
+            finally:
+                mi.set_log_level(level)
+                while held:  # what is put back must have no second owner, see `_set`
+                    self.parameters.__setitem__(*held.popitem())
+                self.parameters.update()
 
-    @one_at_a_time
     def material_adjoint(
         self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, *, meshes: Collection[str]
     ) -> dict[str, Tensor]:
@@ -317,28 +323,28 @@ class MitsubaScene:
             spp: samples a pixel of the interior term.
             meshes: names of the meshes.
         """
-        from advsearch.scene.mitsuba_backend.material_form.adjoint import material_adjoint
+        with one_at_a_time:
+            from advsearch.scene.mitsuba_backend.material_form.adjoint import material_adjoint
 
-        self._set(inputs)
-        names = list(meshes)
-        by_vertices, by_normals = material_adjoint(
-            self._scene,
-            self._sensor,
-            self.parameters,
-            mesh_key=names,
-            vertices=[inputs[f"{name}.vertices"] for name in names],
-            normals=[inputs[f"{name}.normals"] for name in names],
-            cotangent=cotangent,
-            seed=seed,
-            spp=spp,
-            max_depth=self._depth,
-            shadow_spp=SHADOW_SPP,
-        )
-        population.changes += 1  # the first call loads integrators of its own
-        found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
-        return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
+            self._set(inputs)
+            names = list(meshes)
+            by_vertices, by_normals = material_adjoint(
+                self._scene,
+                self._sensor,
+                self.parameters,
+                mesh_key=names,
+                vertices=[inputs[f"{name}.vertices"] for name in names],
+                normals=[inputs[f"{name}.normals"] for name in names],
+                cotangent=cotangent,
+                seed=seed,
+                spp=spp,
+                max_depth=self._depth,
+                shadow_spp=SHADOW_SPP,
+            )
+            population.changes += 1  # the first call loads integrators of its own
+            found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
+            return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
 
-    @one_at_a_time
     def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
         """Return what the vertices of light paths add to their pixels for a unit more of a base colour, and the picture
         of these paths.
@@ -349,21 +355,24 @@ class MitsubaScene:
             seed: number of the noise.
             spp: samples a pixel.
         """
-        mi = mitsuba()
-        import drjit as dr
+        with one_at_a_time:
+            mi = mitsuba()
+            import drjit as dr
 
-        self._set(inputs)
-        key, spp = self.declared[name][0], next_count(self.sampler, spp)
-        noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
-        noise.set_samples_per_wavefront(spp)
-        noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
-        found = collect(self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
-        surface = self.made[0].meshes[name.partition(".")[0]].surface
-        if surface is None:
-            return found
-        options = next(one for one in plugins_in(surface) if one["type"] == BASE_COLOR_PLACE)
-        size = tuple(self.parameters[key].shape[:2])
-        return replace(found, vertices=[replace(one, uv=repeating(one.uv, options, size)) for one in found.vertices])
+            self._set(inputs)
+            key, spp = self.declared[name][0], next_count(self.sampler, spp)
+            noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
+            noise.set_samples_per_wavefront(spp)
+            noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
+            found = collect(self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
+            surface = self.made[0].meshes[name.partition(".")[0]].surface
+            if surface is None:
+                return found
+            options = next(one for one in plugins_in(surface) if one["type"] == BASE_COLOR_PLACE)
+            size = tuple(self.parameters[key].shape[:2])
+            return replace(
+                found, vertices=[replace(one, uv=repeating(one.uv, options, size)) for one in found.vertices]
+            )
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
@@ -373,9 +382,11 @@ class MitsubaScene:
         Vertices are written into the memory where they are: recordings hold on to it. Numbers that Mitsuba takes for
         constants are part of a recording, so that every change makes all recordings stale.
         """
-        mi = mitsuba()
         import drjit as dr
+        import mitsuba as mi
 
+        if mi.variant() != VARIANT:  # somebody else has taken another one since
+            mitsuba()
         unknown = [name for name in inputs if name not in self.declared]
         if any(name.endswith(".base_color") for name in unknown):
             raise InputError(
@@ -398,7 +409,7 @@ class MitsubaScene:
             own = self.parameters[key]
             if name not in self._base:
                 self._base[name] = type(own)(own.torch().clone() if name in self._buffers else own)
-            given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
+            given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)  # type: ignore[call-overload]
             if fresh is not None and one.write:
                 given = one.write(given)
             if name in self._buffers:

@@ -7,11 +7,10 @@ import gc
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import wraps
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 from advsearch import threads
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
@@ -22,20 +21,8 @@ Plugin = dict[str, Any]
 """A plugin, or a whole scene, as Mitsuba's loader takes it: its `type`, and by Mitsuba's names for them numbers, texts,
 transforms, bitmaps, objects that are loaded already, and further plugins."""
 
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-_LOCK = threading.RLock()
-
-
-def one_at_a_time(function: Function) -> Function:
-    """Let one thread be in such functions at a time: they share what Dr.Jit records, and the denoiser's pictures."""
-
-    @wraps(function)
-    def locked(*args: Any, **named: Any) -> Any:
-        with _LOCK:
-            return function(*args, **named)
-
-    return locked  # type: ignore[return-value]
+one_at_a_time = threading.RLock()
+"""One thread renders, builds or denoises at a time: they share what Dr.Jit records, and the denoiser's pictures."""
 
 
 def mitsuba() -> ModuleType:
@@ -60,7 +47,7 @@ def mitsuba() -> ModuleType:
 
 @contextmanager
 def fewer_warnings() -> Iterator[None]:
-    """Keep Mitsuba from warning: of a film that samples beyond its border, at every call, or of what is told here."""
+    """Keep Mitsuba from warning of what is told here."""
     import mitsuba as mi
 
     before = mi.log_level()
@@ -87,6 +74,10 @@ class Population:
     what happens when it is replayed after one was added or removed. So every change of the population makes every
     recording stale, and a scene that nobody uses any more is kept until no render is under way: Python's garbage
     collector may strike in the middle of one.
+
+    Attributes:
+        changes: how often it has changed.
+        unused: the numbers of what has lost its owner.
     """
 
     def __init__(self) -> None:
@@ -94,20 +85,18 @@ class Population:
         self._media: dict[int, tuple[Any, ...]] = {}
         self._loose: list[Any] = []
         self._held: dict[int, tuple[Any, ...]] = {}
-        self._unused: list[int] = []
+        self.unused: list[int] = []
 
     def add(self, owner: object, *objects: Any, media: tuple[Any, ...] = ()) -> None:
         """Hold Mitsuba's objects, with the media among them, for as long as their owner lives, and a little longer."""
         self.changes += 1
         self._held[self.changes], self._media[self.changes] = objects, media
-        weakref.finalize(owner, self._unused.append, self.changes)
+        weakref.finalize(owner, self.unused.append, self.changes)
 
     def bury(self) -> None:
-        """Let go of what has lost its owner. Call it between renders only."""
-        if not self._unused:
-            return
-        while self._unused:
-            number = self._unused.pop()
+        """Let go of what has lost its owner, of which there is some. Call it between renders only."""
+        while self.unused:
+            number = self.unused.pop()
             self._held.pop(number, None), self._media.pop(number, None)
         gc.collect()  # Mitsuba's Python objects form cycles; they have to go now, not during a later render
         self.changes += 1

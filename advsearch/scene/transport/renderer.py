@@ -47,6 +47,7 @@ class PredictingRenderer(Renderer, ABC):
     """
 
     products: int
+    _predicts = True
 
     @property
     @abstractmethod
@@ -57,9 +58,6 @@ class PredictingRenderer(Renderer, ABC):
     @abstractmethod
     def bytes(self) -> int:
         """Memory of all matrices and pictures, 16 bits a number."""
-
-    def _through(self, u: Tensor) -> Tensor:
-        return u
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +137,7 @@ class LinearRenderer(PredictingRenderer):
             if self.transports:
                 base = self._finished(self._traced(traced, seed, tick, spp), quick)
             else:
-                base = self.primal(traced, seed, spp, self._hide)
+                base = super()._rendered(traced, seed, spp, self._hide)
                 tick(spp)
             self._base = Halves(base)
 
@@ -212,7 +210,7 @@ class LinearRenderer(PredictingRenderer):
     def shown(self, inputs: Mapping[str, Tensor], u: Tensor) -> Tensor:
         """The picture (H, W, 3) sRGB of scene inputs, of which only those to which radiance is linear count; what
         controls do to the finished picture comes from `u`."""
-        return self.space.picture(u, self.formation.display(self._formed({**inputs, **self._applied}, 0, 1)))
+        return self._picture(u, 0, 1, {**inputs, **self._applied})
 
 
 def linear_inputs(renderer: Renderer) -> frozenset[str]:
