@@ -8,7 +8,8 @@ the worked example of docs/controls/writing.md.
 `--names` prints the public names with several meanings: classes, functions and type aliases that several modules
 define, and names of modules that are a class's, a function's or an alias's elsewhere. One meaning are aliases of the
 same type, a command's module in each room, a module and its function of the same name, and what every module of a room
-has to define (`ENTRIES`). Methods, private names and imported names do not count.
+has to define (`ENTRIES`). Methods, private names, imported names and `main` do not
+count.
 """
 
 from __future__ import annotations
@@ -145,7 +146,9 @@ def defined_in(tree: ast.Module) -> Iterator[tuple[str, str]]:
 def several_meanings(trees: Mapping[str, ast.Module]) -> dict[str, list[str]]:
     """Return the public names with several meanings, each with the modules of each meaning."""
     found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
-    commands = {module.removeprefix("advsearch.api.") for module in trees if module.startswith("advsearch.api.")}
+    commands = {
+        name for module, tree in trees.items() for name, _ in defined_in(tree) if module == f"advsearch.api.{name}"
+    }
     for module, tree in trees.items():
         room = module.split(".")[1] if "." in module else ""
         for name, what in dict(defined_in(tree)).items():
@@ -153,13 +156,13 @@ def several_meanings(trees: Mapping[str, ast.Module]) -> dict[str, list[str]]:
                 what = f"entry of {room}"
             elif what in ("class", "function"):
                 what = "command" if name in commands and room == "api" else f"{what} of {module}"
-            if not name.startswith("_"):
+            if not name.startswith("_") and name != "main":
                 found[name][what].append(module)
     for module in trees:
         name = module.rpartition(".")[2]
         if name in commands and module.startswith(OF_COMMANDS):
             found[name]["command"].append(module)
-        elif f"function of {module}" not in found.get(name, ()):  # else it is the module's one thing
+        elif not any(module in modules for modules in found[name].values()):  # else it is the module's one thing
             found[name]["module"].append(module)
     return {
         name: [" ".join(modules) for modules in meanings.values()]
