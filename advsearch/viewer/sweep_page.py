@@ -1,7 +1,7 @@
 """The page of one or several sweeps: still pictures and tables that need no script, and the explorer over them.
 
-The same page is a file that needs no other (`write_sweep_page`), a page of `advsearch dashboard`, and one of a folder that
-any web server serves: only where its rows and pictures come from differs (`SweepSource`).
+The same page is a file that needs no other (`write_sweep_page`), a page of `advsearch dashboard`, and one of a folder
+that any web server serves: only where its rows and pictures come from differs (`SweepSource`).
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ def _fresh() -> Iterator[None]:
 @pytest.fixture
 def well(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every part works, and nothing is really tried."""
-    monkeypatch.setattr(doctor, "probe", lambda: ALL_WELL)
+    monkeypatch.setattr(doctor, "run_probe", lambda: ALL_WELL)
     monkeypatch.setattr(doctor, "reference_weights", lambda: doctor.Component("reference model", "", doctor.OK))
 
 
@@ -57,7 +57,7 @@ def test_table_names_every_part_and_says_that_all_is_well(well: None, capsys: py
 def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(
     well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "probe", lambda: ALL_WELL | {"xatlas": (False, "ImportError: no such file")})
+    monkeypatch.setattr(doctor, "run_probe", lambda: ALL_WELL | {"xatlas": (False, "ImportError: no such file")})
     assert doctor.run() == doctor.FELL_SHORT == 3
     text = capsys.readouterr().out
     assert "broken" in text and "ImportError: no such file" in text
