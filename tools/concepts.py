@@ -8,8 +8,7 @@ the worked example of docs/controls/writing.md.
 `--names` prints the public names with several meanings: classes, functions and type aliases that several modules
 define, and names of modules that are a class's, a function's or an alias's elsewhere. One meaning are aliases of the
 same type, a command's module in each room, a module and its function of the same name, and what every module of a room
-has to define (`ENTRIES`). Methods, private names, imported names and `main` do not
-count.
+has to define (`ENTRIES`). Methods, private names, imported names and `main` do not count.
 """
 
 from __future__ import annotations
