@@ -14,7 +14,7 @@ from pydantic import Field
 
 from advsearch.errors import InputError
 from advsearch.recipes.description import PHOTOGRAPHS
-from advsearch.recipes.figures.base import FigureKind, Options, count_text
+from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval
 from advsearch.recipes.figures.curve import COLOURS, MARKS
 from advsearch.recipes.table import Answered, Table, count_of
 from advsearch.report.phrases import percent
@@ -108,7 +108,7 @@ def _said(one: AgreementSeries) -> list[str]:
     total, said = one.total, []
     if total.agreeing.configurations:
         said.append(
-            f"Renderings and {one.name}: {count_text(total.agreeing, 'right about both or wrong about both')}. "
+            f"Renderings and {one.name}: {rate_with_interval(total.agreeing, 'right about both or wrong about both')}. "
             f"{_share('right', total.right_right, total.right_wrong)} "
             f"{_share('wrong', total.wrong_wrong, total.wrong_right)} The answer is the same in "
             f"{total.same_answer} of {total.agreeing.configurations} "
@@ -125,7 +125,7 @@ def _said(one: AgreementSeries) -> list[str]:
 def _share(verb: str, same: int, other: int) -> str:
     if not same + other:
         return f"It is {verb} about none of the renderings."
-    counted = count_text(count_of("", same, same + other), verb)
+    counted = rate_with_interval(count_of("", same, same + other), verb)
     return f"Where it is {verb} about the rendering, it is {counted} about the other."
 
 

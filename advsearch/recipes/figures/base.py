@@ -62,7 +62,7 @@ class FigureKind(Generic[Chosen, FigureType]):
     tells_models: bool = False
 
 
-def count_text(one: NamedCount, verb: str = "right") -> str:
+def rate_with_interval(one: NamedCount, verb: str = "right") -> str:
     """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is counted."""
     return (
         f"{verb} in {one.correct} of {one.configurations} "
@@ -85,13 +85,11 @@ def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str, ve
     """
     known = [one for one in counts if one.configurations]
     if len(known) < 2:
-        return [f"{one.name}: {count_text(one, verb)}." for one in known]
+        return [f"{one.name}: {rate_with_interval(one, verb)}." for one in known]
     low, high = (pick(known, key=lambda one: one.accuracy or 0.0) for pick in (min, max))
     if low.accuracy == high.accuracy:
         return [f"All {len(known)} {thing} have the same share, {percent(low.accuracy)}: no difference is shown."]
-    said = (
-        f"{worst} {_tied(low, known)}: {count_text(low, verb)}; {best} {_tied(high, known)}: {count_text(high, verb)}."
-    )
+    said = f"{worst} {_tied(low, known)}: {rate_with_interval(low, verb)}; {best} {_tied(high, known)}: {rate_with_interval(high, verb)}."
     widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
     if intervals_apart(low, high, len(known)):
         return [said, f"The difference is shown: {widened} do not overlap."]

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.recipes.figures.base import FigureKind, Options, count_text, extremes, intervals_apart
+from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval, extremes, intervals_apart
 from advsearch.recipes.figures.curve import COLOURS
 from advsearch.recipes.table import Answered, Table, count_of
 from advsearch.runs.results.recipe import CorruptionFigure, CorruptionModel, NamedCount
@@ -69,14 +69,14 @@ def _relative(errors: Sequence[NamedCount], base: CorruptionModel) -> float | No
 
 def _said(one: CorruptionModel, first: str) -> list[str]:
     """The mean error with the interval of its pictures, which are as many of each corruption."""
-    said = [f"{one.model}: {count_text(one.error, 'wrong')}, the mean corruption error."]
+    said = [f"{one.model}: {rate_with_interval(one.error, 'wrong')}, the mean corruption error."]
     if one.clean is not None:
         more = (
             "That is more than without"
             if intervals_apart(one.clean, one.error)
             else "No difference is shown to pictures without"
         )
-        said.append(f"{more}: {count_text(one.clean, 'wrong')}.")
+        said.append(f"{more}: {rate_with_interval(one.clean, 'wrong')}.")
     if one.relative is not None:
         said.append(f"Relative to {first}, which takes the place of AlexNet, its mCE is {one.relative:.0f} %.")
     return [*said, *extremes(one.errors, "The most harmless", "the most harmful", "corruptions", "wrong")]

@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.recipes.figures.base import FigureKind, Options, count_text, extremes
+from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval, extremes
 from advsearch.recipes.table import Answered, Table, count_of, counted
 from advsearch.report.drawing import BLUE, RED
 from advsearch.report.phrases import percent
@@ -127,11 +127,11 @@ def _mean(cells: Sequence[_Cell]) -> float:
 def _by_texture(table: Table, options: CuesOptions, rows: list[CuesRow]) -> list[str]:
     shape = count_of("by shape", sum(one.correct for one in rows), sum(one.configurations for one in rows))
     asked = [one for one in rows if options.classes.get(one.name)]
-    said = [f"The answer is the object, whatever its texture: {count_text(shape, 'so')}."]
+    said = [f"The answer is the object, whatever its texture: {rate_with_interval(shape, 'so')}."]
     if asked:
         named = count_of("by texture", sum(one.textured for one in asked), sum(one.configurations for one in asked))
         known = ", ".join(one.name for one in asked)
-        said.append(f"The answer names the texture ({known}): {count_text(named, 'so')}.")
+        said.append(f"The answer names the texture ({known}): {rate_with_interval(named, 'so')}.")
         if not named.correct:
             said.append("A model that has no class for a texture cannot name it.")
     return said

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from advsearch.recipes.figures.base import FigureKind, Options, count_text, extremes, plural
+from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval, extremes, plural
 from advsearch.recipes.table import Table, count_of
 from advsearch.report.recipes import bare
 from advsearch.runs.results.recipe import HeatMapFigure, NamedCount
@@ -61,7 +61,7 @@ def _said(cells: list[NamedCount], rows: str, columns: str) -> list[str]:
     known = [one for one in cells if one.configurations]
     none = [one for one in known if one.correct == 0]
     enough = [one for one in none if one.configurations >= ENOUGH]
-    some = "; ".join(f"{one.name} ({count_text(one)})" for one in enough[:4]) + (
+    some = "; ".join(f"{one.name} ({rate_with_interval(one)})" for one in enough[:4]) + (
         "; and others" if len(enough) > 4 else ""
     )
     said = [f"No answer is right in {len(enough)} of {len(known)} pairs: {some}."] if enough else []

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.recipes.figures.base import FigureKind, Options, count_text, counted_by, intervals_apart
+from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval, counted_by, intervals_apart
 from advsearch.recipes.figures.curve import COLOURS, MARKS
 from advsearch.recipes.table import Table, count_of
 from advsearch.runs.results.recipe import NamedCount, PointsFigure
@@ -55,7 +55,7 @@ def _called(one: NamedCount | None, name: str, names: dict[str, str]) -> NamedCo
 
 def _said(rows: list[str], counts: list[list[NamedCount]], totals: list[NamedCount]) -> list[str]:
     """Each series against the first, over all rows and in each."""
-    said = ["; ".join(f"{one.name}: {count_text(one)}" for one in totals if one.configurations) + "."]
+    said = ["; ".join(f"{one.name}: {rate_with_interval(one)}" for one in totals if one.configurations) + "."]
     for place, other in enumerate(totals[1:], start=1):
         pairs = [(name, row[0], row[place]) for name, row in zip(rows, counts, strict=True)]
         known = [(name, a, b) for name, a, b in pairs if a.configurations and b.configurations]
