@@ -89,7 +89,8 @@ def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str, ve
     low, high = (pick(known, key=lambda one: one.accuracy or 0.0) for pick in (min, max))
     if low.accuracy == high.accuracy:
         return [f"All {len(known)} {thing} have the same share, {percent(low.accuracy)}: no difference is shown."]
-    said = f"{worst} {_tied(low, known)}: {rate_with_interval(low, verb)}; {best} {_tied(high, known)}: {rate_with_interval(high, verb)}."
+    least, most = rate_with_interval(low, verb), rate_with_interval(high, verb)
+    said = f"{worst} {_tied(low, known)}: {least}; {best} {_tied(high, known)}: {most}."
     widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
     if intervals_apart(low, high, len(known)):
         return [said, f"The difference is shown: {widened} do not overlap."]

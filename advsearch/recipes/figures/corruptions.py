@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval, extremes, intervals_apart
+from advsearch.recipes.figures.base import FigureKind, Options, extremes, intervals_apart, rate_with_interval
 from advsearch.recipes.figures.curve import COLOURS
 from advsearch.recipes.table import Answered, Table, count_of
 from advsearch.runs.results.recipe import CorruptionFigure, CorruptionModel, NamedCount

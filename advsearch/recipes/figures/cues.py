@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval, extremes
+from advsearch.recipes.figures.base import FigureKind, Options, extremes, rate_with_interval
 from advsearch.recipes.table import Answered, Table, count_of, counted
 from advsearch.report.drawing import BLUE, RED
 from advsearch.report.phrases import percent

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval, extremes, plural
+from advsearch.recipes.figures.base import FigureKind, Options, extremes, plural, rate_with_interval
 from advsearch.recipes.table import Table, count_of
 from advsearch.report.recipes import bare
 from advsearch.runs.results.recipe import HeatMapFigure, NamedCount

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval, counted_by, intervals_apart
+from advsearch.recipes.figures.base import FigureKind, Options, counted_by, intervals_apart, rate_with_interval
 from advsearch.recipes.figures.curve import COLOURS, MARKS
 from advsearch.recipes.table import Table, count_of
 from advsearch.runs.results.recipe import NamedCount, PointsFigure
