@@ -20,7 +20,7 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.api.harden import harden_from_config  # noqa: E402
-from advsearch.cli.progress import watching  # noqa: E402
+from advsearch.cli.progress import watch_progress  # noqa: E402
 from advsearch.config import HardenConfig  # noqa: E402
 from advsearch.report.hardening import HEADS, hardened_rows  # noqa: E402
 from advsearch.runs.directory import CONFIG, is_run  # noqa: E402
@@ -44,7 +44,7 @@ def main() -> int:
     else:
         first = {} if "controls" in changes else SETTINGS
         config = HardenConfig(**{**first, **changes, "run": str(args.run)})
-    with watching() as progress:
+    with watch_progress() as progress:
         result = harden_from_config(config, progress=progress, resumed=args.run if there else None)
     print(" | ".join(HEADS))
     for row in hardened_rows(result):

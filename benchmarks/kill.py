@@ -1,9 +1,9 @@
 """Kills a run with SIGKILL at random moments, resumes it each time, and compares the rows with those of a whole run.
 
-    python benchmarks/kill.py [--kills 50] [--resolution 32] [--command attack|sweep]
+    python benchmarks/kill.py [--kills 50] [--resolution 32] [--command attack|sweep|workers]
 
 Every row must agree in every column but times. The attack has an adjoint, so it runs under `--deterministic`; the sweep
-does not.
+does not. With workers the process that is killed is the one that gives them work; they have to end by themselves.
 """
 
 from __future__ import annotations
@@ -19,10 +19,15 @@ from pathlib import Path
 
 from advsearch.runs.store import NAME, Row, Store
 
+TEXTURE = ["--control", "texture", "--steps", "60", "--trials", "30", "--verify-spp", "32", "--deterministic"]
+POSE = ["--control", "pose", "--policy", "nes", "--steps", "120", "--average", "60", "--trials", "30", "--spp", "2"]
 COMMANDS = {
-    "attack": ["--control", "texture", "--steps", "60", "--trials", "30", "--verify-spp", "32", "--deterministic"],
-    "sweep": ["--grid", "pose.yaw=0:360:40", "--grid", "camera.elevation=5:60:10", "--threads", "1"],
+    "attack": ["attack", *TEXTURE],
+    "sweep": ["sweep", "--grid", "pose.yaw=0:360:40", "--grid", "camera.elevation=5:60:10", "--threads", "1"],
+    "workers": ["attack", *POSE, "--verify-spp", "8", "--workers", "2"],
 }
+STARTUP = {"attack": 2.5, "sweep": 2.5, "workers": 6.0}
+"""Seconds that pass before the first picture: nothing would come of it if every kill came before."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,13 +37,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--resolution", type=int, default=32)
     parser.add_argument("--command", choices=COMMANDS, default="attack")
     args = parser.parse_args(argv)
-    words = ["--object", "mug", "--resolution", str(args.resolution), *COMMANDS[args.command]]
+    command = [*COMMANDS[args.command], "--object", "mug", "--resolution", str(args.resolution)]
     with tempfile.TemporaryDirectory() as folder:
         whole, killed = Path(folder) / "whole", Path(folder) / "killed"
         begun = time.perf_counter()
-        _start([args.command, *words, "--run", str(whole)]).wait()
+        if status := _start([*command, "--run", str(whole)]).wait():
+            raise SystemExit(f"the run that is not killed ended with status {status}")
         seconds = time.perf_counter() - begun
-        kills = _killed([args.command, *words, "--run", str(killed)], killed, args.kills, seconds)
+        kills = _killed([*command, "--run", str(killed)], killed, args.kills, seconds, STARTUP[args.command])
         same = rows_of(whole) == rows_of(killed)
         print(f"{args.command}: {len(rows_of(whole))} rows, {kills} kills, rows {'agree' if same else 'DIFFER'}")
     return 0 if same else 3
@@ -49,12 +55,12 @@ def _start(words: Sequence[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def _killed(first: Sequence[str], folder: Path, wanted: int, seconds: float) -> int:
+def _killed(first: Sequence[str], folder: Path, wanted: int, seconds: float, startup: float) -> int:
     """Start the run and kill it, resume and kill it, until it is done; return how often it was killed.
 
     Each life lasts as long as a start takes and a share of the rest, so that the kills spread over the whole run.
     """
-    moments, kills, startup = random.Random(1), 0, 2.5
+    moments, kills = random.Random(1), 0
     while True:
         known = (folder / "run.yaml").is_file() and (folder / NAME).is_file()
         child = _start(["resume", str(folder)] if known else first)

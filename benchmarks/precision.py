@@ -23,7 +23,7 @@ from advsearch.api.attack import problem_from_config  # noqa: E402
 from advsearch.api.precision import precision_from_config  # noqa: E402
 from advsearch.config import PrecisionConfig  # noqa: E402
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
-from advsearch.evaluation.precision.gradient import GradientBench, parts_of  # noqa: E402
+from advsearch.evaluation.precision.gradient import GradientBench, estimated_parts  # noqa: E402
 from advsearch.evaluation.precision.image import (  # noqa: E402
     REFERENCE_SAMPLER,
     PictureBench,
@@ -112,7 +112,7 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
     else:
         renderer = renderer.like(denoiser="none", transfer="linear")
         exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
-        part = next(one for one in parts_of(renderer.plan.groups, linear=True) if one.name == found.control)
+        part = next(one for one in estimated_parts(renderer.plan.groups, linear=True) if one.name == found.control)
         loss = smooth_loss(renderer.formation.resolution, config.seed)
         bench = GradientBench(renderer, loss, inside(renderer), part, exact)
     bench.refer(budget, SEED, lambda: None)

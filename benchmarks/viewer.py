@@ -31,7 +31,7 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
 from advsearch.viewer.server import Dashboard
-from advsearch.viewer.sweep_page import write_page
+from advsearch.viewer.sweep_page import write_sweep_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -118,7 +118,7 @@ def make(folder: Path, count: int, pictures: Literal["all", "none"]) -> dict[str
         )  # fmt: skip
         begun = time.perf_counter()
         run.write_summary(summary)
-        write_page(run.path, summary)
+        write_sweep_page(run.path, summary)
         return {"columns when it ends [s]": time.perf_counter() - begun}
 
 

@@ -26,7 +26,7 @@ from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
-from advsearch.recipes.description import names as recipe_names
+from advsearch.recipes.description import recipe_names as recipe_names
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
 from advsearch.runs.results.explain import ExplainResult

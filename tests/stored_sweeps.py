@@ -20,7 +20,7 @@ from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
 from advsearch.viewer.photographing import PhotoTaker
 from advsearch.viewer.server import Dashboard
-from advsearch.viewer.sweep_page import write_page
+from advsearch.viewer.sweep_page import write_sweep_page
 
 YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
 
@@ -73,7 +73,7 @@ def make_sweep(
             axis = {"axis": "pose.yaw", "unit": "degrees", "value": 45.0, **counts}
             summary = sweep(**counts, planned=len(rows), run=str(path), axes=[axis], **summarised)
             run.write_summary(summary)
-            write_page(run.path, summary)
+            write_sweep_page(run.path, summary)
     return path
 
 

@@ -68,8 +68,8 @@ from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
-from advsearch.recipes.description import names as recipes
 from advsearch.recipes.description import read_recipe
+from advsearch.recipes.description import recipe_names as recipes
 from advsearch.recipes.parts import planned
 from advsearch.runs import directory, export, store
 from advsearch.runs.results import KEPT

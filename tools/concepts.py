@@ -1,22 +1,34 @@
-"""Counts what a stranger has to learn: python tools/concepts.py [CHECKOUT]
+"""Counts what a stranger has to learn: python tools/concepts.py [CHECKOUT] [--names]
 
 Lines of the package and its modules; lines with an untyped answer (`dict[str, Any]`, `Mapping[str, Any]`); class names
 and file names that occur several times; imports that go in a circle; modules that take a run's settings (a parameter
 or a field annotated with a `...Config`); and the classes of ours that a new control has to import or subclass, from
 the worked example of docs/controls/writing.md.
+
+`--names` prints the public names with several meanings: classes, functions and type aliases that several modules
+define, and names of modules that are a class's, a function's or an alias's elsewhere. One meaning are aliases of the
+same type, a command's module in each room, a module and its function of the same name, and what every module of a room
+has to define (`ENTRIES`). Methods, private names, imported names and `main` do not count.
 """
 
 from __future__ import annotations
 
+import argparse
 import ast
 import re
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 UNTYPED = re.compile(r"(?:dict|Mapping)\[str, Any\]")
 Modules = Mapping[str, Path]
+
+ENTRIES = {"cli": {"add_arguments", "answer", "run"}, "models": {"load", "source"}}
+"""Functions that every module of a room defines so that it is found: commands, and libraries of networks."""
+
+OF_COMMANDS = tuple(f"advsearch.{room}." for room in ("api", "cli", "config", "runs.results", "evaluation"))
+"""Where a command has a module, or a folder, of its name."""
 
 
 def modules_of(root: Path) -> Modules:
@@ -117,10 +129,59 @@ def repeated(names: Iterator[str]) -> list[str]:
     return [f"{name} {count}" for name, count in Counter(names).most_common() if count > 1]
 
 
+def defined_in(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield the public classes, functions and type aliases of a module: name, and what it is (of an alias, of what)."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef):
+            yield node.name, "class"
+        elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            yield node.name, "function"
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            if isinstance(target, ast.Name) and re.fullmatch(r"[A-Z]\w*[a-z]\w*", target.id):
+                yield target.id, ast.unparse(node.value)
+
+
+def several_meanings(trees: Mapping[str, ast.Module]) -> dict[str, list[str]]:
+    """Return the public names with several meanings, each with the modules of each meaning."""
+    found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    commands = {
+        name for module, tree in trees.items() for name, _ in defined_in(tree) if module == f"advsearch.api.{name}"
+    }
+    for module, tree in trees.items():
+        room = module.split(".")[1] if "." in module else ""
+        for name, what in dict(defined_in(tree)).items():
+            if name in ENTRIES.get(room, ()):
+                what = f"entry of {room}"
+            elif what in ("class", "function"):
+                what = "command" if name in commands and room == "api" else f"{what} of {module}"
+            if not name.startswith("_") and name != "main":
+                found[name][what].append(module)
+    for module in trees:
+        name = module.rpartition(".")[2]
+        if name in commands and module.startswith(OF_COMMANDS):
+            found[name]["command"].append(module)
+        elif not any(module in modules for modules in found[name].values()):  # else it is the module's one thing
+            found[name]["module"].append(module)
+    return {
+        name: [" ".join(modules) for modules in meanings.values()]
+        for name, meanings in sorted(found.items())
+        if len(meanings) > 1
+    }
+
+
 def main() -> int:
     """Print the counts."""
-    root = Path(sys.argv[1] if len(sys.argv) > 1 else ".").resolve()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "checkout", nargs="?", type=Path, default=Path(), help="folder of advsearch (default: this one)"
+    )
+    parser.add_argument("--names", action="store_true", help="list the names with several meanings")
+    args = parser.parse_args()
+    root = args.checkout.resolve()
     modules = modules_of(root)
+    if not modules:
+        parser.error(f"expected the folder of a checkout, got {root}, which has no advsearch")
     texts = {name: path.read_text("utf-8") for name, path in modules.items()}
     trees = {name: ast.parse(text) for name, text in texts.items()}
     lines = sorted(text.count("\n") for text in texts.values())
@@ -131,10 +192,16 @@ def main() -> int:
     files = repeated(path.name for path in modules.values() if path.name != "__init__.py")
     settings = [name for name, tree in trees.items() if takes_settings(tree)]
     control = classes_for_a_control(root)
+    names = several_meanings(trees)
+    if args.names:
+        for name, where in names.items():
+            print(f"{name:<24}{'; '.join(where).replace('advsearch.', '')}")
+        return 0
     print(f"lines of the package          {sum(lines):6d}   in {len(lines)} modules, median {lines[len(lines) // 2]}")
     print(f"lines with an untyped answer  {untyped:6d}")
     print(f"class names that come again   {len(classes):6d}   {', '.join(classes)}")
     print(f"file names that come again    {len(files):6d}   {', '.join(files)}")
+    print(f"names with several meanings   {len(names):6d}   (--names lists them)")
     print(f"modules that take settings    {len(settings):6d}")
     print(f"classes to add a control      {len(control):6d}   {', '.join(control)}")
     found = circles(modules)

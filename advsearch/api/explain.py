@@ -30,8 +30,8 @@ from advsearch.explanations.clusters import find_clusters
 from advsearch.explanations.envelope import Envelope, find_envelope
 from advsearch.explanations.importance import FactorWeight, find_importance
 from advsearch.explanations.observations import Factor, Observations, observed
-from advsearch.explanations.renders import along, inside, lies_inside
-from advsearch.explanations.rules import CHANCE, Conditions, CountedRule, RuleCondition, covered, find_rules
+from advsearch.explanations.renders import along, lies_inside, sweep_inside
+from advsearch.explanations.rules import CHANCE, CountedRule, RuleCondition, RuleConditions, covered, find_rules
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
@@ -229,7 +229,7 @@ class _Renders:
             seed = seeds.stream(self.config.seed, "confirm", number * len(asked) + place)
             samples = -(-self.config.confirm // len(asked))
             self.progress.message(f"rule {number + 1}: rendering about {samples} configurations inside it")
-            own = inside(one.config, self.found, rule.conditions, samples, seed)
+            own = sweep_inside(one.config, self.found, rule.conditions, samples, seed)
             rows += self._rows(f"rule-{number + 1}-{place}", own) or []
         kept = [row.correct for row in rows if lies_inside(rule.conditions, self.found.factors, row.values)]
         return right_of(sum(kept), len(kept)) if kept else None
@@ -347,7 +347,7 @@ class _Renders:
         )
 
 
-def typical_failures(found: Observations, rules: Sequence[CountedRule], most: int) -> list[tuple[int, Conditions]]:
+def typical_failures(found: Observations, rules: Sequence[CountedRule], most: int) -> list[tuple[int, RuleConditions]]:
     """Return failures with the conditions of the rule that they are under, the most typical first.
 
     Rules take turns, and what fails under none of them is the last to take one. Of each the failure nearest to the
@@ -359,7 +359,7 @@ def typical_failures(found: Observations, rules: Sequence[CountedRule], most: in
         most: failures at most.
     """
     left = ~found.right
-    queues: list[list[tuple[int, Conditions]]] = []
+    queues: list[list[tuple[int, RuleConditions]]] = []
     for conditions in (*(rule.conditions for rule in rules), ()):
         own = left & covered(conditions, found)
         left = left & ~own
@@ -421,7 +421,7 @@ def _envelope_row(one: Envelope, factors: Sequence[Factor], accuracy: float) -> 
     return EnvelopeRow(conditions=rows, **vars(right_of(one.right, one.of)), accuracy=accuracy, held=one.held)
 
 
-def _condition_rows(conditions: Conditions, factors: Sequence[Factor]) -> list[ConditionRow]:
+def _condition_rows(conditions: RuleConditions, factors: Sequence[Factor]) -> list[ConditionRow]:
     return [_condition_row(one, factors[one.place]) for one in conditions]
 
 

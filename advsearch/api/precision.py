@@ -28,9 +28,15 @@ from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.evaluation.precision.fits import UNKNOWN, Theory
-from advsearch.evaluation.precision.gradient import GradientBench, GradientPart, matrix_groups, parts_of, theory_of
+from advsearch.evaluation.precision.gradient import (
+    GradientBench,
+    GradientPart,
+    estimated_parts,
+    matrix_groups,
+    theory_of,
+)
 from advsearch.evaluation.precision.image import REFERENCE_SAMPLER, PictureBench, variants
-from advsearch.evaluation.precision.machine import machine
+from advsearch.evaluation.precision.machine import timing_machine
 from advsearch.evaluation.precision.objective import ObjectiveBench, curve_of
 from advsearch.evaluation.precision.points import Array, MeasuredSetting, Point, Sample, point_of
 from advsearch.evaluation.precision.report import MeasuredLine, Section, report_of
@@ -274,7 +280,7 @@ class _Measurement:
         """The parts of the space whose gradients are measured."""
         renderer, _ = self._differentiated
         linear = self.config.loss == "linear"
-        return parts_of(renderer.plan.groups, linear=linear, by_matrix=matrix_groups(renderer))
+        return estimated_parts(renderer.plan.groups, linear=linear, by_matrix=matrix_groups(renderer))
 
     def _bench(self, part: GradientPart) -> GradientBench:
         """What takes the gradient of a part."""
@@ -456,7 +462,7 @@ def _subject(
         loss=config.loss,
         objective=config.objective or problem.task.objective,
         spp=problem.spp,
-        machine=machine(),
+        machine=timing_machine(),
         seconds=seconds,
         seed=config.seed,
         command_line=config.command_line(),

@@ -26,8 +26,8 @@ from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.recipes.columns import ANY, check_figures
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
-from advsearch.recipes.figures import compute, draw, read_options
-from advsearch.recipes.parts import Planned, listed, made_of, planned
+from advsearch.recipes.figures import compute, draw_figure, read_options
+from advsearch.recipes.parts import Planned, made_of, names_listed, planned
 from advsearch.recipes.table import TRIAL, WORKERS, Answered, Table, photographs_of, rows_of
 from advsearch.report.phrases import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
@@ -291,7 +291,7 @@ def _figures(
     table = Table(rows, described.groups, surfaces, cores())
     figures = (made for one in described.figures for made in compute(table, *read_options(one, config.recipe)))
     for number, made in enumerate(figures):
-        for suffix, data in draw(made, run.path).items():
+        for suffix, data in draw_figure(made, run.path).items():
             write_bytes(run.path / IMAGES / f"figure-{number + 1}.{suffix}", data)
         yield made
 
@@ -314,9 +314,9 @@ def _result(
         title=described.title,
         about=described.about,
         quick=config.quick,
-        objects=listed(settings["object"]),
-        environment=",".join(listed(settings.get("environment") or DEFAULT_ENVIRONMENT)),
-        model=",".join(listed(settings.get("model") or "reference")),
+        objects=names_listed(settings["object"]),
+        environment=",".join(names_listed(settings.get("environment") or DEFAULT_ENVIRONMENT)),
+        model=",".join(names_listed(settings.get("model") or "reference")),
         controls=list(dict.fromkeys(controls)),
         parts=[_part(one, result) for one, result in results],
         figures=list(figures),

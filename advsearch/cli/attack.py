@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from advsearch.cli.output import as_notes, columns
+from advsearch.cli.output import aligned, as_notes
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
 from advsearch.report.failures import FAILURE_HEADS, failure_rows, failures_text
-from advsearch.report.phrases import cells
+from advsearch.report.phrases import answer_cells
 
 if TYPE_CHECKING:
     from advsearch.runs.results.attack import AttackSummary, VerifiedRate
@@ -37,9 +37,9 @@ def answer(summary: AttackSummary | CurveResult | MatrixResult) -> str:
 
         return gap.answer(summary)
     facts = [[name, text] for name, text in _facts(summary).items() if text]
-    parts = [wording.verdict(summary), columns(_rates(summary)), columns(facts)]
+    parts = [wording.attack_verdict(summary), aligned(_rates(summary)), aligned(facts)]
     if summary.failures and summary.failures.tried:
-        parts.append(columns([list(FAILURE_HEADS), *failure_rows(summary.failures, tried=True)]))
+        parts.append(aligned([list(FAILURE_HEADS), *failure_rows(summary.failures, tried=True)]))
     return "\n\n".join(parts) + as_notes(wording.remarks(summary))
 
 
@@ -50,9 +50,11 @@ def _rates(summary: AttackSummary) -> list[list[str]]:
         if control
         else ["not verified"]
     )
-    rows = [["clean", *cells(summary.task, clean), *rated]]
+    rows = [["clean", *answer_cells(summary.task, clean), *rated]]
     if summary.adversarial:
-        rows.append(["adversarial", *cells(summary.task, summary.adversarial), *_verified(success, summary.verified)])
+        rows.append(
+            ["adversarial", *answer_cells(summary.task, summary.adversarial), *_verified(success, summary.verified)]
+        )
     if summary.baseline:
         pictures = f"{summary.baseline.renders} pictures"
         rows.append(["random search", pictures, "", *_verified(success, summary.baseline.verified)])
@@ -97,7 +99,7 @@ def _matrix(result: MatrixResult) -> str:
 
     facts = [["time", wording.seconds_text(result.seconds["total"])], ["run", str(result.run)]]
     ending = "Interrupted." if result.ending == "interrupted" else ""
-    parts = [matrix_text(result), columns([matrix_heads(result), *matrix_rows(result)]), columns(facts), ending]
+    parts = [matrix_text(result), aligned([matrix_heads(result), *matrix_rows(result)]), aligned(facts), ending]
     return "\n\n".join(filter(None, parts)) + as_notes(result.warnings)
 
 

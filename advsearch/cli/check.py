@@ -42,7 +42,7 @@ SINGLE = (
 """Heads of a table of single parameters."""
 
 
-def fell_short(result: CheckResult) -> bool:
+def lacks_gradient(result: CheckResult) -> bool:
     """Whether a parameter has no good gradient by any estimator."""
     return any(row.short for row in _best(result.rows))
 
@@ -52,7 +52,7 @@ def answer(result: CheckResult) -> str:
     from advsearch.runs.results.base import OUT_OF_TIME
 
     rows, left = result.rows, result.planned - result.measured
-    parts = [READING, table(rows)] if rows else []
+    parts = [READING, check_table(rows)] if rows else []
     if left:
         why = "The time was up" if result.ending == OUT_OF_TIME else "Stopped"
         done = f"{result.measured} of {result.planned}"
@@ -63,7 +63,7 @@ def answer(result: CheckResult) -> str:
     elif rows:
         parts.append("Every parameter so far has a good gradient." if left else "Every parameter has a good gradient.")
     time = wording.seconds_text(result.seconds["total"])
-    return "\n\n".join([*parts, output.columns([["time", time], ["run", str(result.run)]])])
+    return "\n\n".join([*parts, output.aligned([["time", time], ["run", str(result.run)]])])
 
 
 def _short(rows: Sequence[CheckedRow]) -> list[str]:
@@ -88,7 +88,7 @@ def _best(rows: Sequence[CheckedRow]) -> list[CheckedRow]:
     return list(best.values())
 
 
-def table(rows: Sequence[CheckedRow]) -> str:
+def check_table(rows: Sequence[CheckedRow]) -> str:
     """Return the rows as text: one table for each loss."""
     from advsearch.runs.results.check import DerivativeRow, DirectionRow
 
@@ -99,7 +99,7 @@ def table(rows: Sequence[CheckedRow]) -> str:
     ):
         single = [row for row in rows if row.loss == loss and isinstance(row, DerivativeRow)]
         if single:
-            parts.append(f"{title}:\n" + output.columns([SINGLE, *map(_single, single)]))
+            parts.append(f"{title}:\n" + output.aligned([SINGLE, *map(_single, single)]))
     cosine = [row for row in rows if isinstance(row, DirectionRow)]
     if cosine:
         heads = ["object", "control", "estimator", "step", "samples", "cosine", "converged", "seconds", "status"]
@@ -117,7 +117,7 @@ def table(rows: Sequence[CheckedRow]) -> str:
             ]
             for row in cosine
         ]
-        parts.append("the model's loss, cosine with the converged gradient:\n" + output.columns([heads, *body]))
+        parts.append("the model's loss, cosine with the converged gradient:\n" + output.aligned([heads, *body]))
     return "\n\n".join(parts)
 
 
@@ -136,4 +136,4 @@ def _single(row: DerivativeRow) -> list[str]:
     ]
 
 
-COMMAND = QuestionCommand("check", answer, short=fell_short)
+COMMAND = QuestionCommand("check", answer, short=lacks_gradient)

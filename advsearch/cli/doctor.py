@@ -66,7 +66,7 @@ def run(json: bool = False) -> int:
     Returns:
         0 when everything that is necessary works, 3 otherwise.
     """
-    parts = examine()
+    parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
     if json:
         answer = {"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]}
@@ -76,23 +76,23 @@ def run(json: bool = False) -> int:
     return 0 if good else FELL_SHORT
 
 
-def examine() -> list[Component]:
+def diagnose() -> list[Component]:
     """Check every part, in the order in which they depend on each other."""
     return [
         Component("Python", platform.python_version(), OK, sys.executable),
         Component("advsearch", __version__, OK, str(resources.files("advsearch"))),
-        *packages(probe()),
+        *packages(run_probe()),
         other_packages(),
-        llvm(),
+        check_llvm(),
         bundled_scenes(),
         reference_weights(),
         kernel_cache(Path.home() / ".drjit"),
         disk(Path.cwd()),
-        machine(),
+        check_hardware(),
     ]
 
 
-def probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
+def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
     """Try the parts that load native code, in another process: name to whether it worked and a detail or the error.
 
     The part that ended the process, and those after it, are absent; under the name ``""`` stands how it ended.
@@ -173,7 +173,7 @@ def _reinstall(name: str) -> str:
     return f"pip install --force-reinstall --no-deps {name}, or make clean setup in a checkout"
 
 
-def llvm() -> Component:
+def check_llvm() -> Component:
     """The libLLVM that will be used, what else there is, and why that is not used."""
     from advsearch.scene.mitsuba_backend.llvm import VARIABLE, ensure_llvm, find, install_command
 
@@ -241,7 +241,7 @@ def disk(folder: Path) -> Component:
     return Component("disk", "", OK, f"{free / GIB:.0f} GiB free in {folder}")
 
 
-def machine() -> Component:
+def check_hardware() -> Component:
     """Cores and memory."""
     cores = threads.cores()
     memory = _memory()

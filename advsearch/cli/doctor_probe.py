@@ -43,7 +43,7 @@ def torch() -> str:
     return f"{build}, {count} thread{'s' * (count > 1)}"
 
 
-def render() -> str:
+def probe_renderer() -> str:
     """Render a few pixels of a lit wall and differentiate them with respect to its colour, which is linear."""
     from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
 
@@ -70,7 +70,7 @@ def render() -> str:
     return f"{PIXELS} x {PIXELS} pixels and their gradient, {VARIANT}, LLVM {version}, {dr.thread_count()} threads"
 
 
-def denoise() -> str:
+def probe_denoiser() -> str:
     """Denoise a constant picture, which must stay what it is."""
     import mitsuba_oidn
     import numpy as np
@@ -163,8 +163,8 @@ TRIALS: dict[str, Callable[[], str]] = {
     "cma": cma,
     "pyarrow": pyarrow,
     "xatlas": xatlas,
-    "render": render,
-    "mitsuba-oidn": denoise,
+    "render": probe_renderer,
+    "mitsuba-oidn": probe_denoiser,
 }
 """Part and trial, in the order tried: what may end the process comes last."""
 

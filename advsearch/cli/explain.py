@@ -31,8 +31,8 @@ def answer(result: ExplainResult) -> str:
         not_told_text,
         pair_text,
         pairs_text,
+        right_share_text,
         rule_text,
-        share_text,
         weight_rows,
     )
     from advsearch.runs.directory import REPORT
@@ -42,20 +42,20 @@ def answer(result: ExplainResult) -> str:
     parts += [not_told_text(result)] if result.not_told else []
     if result.importance:
         heads = "What decides: share of the answers' variance, by which part of its values a parameter lies in"
-        parts.append(f"{heads}\n{output.columns([list(WEIGHT_HEADS), *weight_rows(result)])}")
+        parts.append(f"{heads}\n{output.aligned([list(WEIGHT_HEADS), *weight_rows(result)])}")
     parts.append(f"Envelope. {envelope_text(result)}")
     parts += [f"One thing changed. {pairs_text(result)}"] if result.pairs_sought else []
     parts += [f"One thing changed. {pair_text(pair)}" for pair in result.pairs]
     if result.clusters is not None:
         parts.append(f"Kinds. {clusters_text(result.clusters)}")
-        parts.append(output.columns([[one.picture, cluster_text(one)] for one in result.clusters.listed]))
+        parts.append(output.aligned([[one.picture, cluster_text(one)] for one in result.clusters.listed]))
     facts = [
-        ["rows", f"right in {share_text(result)}"],
+        ["rows", f"right in {right_share_text(result)}"],
         ["renders", str(result.renders)],
         ["time", wording.seconds_text(result.seconds["total"])],
         ["page", f"{result.run}/{REPORT}"],
     ]
-    parts.append(output.columns(facts))
+    parts.append(output.aligned(facts))
     parts += ["Interrupted."] if result.goes_on else []
     return "\n\n".join(parts) + as_notes(result.warnings)
 

@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     """Write the rows."""
     from advsearch.runs.directory import PARTS, find_run
-    from advsearch.runs.export import FORMATS, export
+    from advsearch.runs.export import FORMATS, write_rows
     from advsearch.runs.store import NAME, Store
 
     otherwise = by_name if by_name in FORMATS else "json" if args.json and out is None else "csv"
@@ -96,7 +96,7 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
         raise InputError(f"{folder}: is a study, whose rows are those of its parts; export one of {parts}")
     on_screen = io.BytesIO() if out is None and sys.stdout.isatty() else None
     with Store(folder / NAME, read_only=True) as store, output_errors():
-        count = export(store, format, out, on_screen or sys.stdout.buffer, args.kind)
+        count = write_rows(store, format, out, on_screen or sys.stdout.buffer, args.kind)
     if on_screen is not None:
         print(on_screen.getvalue().decode("utf-8", "replace"), end="")
     if out is not None and args.json:
@@ -125,10 +125,10 @@ def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
     """Write a dataset of the pictures that were kept."""
     from advsearch.runs.directory import find_run
     from advsearch.runs.fiftyone import write_fiftyone
-    from advsearch.viewer.pictured import object_of, pictured
+    from advsearch.viewer.pictured import name_of_object, pictured
 
     folder = find_run(args.run)
-    count = write_fiftyone(lambda: pictured(folder), out, folder.resolve().name, object_of(folder))
+    count = write_fiftyone(lambda: pictured(folder), out, folder.resolve().name, name_of_object(folder))
     return {"samples": count}, f"{count} samples in {out}, a fiftyone.types.FiftyOneDataset"
 
 

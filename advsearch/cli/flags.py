@@ -27,7 +27,7 @@ SCENE = (
 MOST_NAMES = 50
 """Names of what is in a scene that one message lists."""
 
-Given = TypeVar("Given", bound=Config)
+AnyConfig = TypeVar("AnyConfig", bound=Config)
 
 
 def add_settings(
@@ -55,7 +55,7 @@ def add_settings(
             add(action="store" if setting.form == "text" else "append", metavar=setting.metavar)
 
 
-def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any) -> Given:
+def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any) -> AnyConfig:
     """Return the configuration that the flags describe.
 
     Args:

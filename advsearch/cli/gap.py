@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from advsearch.cli.output import columns
+from advsearch.cli.output import aligned
 from advsearch.cli.question import QuestionCommand
 
 if TYPE_CHECKING:
@@ -25,14 +25,14 @@ def answer(result: CurveResult | GapResult) -> str:
 
     meaning = f"\n  {gaps.margin_meaning(result)}"
     if isinstance(result, GapResult):
-        parts = [columns([gaps.GAP_HEADS, *gaps.gap_rows(result)]) + meaning]
+        parts = [aligned([gaps.GAP_HEADS, *gaps.gap_rows(result)]) + meaning]
     else:
         curve = gaps.curve_rows(result)
-        parts = [columns([gaps.OBJECT_HEADS, *gaps.object_rows(result)]) + meaning]
-        parts += [columns([gaps.CURVE_HEADS, *curve])] if curve else []
+        parts = [aligned([gaps.OBJECT_HEADS, *gaps.object_rows(result)]) + meaning]
+        parts += [aligned([gaps.CURVE_HEADS, *curve])] if curve else []
     facts = [["time", wording.seconds_text(result.seconds["total"])], ["run", str(result.run)]]
     ending = "Interrupted." if result.ending == INTERRUPTED else ""
-    return "\n\n".join(part for part in (*parts, columns(facts), ending) if part)
+    return "\n\n".join(part for part in (*parts, aligned(facts), ending) if part)
 
 
 COMMAND = QuestionCommand("gap", answer)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from advsearch.cli.output import columns
+from advsearch.cli.output import aligned
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
 
@@ -33,7 +33,7 @@ def answer(result: HardenResult) -> str:
         ["run", str(result.run)],
     ]
     rows = hardened_rows(result)
-    parts = [hardened_text(result), columns([list(HEADS), *rows]) if rows else "", columns([f for f in facts if f[1]])]
+    parts = [hardened_text(result), aligned([list(HEADS), *rows]) if rows else "", aligned([f for f in facts if f[1]])]
     return "\n\n".join(part for part in parts if part)
 
 

@@ -88,7 +88,7 @@ def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
             [one.name, one.mesh, f"{one.triangles:,} triangles", " x ".join(f"{side:.3g}" for side in one.size)]
             for one in found.nodes
         ]
-        print(output.columns([["node", "in controls", "", "size"], *rows]))
+        print(output.aligned([["node", "in controls", "", "size"], *rows]))
         print(f"One of them as the object, the rest around it: --object '{args.file}#{found.nodes[-1].name}'")
         if len(found.nodes) > 1:
             print(f"Another one moves with it: --control pose,pose:{found.nodes[0].mesh}")

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         listed = [{"index": index, "label": labels[index]} for index in indices]
         output.print_json({"schema": 1, "command": "labels", "word": args.word, "labels": listed})
     else:
-        print(output.columns([[f"#{index}", labels[index]] for index in indices]))
+        print(output.aligned([[f"#{index}", labels[index]] for index in indices]))
     return 0
 
 

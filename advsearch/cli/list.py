@@ -39,28 +39,28 @@ def run(args: argparse.Namespace) -> int:
 
     kinds = list(REGISTRIES) if args.kind == "all" else [args.kind]
     with at_work(as_json=True, quiet=False):
-        found = {kind: names(kind) for kind in kinds}
+        found = {kind: list_names(kind) for kind in kinds}
     if args.json:
         output.print_json({"schema": 1, **{kind: list(entries) for kind, entries in found.items()}})
         return 0
     for number, (kind, entries) in enumerate(found.items()):
         if args.kind == "all":
             print(("\n" if number else "") + f"{kind}:")
-        print(output.columns([[name, text] for name, text in entries.items()]))
+        print(output.aligned([[name, text] for name, text in entries.items()]))
     return 0
 
 
-def names(kind: str) -> dict[str, str]:
+def list_names(kind: str) -> dict[str, str]:
     """Return the names of one kind, each with one line about it where its registry has one."""
     module, _, attribute = REGISTRIES[kind].partition(":")
     registry = getattr(importlib.import_module(module), attribute)
     entries = registry() if callable(registry) else registry
     if isinstance(entries, Mapping):
-        return {str(name): first_line(entry) for name, entry in entries.items()}
+        return {str(name): first_doc_line(entry) for name, entry in entries.items()}
     return {str(name): "" for name in entries}
 
 
-def first_line(entry: Any) -> str:
+def first_doc_line(entry: Any) -> str:
     """Return the first line of what an entry of a registry says of itself; empty for plain values."""
     documented = entry if inspect.isroutine(entry) or inspect.isclass(entry) else type(entry)
     if documented.__module__ == "builtins":

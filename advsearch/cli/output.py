@@ -80,9 +80,9 @@ def go_on_command(run: str | Path) -> str:
     Args:
         run: its folder.
     """
-    from advsearch.runs.directory import CONFIG, shown
+    from advsearch.runs.directory import CONFIG, typed_name
 
-    words = ["advsearch", "resume", shown(run)]
+    words = ["advsearch", "resume", typed_name(run)]
     with suppress(AdvsearchError):
         words += [word for name in _code_in(Path(run) / CONFIG) for word in ("--code", name)]
     return shlex.join(words)
@@ -90,11 +90,11 @@ def go_on_command(run: str | Path) -> str:
 
 def _code_in(file: Path) -> Sequence[str]:
     """The Python code that a run.yaml names."""
-    from advsearch.cli.run import command_in, described
+    from advsearch.cli.run import command_in, config_of_file
     from advsearch.config import SceneConfig
     from advsearch.settings import split_names
 
-    config = described(command_in(file), file, {})
+    config = config_of_file(command_in(file), file, {})
     if not isinstance(config, SceneConfig):
         return ()
     metrics = getattr(config, "metrics", {}).values()
@@ -116,7 +116,7 @@ def output_kept_clean() -> Iterator[None]:
         yield
 
 
-def columns(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:
+def aligned(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:
     """Return lines with the cells of `rows` in aligned columns."""
     wide = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows), default=0))]
     return "\n".join(

@@ -54,7 +54,7 @@ def answer(chosen: PlanResult) -> str:
     lines = [
         READING,
         "",
-        output.columns(rows),
+        output.aligned(rows),
         "",
         f"renders for one gradient beside the picture itself: {chosen.renders_per_gradient}",
         f"samples a pixel: {chosen.spp}",
@@ -85,7 +85,7 @@ def answer(chosen: PlanResult) -> str:
             ]
             for row in chosen.cosines
         ]
-        lines += ["", output.columns([heads, *body])]
+        lines += ["", output.aligned([heads, *body])]
         denoise = chosen.denoise
         lines += [
             "",
@@ -97,7 +97,7 @@ def answer(chosen: PlanResult) -> str:
     if chosen.limits:
         lines += ["", "limits of the material form:", *(f"  {limit.what}" for limit in chosen.limits)]
     time = wording.seconds_text(chosen.seconds["total"])
-    return "\n".join([*lines, "", output.columns([["time", time], ["run", str(chosen.run)]])])
+    return "\n".join([*lines, "", output.aligned([["time", time], ["run", str(chosen.run)]])])
 
 
 def _left_out(chosen: PlanResult) -> list[str]:
@@ -110,7 +110,7 @@ def _left_out(chosen: PlanResult) -> list[str]:
         for row in chosen.gains:
             agrees = _agreement(row.picture_difference), _agreement(row.gradient_difference)
             rows.append([row.what, f"x {row.gain:.2f}", *agrees, *([] if row.safe else ["MORE THAN ITS NOISE"])])
-        lines += ["", output.columns(rows), ""]
+        lines += ["", output.aligned(rows), ""]
     if chosen.bounces is not None:
         depth, full = chosen.bounces.depth, chosen.bounces.full
         lines.append(f"longest light path of the search: {depth} segments of {full}: {chosen.bounces.reason}")

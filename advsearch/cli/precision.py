@@ -95,7 +95,7 @@ def _errors(points: Sequence[PrecisionPoint]) -> str:
         later = [f"{one.seconds if one.later_seconds is None else one.later_seconds:.3g}"] * again
         seconds = [f"{one.seconds:.3g}", *later]
         rows.append([*place, _percent(one.error_by("error")), between, beside, *seconds, str(one.repeats)])
-    return output.columns(rows)
+    return output.aligned(rows)
 
 
 def _objectives(points: Sequence[PrecisionPoint]) -> str:
@@ -112,7 +112,7 @@ def _objectives(points: Sequence[PrecisionPoint]) -> str:
                 str(one.repeats),
             ]
         )
-    return output.columns(rows)
+    return output.aligned(rows)
 
 
 def _slopes(slopes: Sequence[PrecisionSlope]) -> str:
@@ -135,7 +135,7 @@ def _slopes(slopes: Sequence[PrecisionSlope]) -> str:
                 verdict,
             ]
         )
-    return output.columns(rows)
+    return output.aligned(rows)
 
 
 def _references(references: Sequence[PrecisionReference]) -> str:
@@ -148,7 +148,7 @@ def _references(references: Sequence[PrecisionReference]) -> str:
         )
         what = one.control or one.quantity
         rows.append([what, one.reference, str(one.spp), str(one.parts), f"{100 * one.error:.2g} %", margin])
-    return output.columns(rows)
+    return output.aligned(rows)
 
 
 def _left_out(left_out: Sequence[NotMeasured]) -> list[str]:

@@ -20,7 +20,7 @@ LOADING_STAGES = 2
 @contextmanager
 def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
     """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
-    with output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as watcher:
+    with output_kept_clean() if as_json else nullcontext(), watch_progress(quiet=quiet) as watcher:
         progress = LoadingProgress(watcher)
         progress.stage("starting: PyTorch and Mitsuba are loaded")
         yield progress
@@ -28,7 +28,7 @@ def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
 
 
 @contextmanager
-def watching(*, quiet: bool = False) -> Iterator[Progress]:
+def watch_progress(*, quiet: bool = False) -> Iterator[Progress]:
     """Yield the progress that suits standard error: none when `quiet`, bars on a terminal, lines elsewhere."""
     if quiet:
         yield NullProgress()

@@ -47,7 +47,7 @@ def _listed(as_json: bool) -> int:
     if as_json:
         output.print_json({"schema": 1, "recipes": [{"name": name, "title": text} for name, text in found.items()]})
     else:
-        print(output.columns([[name, text] for name, text in found.items()]))
+        print(output.aligned([[name, text] for name, text in found.items()]))
     return 0
 
 
@@ -65,7 +65,7 @@ def answer(result: RecipeResult) -> str:
         ["time", wording.seconds_text(result.seconds["total"])],
         ["page", f"{result.run}/{REPORT}"],
     ]
-    parts = [result.title, *said, output.columns(facts)]
+    parts = [result.title, *said, output.aligned(facts)]
     parts += ["Quick: few and small pictures; no result."] if result.quick else []
     parts += ["Interrupted."] if result.goes_on else []
     return "\n\n".join(parts) + as_notes(result.warnings)

@@ -49,7 +49,7 @@ def answer(result: RegionResult) -> str:
         ["run", str(result.run)],
     ]
     if result.box is None or result.interval is None:
-        return "Stopped before the box was known.\n\n" + output.columns(cost)
+        return "Stopped before the box was known.\n\n" + output.aligned(cost)
     verdict = (
         f"The model is {result.verdict} in {result.same} of {result.samples} fresh samples of this box: "
         f"with 95 % confidence in at least {percent(result.interval[0])} of it."
@@ -57,7 +57,7 @@ def answer(result: RegionResult) -> str:
     rows = [["parameter", "from", "to", "centre", "unit"]]
     rows += [[one.name, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.centre:.4g}", one.unit] for one in result.box]
     facts = [["share of the space", percent(result.volume)], *cost]
-    return "\n\n".join([verdict, output.columns(rows), output.columns(facts)])
+    return "\n\n".join([verdict, output.aligned(rows), output.aligned(facts)])
 
 
 COMMAND = _Region("region", answer, about="around")

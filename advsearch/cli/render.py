@@ -27,11 +27,11 @@ def text(result: RenderResult) -> str:
     lines += [""]
     if len(result.views) == 1:
         rows = [seen_cells(result.task, one) for one in result.views[0].answers]
-        return "\n".join([*lines, f"Model {result.model} sees", output.columns(rows)])
+        return "\n".join([*lines, f"Model {result.model} sees", output.aligned(rows)])
     rows = [["azimuth", f"model {result.model} sees"]]
     for view in result.views:
         rows.append([f"{view.azimuth:g}", "; ".join(seen_text(result.task, one) for one in view.answers)])
-    return "\n".join([*lines, output.columns(rows)])
+    return "\n".join([*lines, output.aligned(rows)])
 
 
 COMMAND = QuestionCommand("render", text)

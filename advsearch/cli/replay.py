@@ -28,7 +28,7 @@ def answer(result: ReplayResult) -> str:
         ["time", wording.seconds_text(result.seconds["total"])],
         ["run", str(result.run)],
     ]
-    parts = [replay_text(result), output.columns([HEADS, *replay_rows(result)]), output.columns(facts)]
+    parts = [replay_text(result), output.aligned([HEADS, *replay_rows(result)]), output.aligned(facts)]
     parts += ["Interrupted."] if result.ending == "interrupted" else []
     return "\n\n".join(parts) + as_notes(result.warnings)
 

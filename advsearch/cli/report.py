@@ -121,12 +121,12 @@ def _run(folder: Path) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
     from advsearch.report.evidence import QUICK, claims_of, nothing_there
     from advsearch.report.evidence_runs import NOT_NOTED, evidence_of
-    from advsearch.runs.directory import CONFIG, shown
+    from advsearch.runs.directory import CONFIG, typed_name
     from advsearch.runs.results.evidence import EvidenceRun
     from advsearch.runs.summary import NAME as SUMMARY
     from advsearch.runs.summary import read_result
 
-    name, settings = shown(folder), _settings(folder)
+    name, settings = typed_name(folder), _settings(folder)
     made = _made_with(folder)
     if not (folder / SUMMARY).is_file():
         facts = {"Object": str(settings.get("object") or ""), "Model": str(settings.get("model") or "")}

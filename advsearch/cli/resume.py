@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     """Do what is left of the run and print its answer; of a run that is done, its answer."""
     import sys
 
-    from advsearch.cli.run import carry_out, changes_in, command_in
+    from advsearch.cli.run import changes_in, command_in, run_file
     from advsearch.runs.directory import CONFIG, find_run, only_here
     from advsearch.runs.listing import finished
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
             f"{path}: cannot go on from here: {', '.join(only)} existed only in the Python session that asked; call "
             "the same function with the same arguments again, an attack with `resume=True`"
         )
-    return carry_out(command_in(path / CONFIG), path / CONFIG, changes, args, resumed=path)
+    return run_file(command_in(path / CONFIG), path / CONFIG, changes, args, resumed=path)
 
 
 def _adds(path: Path, changes: Mapping[str, object]) -> bool:

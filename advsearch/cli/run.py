@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         changes["run"] = args.run
     if args.overwrite:
         changes["overwrite"] = True
-    return carry_out(command, args.file, changes, args)
+    return run_file(command, args.file, changes, args)
 
 
 def changes_in(words: Sequence[str]) -> dict[str, object]:
@@ -65,8 +65,8 @@ def command_in(file: str | Path) -> str:
     return str(read_yaml(file).get("command", "attack"))
 
 
-def described(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
-    """Return the configuration that a file describes; arguments and errors as for `carry_out`."""
+def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
+    """Return the configuration that a file describes; arguments and errors as for `run_file`."""
     from advsearch.config import CONFIGS
 
     if command not in COMMANDS:
@@ -74,7 +74,7 @@ def described(command: str, file: str | Path, changes: Mapping[str, object]) -> 
     return CONFIGS[command].from_yaml(file, changes)
 
 
-def carry_out(
+def run_file(
     command: str, file: str | Path, changes: Mapping[str, object], args: argparse.Namespace, resumed: Path | None = None
 ) -> int:
     """Do what a file describes.
@@ -91,7 +91,7 @@ def carry_out(
     """
     from advsearch.registry import only_named_code
 
-    config = described(command, file, changes)
+    config = config_of_file(command, file, changes)
     module = importlib.import_module(f"advsearch.cli.{command}")
     with only_named_code(file, args.code):
         return int(module.COMMAND.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))

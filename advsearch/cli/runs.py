@@ -24,12 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print one line for each run."""
     from advsearch.runs.directory import HOME
-    from advsearch.runs.listing import listed
+    from advsearch.runs.listing import listed_runs
 
     folder = HOME if args.folder is None else Path(args.folder)
     if args.folder is not None and not os.path.isdir(folder):
         raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")
-    runs = listed(folder)
+    runs = listed_runs(folder)
     if args.json:
         output.print_json({"schema": 1, "command": "runs", "runs": [vars(one) for one in runs]})
         return 0
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
         [one.name, one.command, one.object, _several(one.controls), str(one.rows), one.state, one.answer]
         for one in runs
     ]
-    print(output.columns([heads, *rows]))
+    print(output.aligned([heads, *rows]))
     return 0
 
 

@@ -20,7 +20,7 @@ LONGEST_WORD = 300
 """Most characters of a name in a message; of a longer one the ends are shown."""
 
 
-def printable(text: str, encoding: str = "utf-8") -> str:
+def escaped(text: str, encoding: str = "utf-8") -> str:
     """Return `text` with everything but line ends and tabs that a terminal would not show written as an escape."""
     if not text.isascii() or not text.isprintable():
         text = "".join(sign if sign in "\n\t" or _is_shown(sign) else _escape(sign) for sign in text)
@@ -45,7 +45,7 @@ def _escape(sign: str) -> str:
 
 
 class Screen:
-    """A text stream that prints what is `printable`. All but writing is the stream's own.
+    """A text stream that prints text `escaped`. All but writing is the stream's own.
 
     Args:
         stream: where it goes.
@@ -59,7 +59,7 @@ class Screen:
     def write(self, text: str) -> int:
         """Write a text; errors as for `output_errors`."""
         with self._errors():
-            self.stream.write(printable(text, self.stream.encoding or "utf-8"))
+            self.stream.write(escaped(text, self.stream.encoding or "utf-8"))
         return len(text)
 
     def flush(self) -> None:

@@ -55,12 +55,12 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     import importlib
 
     from advsearch.runs.directory import find_run
-    from advsearch.runs.listing import described
+    from advsearch.runs.listing import listed_run
     from advsearch.runs.summary import NAME, read_result
 
     path = find_run(name)
     if not (path / NAME).is_file():
-        return _show_unfinished(described(path), as_json)
+        return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
     answer = importlib.import_module(f"advsearch.cli.{result.command}").answer
     photos = photos_of(path)
@@ -69,9 +69,9 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     else:
         print(answer(result) + output.go_on_text(result) + (_photos_text(photos) if photos else ""))
     if picture:
-        from advsearch.cli.picture import pictures_of, show_pictures
+        from advsearch.cli.terminal_pictures import best_pictures, show_pictures
 
-        show_pictures(pictures_of(path))
+        show_pictures(best_pictures(path))
     return 0
 
 
@@ -100,7 +100,7 @@ def _photos_text(table: PhotoAgreement) -> str:
     agreeing = table.right_right + table.wrong_wrong
     total = count(table.photos, "photograph")
     text = f"Renderings and reality agree in {agreeing} of {total}, 95 % interval {interval_text(table.interval)}:"
-    return f"\n\n{text}\n{output.columns(lines)}"
+    return f"\n\n{text}\n{output.aligned(lines)}"
 
 
 def _show_unfinished(run: Listed, as_json: bool) -> int:
@@ -130,7 +130,7 @@ def _show_control(name: str, as_json: bool) -> int:
     from advsearch.cli.progress import at_work
 
     with at_work(as_json=True, quiet=False):
-        from advsearch.cli.list import first_line
+        from advsearch.cli.list import first_doc_line
         from advsearch.controls import CONTROLS
         from advsearch.runs.results.base import plain
 
@@ -141,7 +141,7 @@ def _show_control(name: str, as_json: bool) -> int:
     if as_json:
         output.print_json({"schema": 1, "control": name, "parameters": plain(parameters), "choices": plain(choices)})
         return 0
-    print(f"{name}: {first_line(control)}")
+    print(f"{name}: {first_doc_line(control)}")
     if not parameters:
         print(f"\nThe scene names its parameters: --control {name}:KEY=[low, high]")
     else:
@@ -156,7 +156,7 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
 
     with at_work(as_json=True, quiet=False):
         from advsearch.attacks import POLICIES
-        from advsearch.cli.list import first_line
+        from advsearch.cli.list import first_doc_line
         from advsearch.options import declared_options, default_of, type_of
         from advsearch.runs.results.base import plain
         from advsearch.tasks import TASKS
@@ -171,16 +171,16 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
         declared = [{"name": one, "type": options[one][0], "default": defaults[one]} for one in options]
         output.print_json({"schema": 1, kind: name, "options": declared})
         return 0
-    print(f"{name}: {first_line(entry)}\n")
+    print(f"{name}: {first_doc_line(entry)}\n")
     rows = [{"name": one, "type": options[one][0], "default": _cell(defaults[one])} for one in options]
     print(f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(rows)}" if rows else "It has no options.")
     return 0
 
 
 def _show_recipe(name: str, as_json: bool) -> int:
-    from advsearch.recipes.description import read_recipe, text_of
+    from advsearch.recipes.description import read_recipe, recipe_yaml
 
-    text = text_of(name)
+    text = recipe_yaml(name)
     if as_json:
         output.print_json({"schema": 1, "recipe": name, **read_recipe(name).model_dump(mode="json")})
     else:
@@ -219,7 +219,7 @@ def _of_choice(one: Choice) -> dict[str, str]:
 def _table(declared: Sequence[Mapping[str, str]]) -> str:
     """Return what was declared as a table."""
     rows = [list(one.values()) for one in declared]
-    return output.columns([list(declared[0]), *rows])
+    return output.aligned([list(declared[0]), *rows])
 
 
 def _cell(value: JsonValue) -> str:

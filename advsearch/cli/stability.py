@@ -56,11 +56,11 @@ def _print_cases(cases: Sequence[Case], *, as_json: bool) -> int:
         output.print_json({"schema": 1, "command": "stability", "cases": listed})
     else:
         rows = [[one.group, one.name, one.holds] for one in cases]
-        print(output.columns([["group", "case", "what must hold"], *rows]))
+        print(output.aligned([["group", "case", "what must hold"], *rows]))
     return 0
 
 
-def fell_short(result: StabilityResult) -> bool:
+def has_failed(result: StabilityResult) -> bool:
     """Whether a case does not hold."""
     from advsearch.evaluation.stability.suite import OK
 
@@ -69,10 +69,10 @@ def fell_short(result: StabilityResult) -> bool:
 
 def answer(result: StabilityResult) -> str:
     """Return the table, and where the run is."""
-    return "\n\n".join([table(result), output.columns([["run", result.run]])])
+    return "\n\n".join([stability_table(result), output.aligned([["run", result.run]])])
 
 
-def table(result: StabilityResult) -> str:
+def stability_table(result: StabilityResult) -> str:
     """Return the rows as text: a table, what was measured, the number that decides where a case fell short, and what
     was not run."""
     from advsearch.evaluation.stability.suite import OK
@@ -91,7 +91,7 @@ def table(result: StabilityResult) -> str:
         ]
         for row in rows
     ]
-    parts = [output.columns([heads, *body])]
+    parts = [output.aligned([heads, *body])]
     conditions = [
         f"  {row.case}: {name} {value:.3g}"
         for row in rows
@@ -109,4 +109,4 @@ def table(result: StabilityResult) -> str:
     return "\n\n".join(parts)
 
 
-COMMAND = _Stability("stability", answer, short=fell_short)
+COMMAND = _Stability("stability", answer, short=has_failed)

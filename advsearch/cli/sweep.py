@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from advsearch.cli.output import as_notes, columns
+from advsearch.cli.output import aligned, as_notes
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
 from advsearch.report.phrases import answer_text, beside_text, margin_text, percent
@@ -52,7 +52,7 @@ class _Sweep(QuestionCommand):
 def answer(summary: SweepSummary) -> str:
     """Return accuracy in total and by axis, the worst configuration and the cost."""
     facts = [[name, text] for name, text in _facts(summary).items() if text]
-    parts = [_verdict(summary), *_tables(summary), "\n".join(_surface(summary)), columns(facts)]
+    parts = [_verdict(summary), *_tables(summary), "\n".join(_surface(summary)), aligned(facts)]
     return "\n\n".join(part for part in parts if part) + as_notes(summary.warnings)
 
 
@@ -81,7 +81,7 @@ def _beside(pair: PairedRates, answer: str) -> str:
         ]
         for name, one in (("clean", pair.clean), (answer, pair.answer))
     ]
-    return f"{beside_text(answer, pair)}\n\n{columns(rows)}"
+    return f"{beside_text(answer, pair)}\n\n{aligned(rows)}"
 
 
 def _tables(summary: SweepSummary) -> list[str]:
@@ -111,7 +111,7 @@ def _table(name: str, rows: Sequence[AxisRow]) -> str:
         ]
         for row in shown
     ]
-    return f"{title}\n{columns(lines)}"
+    return f"{title}\n{aligned(lines)}"
 
 
 def _surface(summary: SweepSummary) -> list[str]:

@@ -17,9 +17,9 @@ from typing import Any
 
 from advsearch.cluster.executor import Done, Work, Workforce
 from advsearch.cluster.inputs import Files
-from advsearch.cluster.machine import Machine, name_of
+from advsearch.cluster.machine import MachineInfo, machine_name
 from advsearch.cluster.pool import Disconnected, Dropped, Ended, Event, Joined, Left, Pool
-from advsearch.cluster.worker import Carried, Failure, Ready, carry_out, prepare
+from advsearch.cluster.worker import Carried, Failure, Ready, carry_out_range, prepare
 from advsearch.errors import ClusterError
 
 DEPTH = 2
@@ -86,7 +86,7 @@ class Coordinator:
         key: str,
         files: Files,
         version: str,
-        machine: Machine,
+        machine: MachineInfo,
         tell: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -94,8 +94,8 @@ class Coordinator:
         self._pool, self._key, self._tell, self._clock = pool, key, tell, clock
         self._depth = DEPTH if work.ahead else 1
         self._work, self._files, self._version = work, files, version
-        self._here = name_of(machine)
-        self._machines: dict[str, Machine] = {}
+        self._here = machine_name(machine)
+        self._machines: dict[str, MachineInfo] = {}
         self._workers: dict[str, _Worker] = {}
         self._refused: dict[str, str] = {}
         self._tickets: dict[int, tuple[_Worker, _Range | None]] = {}
@@ -180,7 +180,7 @@ class Coordinator:
         else:
             first, last = one.numbers.start, one.numbers.stop
             given = () if self._given is None else (self._given[first:last],)
-            self._pool.submit(ticket, worker.address, carry_out, self._key, first, last, *given)
+            self._pool.submit(ticket, worker.address, carry_out_range, self._key, first, last, *given)
 
     # ---- what happens -----------------------------------------------------------------------------------------------
 
@@ -244,7 +244,7 @@ class Coordinator:
                 raise ClusterError(value.text)
 
     def _is_ready(self, worker: _Worker, value: Ready) -> None:
-        name = name_of(value.machine)
+        name = machine_name(value.machine)
         if name != self._here:
             worker.machine = name
             if name not in self._machines:

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -299,17 +300,28 @@ class DaskPool:
             self._there(worker)
 
     async def _watching(self, client: Any) -> None:
-        looked = time.monotonic()
-        while client.status == "running":
-            await asyncio.sleep(LOOK)
-            if time.monotonic() - looked > RESYNC:
-                looked = time.monotonic()
-                try:
-                    await asyncio.wait_for(self._look_around(), RESYNC)
-                except Exception:
-                    if client.status == "running":
-                        continue  # slow; the next look will tell
+        looking = self._loop.create_task(self._looking_around())
+        try:
+            await scheduler_gone(client)
+        finally:
+            looking.cancel()
         self._events.put(Disconnected())
+
+    async def _looking_around(self) -> None:
+        while True:
+            await asyncio.sleep(RESYNC)
+            with suppress(Exception):  # slow; the next look will tell
+                await asyncio.wait_for(self._look_around(), RESYNC)
+
+
+async def scheduler_gone(client: Any) -> None:
+    """Wait until a client of Dask has lost its scheduler, also where it has found it again between two looks.
+
+    A client that connects again does so by a connection of its own. What was under way is lost all the same.
+    """
+    connection = client.scheduler_comm
+    while client.status == "running" and client.scheduler_comm is connection:
+        await asyncio.sleep(LOOK)
 
 
 def _failure(error: Exception) -> Failure:

@@ -51,7 +51,7 @@ class MissingError(Exception):
     """A file is neither where the settings say nor among those that were sent before."""
 
 
-def gathered(work: Work) -> Files:
+def read_files(work: Work) -> Files:
     """Read the files that the settings of a work name.
 
     Raises:
@@ -71,7 +71,7 @@ def gathered(work: Work) -> Files:
     return found
 
 
-def placed(work: Work, files: Files, folder: Path) -> Work:
+def write_files(work: Work, files: Files, folder: Path) -> Work:
     """Write files that were sent into folders of their digests, and return the work with the paths that hold here.
 
     Raises:

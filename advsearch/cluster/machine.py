@@ -15,11 +15,11 @@ _CPU_INFO = Path("/proc/cpuinfo")
 PACKAGES = ("mitsuba", "drjit", "torch", "numpy")
 """Whose versions decide last bits."""
 
-Machine = dict[str, str]
+MachineInfo = dict[str, str]
 
 
 @cache
-def this_machine() -> Machine:
+def this_machine() -> MachineInfo:
     """Return the processor, libLLVM, and versions of packages.
 
     Raises:
@@ -29,7 +29,7 @@ def this_machine() -> Machine:
     return {"processor": processor(), "LLVM": llvm, **{name: _version(name) for name in PACKAGES}}
 
 
-def name_of(machine: Machine) -> str:
+def machine_name(machine: MachineInfo) -> str:
     """Return a short name of a machine by what it is."""
     return hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()[:8]
 

@@ -17,7 +17,7 @@ from advsearch import threads
 from advsearch.cluster.coordinator import Coordinator
 from advsearch.cluster.dask_pool import DaskPool, Site, local
 from advsearch.cluster.executor import Executor, Work
-from advsearch.cluster.inputs import Files, gathered
+from advsearch.cluster.inputs import Files, read_files
 from advsearch.cluster.machine import this_machine, version
 from advsearch.errors import FileFormatError, InputError
 from advsearch.settings import read_yaml
@@ -57,13 +57,13 @@ def executor_of(
         yield None
         return
     check_installed()
-    files = gathered(work)
+    files = read_files(work)
     place = place_of(workers, cluster)
     pool = DaskPool(place)
     try:
         if pool.link:
             tell(f"Dask shows its workers at {pool.link}")
-        yield Coordinator(pool, work, key_of(work, files), files, version(), this_machine(), tell)
+        yield Coordinator(pool, work, work_key(work, files), files, version(), this_machine(), tell)
     finally:
         pool.close()
 
@@ -110,7 +110,7 @@ def check_main() -> None:
     )
 
 
-def key_of(work: Work, files: Files) -> str:
+def work_key(work: Work, files: Files) -> str:
     """Return a name of a work by its content."""
     said = [work.function, work.settings, work.threads, sorted(files.named.items())]
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:32]

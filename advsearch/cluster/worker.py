@@ -20,8 +20,8 @@ from typing import Any
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster.executor import Call, Work
-from advsearch.cluster.inputs import Files, MissingError, placed
-from advsearch.cluster.machine import Machine, this_machine, version
+from advsearch.cluster.inputs import Files, MissingError, write_files
+from advsearch.cluster.machine import MachineInfo, this_machine, version
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, StorageError
 
 MOST_LOADED = 2
@@ -44,7 +44,7 @@ class Ready:
         seconds: that it took.
     """
 
-    machine: Machine
+    machine: MachineInfo
     seconds: float
 
 
@@ -100,7 +100,7 @@ def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
                     (own / KERNELS).mkdir(exist_ok=True)
                     os.environ["DRJIT_CACHE_DIR"] = str(own / KERNELS)
                 this_machine()
-                _load(key, placed(work, files, own / INPUTS))
+                _load(key, write_files(work, files, own / INPUTS))
             machine = this_machine()
     except MissingError as error:
         return Failure(f"it lacks {error}", missing=True)
@@ -109,7 +109,7 @@ def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
     return Ready(machine, time.perf_counter() - begun)
 
 
-def carry_out(key: str, first: int, last: int, given: Sequence[Any] | None = None) -> Carried | Failure:
+def carry_out_range(key: str, first: int, last: int, given: Sequence[Any] | None = None) -> Carried | Failure:
     """Carry out the range from `first` to before `last` of a work that this worker is ready for, or what is given for
     its numbers."""
     begun = time.perf_counter()

@@ -115,11 +115,11 @@ def measured_gains(
     return rows
 
 
-Found = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], float]
+GradientSamples = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], float]
 """The picture and the gradient of one seed, those of another, and the seconds of a gradient."""
 
 
-def _row(item: str, without: Found, having: Found) -> GainRow:
+def _row(item: str, without: GradientSamples, having: GradientSamples) -> GainRow:
     """Compare what is found with an item and without it."""
     (first, again, seconds), (first_with, again_with, seconds_with) = without, having
     picture, gradient = (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from advsearch.explanations.libraries import library
+from advsearch.explanations.libraries import import_library
 
 MOST, FEWEST = 6, 8
 """Clusters at most, and failures of which clusters are sought at least."""
@@ -52,7 +52,7 @@ def find_clusters(features: NDArray[np.float64], seed: int) -> Clusters:
     count = min(DIMENSIONS, *points.shape)
     if len(points) < FEWEST:
         return Clusters((tuple(range(len(points))),), None, False)
-    points = library("sklearn.decomposition").PCA(count, random_state=0).fit_transform(points)
+    points = import_library("sklearn.decomposition").PCA(count, random_state=0).fit_transform(points)
     generator = np.random.default_rng(seed)
     score, found = _grouped(points)
     spread = points.std(axis=0)
@@ -68,8 +68,8 @@ def _grouped(points: NDArray[np.float64]) -> tuple[float, NDArray[np.int64]]:
     best = (-1.0, np.zeros(len(points), dtype=np.int64))
     distinct = len(np.unique(points.round(9), axis=0))
     for k in range(2, min(MOST, distinct - 1) + 1):
-        found = library("sklearn.cluster").KMeans(k, n_init=4, random_state=0).fit_predict(points)
-        score = float(library("sklearn.metrics").silhouette_score(points, found))
+        found = import_library("sklearn.cluster").KMeans(k, n_init=4, random_state=0).fit_predict(points)
+        score = float(import_library("sklearn.metrics").silhouette_score(points, found))
         if score > best[0]:
             best = score, found
     return best

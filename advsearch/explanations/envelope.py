@@ -14,7 +14,7 @@ import numpy as np
 
 from advsearch.attacks import clopper_pearson
 from advsearch.explanations.observations import Observations
-from advsearch.explanations.rules import Conditions, RuleCondition, covered
+from advsearch.explanations.rules import RuleCondition, RuleConditions, covered
 
 SLICE = 0.05
 """Share of the rows left that is peeled off a side at a time."""
@@ -35,7 +35,7 @@ class Envelope:
         held: whether that is as much as was asked for.
     """
 
-    conditions: Conditions
+    conditions: RuleConditions
     right: int
     of: int
     at_least: float
@@ -50,7 +50,7 @@ def find_envelope(choosing: Observations, counting: Observations, accuracy: floa
         counting: other rows that it is tried on, once.
         accuracy: in (0, 1), which the lower end of a 95 % interval has to reach.
     """
-    conditions: Conditions = ()
+    conditions: RuleConditions = ()
     inside = np.ones(len(choosing), dtype=bool)
     while _at_least(choosing.right[inside]) < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
         best, kept = max(
@@ -74,7 +74,7 @@ def _mean(right: np.ndarray) -> float:
     return float(right.mean()) if len(right) >= LEAST_ROWS else -1.0
 
 
-def _peeled(conditions: Conditions, found: Observations, inside: np.ndarray) -> Iterator[Conditions]:
+def _peeled(conditions: RuleConditions, found: Observations, inside: np.ndarray) -> Iterator[RuleConditions]:
     """Boxes that are a little smaller, in one factor each."""
     own = {one.place: one for one in conditions}
     for place, factor in enumerate(found.factors):

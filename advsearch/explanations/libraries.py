@@ -11,7 +11,7 @@ PACKAGES = {"sklearn": "scikit-learn"}
 """Names on the package index, by that of a module."""
 
 
-def library(name: str) -> Any:
+def import_library(name: str) -> Any:
     """Return a module of such a library, such as ``sklearn.tree``.
 
     Raises:

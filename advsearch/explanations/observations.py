@@ -59,11 +59,11 @@ class Observations:
         return self.where(first), self.where(~first)
 
 
-Shown = Mapping[str, tuple[float | str, str]]
+RowValues = Mapping[str, tuple[float | str, str]]
 """Value and unit of everything that a row shows, by name."""
 
 
-def observed(rows: Sequence[tuple[Shown, bool]]) -> Observations:
+def observed(rows: Sequence[tuple[RowValues, bool]]) -> Observations:
     """Return rows as a table of what varies among them; what only some of them have is left out.
 
     Args:

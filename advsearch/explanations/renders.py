@@ -9,8 +9,8 @@ import numpy as np
 
 from advsearch.config import SweepConfig
 from advsearch.explanations.observations import Factor, Mask, Observations
-from advsearch.explanations.rules import Conditions, RuleCondition, covered
-from advsearch.recipes.table import written
+from advsearch.explanations.rules import RuleCondition, RuleConditions, covered
+from advsearch.recipes.table import figure_value
 from advsearch.settings import split_names
 
 ALONG = 9
@@ -18,7 +18,9 @@ ALONG = 9
 OUTER = ("object", "environment", "model")
 
 
-def inside(config: SweepConfig, found: Observations, conditions: Conditions, samples: int, seed: int) -> SweepConfig:
+def sweep_inside(
+    config: SweepConfig, found: Observations, conditions: RuleConditions, samples: int, seed: int
+) -> SweepConfig:
     """Return a sweep like another, of about so many configurations, most of which lie under the conditions.
 
     Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of a grid to the values that the
@@ -66,7 +68,7 @@ def along(
     return _quiet(config, grid=grid, controls={}, samples=None, seed=seed, **kept, **outer)
 
 
-def lies_inside(conditions: Conditions, factors: tuple[Factor, ...], row: Mapping[str, float | str]) -> bool:
+def lies_inside(conditions: RuleConditions, factors: tuple[Factor, ...], row: Mapping[str, float | str]) -> bool:
     """Whether a row lies under all conditions."""
     return all(_holds(one, factors[one.place], row[factors[one.place].name]) for one in conditions)
 
@@ -112,7 +114,7 @@ def _names(config: SweepConfig, found: Observations, mask: Mask, name: str) -> s
 def _like(config: SweepConfig, name: str, value: str) -> list[str]:
     """Of the names that a sweep was given, those that its rows write so."""
     given = split_names(getattr(config, name)) if getattr(config, name) else ()
-    return [one for one in given if value in (one, written(one))] or list(given[:1])
+    return [one for one in given if value in (one, figure_value(one))] or list(given[:1])
 
 
 def _ranges(control: str, found: Observations, mask: Mask, cut: Mapping[int, RuleCondition]) -> dict[str, object]:

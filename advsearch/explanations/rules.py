@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import hypergeom
 
 from advsearch import seeds
-from advsearch.explanations.libraries import library
+from advsearch.explanations.libraries import import_library
 from advsearch.explanations.observations import Factor, Mask, Observations, encoded
 
 MOST_RULES = 5
@@ -73,7 +73,7 @@ class RuleCondition:
         return f"{factor.name} over {self.low:g} and at most {self.high:g}{unit}"
 
 
-Conditions = tuple[RuleCondition, ...]
+RuleConditions = tuple[RuleCondition, ...]
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class CountedRule:
         right_elsewhere, of_elsewhere: the other rows.
     """
 
-    conditions: Conditions
+    conditions: RuleConditions
     right: int
     of: int
     right_elsewhere: int
@@ -139,7 +139,7 @@ class FoundRules:
     next: CountedRule | None
 
 
-def covered(conditions: Conditions, found: Observations) -> Mask:
+def covered(conditions: RuleConditions, found: Observations) -> Mask:
     """Return which rows (n,) lie under all conditions."""
     mask = np.ones(len(found), dtype=bool)
     for one in conditions:
@@ -172,11 +172,11 @@ def find_rules(choosing: Observations, counting: Observations, seed: int) -> Fou
     return FoundRules(rules, None)
 
 
-def _counted(conditions: Conditions, inside: Mask, elsewhere: Mask) -> CountedRule:
+def _counted(conditions: RuleConditions, inside: Mask, elsewhere: Mask) -> CountedRule:
     return CountedRule(conditions, int(inside.sum()), len(inside), int(elsewhere.sum()), len(elsewhere))
 
 
-def _best(found: Observations, seed: int) -> Conditions:
+def _best(found: Observations, seed: int) -> RuleConditions:
     """The candidate of the largest weighted relative accuracy, as short as it can be; none where all are worthless."""
     wrong = ~found.right
     least = max(LEAST_ROWS, round(LEAST_SHARE * len(found)))
@@ -184,7 +184,7 @@ def _best(found: Observations, seed: int) -> Conditions:
         return ()
     excess = wrong - wrong.mean()
 
-    def weight(conditions: Conditions) -> float:
+    def weight(conditions: RuleConditions) -> float:
         mask = covered(conditions, found)
         return float(excess[mask].sum()) / len(found) if int(mask.sum()) >= least else -1.0
 
@@ -204,7 +204,7 @@ def _best(found: Observations, seed: int) -> Conditions:
     return best
 
 
-def _error(shorter: Conditions, longer: Conditions, found: Observations) -> float:
+def _error(shorter: RuleConditions, longer: RuleConditions, found: Observations) -> float:
     """The standard error of what conditions add to the weighted relative accuracy, so that few rows choose few."""
     left_out = int((covered(shorter, found) & ~covered(longer, found)).sum())
     return math.sqrt(left_out * float(found.right.var())) / len(found)
@@ -222,16 +222,16 @@ def _moved(condition: RuleCondition, found: Observations) -> Iterator[RuleCondit
             yield replace(condition, high=at)
 
 
-def _candidates(found: Observations, least: int, seed: int) -> Iterator[Conditions]:
+def _candidates(found: Observations, least: int, seed: int) -> Iterator[RuleConditions]:
     """The nodes of one tree of all rows and of a random forest."""
-    one_tree = library("sklearn.tree").DecisionTreeClassifier
-    forest = library("sklearn.ensemble").RandomForestClassifier
+    one_tree = import_library("sklearn.tree").DecisionTreeClassifier
+    forest = import_library("sklearn.ensemble").RandomForestClassifier
     columns, meaning = encoded(found)
     shape = {"max_depth": DEPTH, "min_samples_leaf": least}
     alone = one_tree(**shape, random_state=seed % 2**32)
     several = forest(TREES, **shape, max_features=0.6, random_state=seed % 2**32)
     trees = [alone.fit(columns, found.right), *several.fit(columns, found.right).estimators_]
-    seen: set[Conditions] = set()
+    seen: set[RuleConditions] = set()
     for one in trees:
         for conditions in _nodes(one.tree_, meaning, found.factors):
             if conditions and conditions not in seen:
@@ -239,7 +239,9 @@ def _candidates(found: Observations, least: int, seed: int) -> Iterator[Conditio
                 yield conditions
 
 
-def _nodes(tree: object, meaning: Sequence[tuple[int, int | None]], factors: Sequence[Factor]) -> Iterator[Conditions]:
+def _nodes(
+    tree: object, meaning: Sequence[tuple[int, int | None]], factors: Sequence[Factor]
+) -> Iterator[RuleConditions]:
     """The conditions of every node of a tree of scikit-learn."""
     left, right = tree.children_left, tree.children_right  # type: ignore[attr-defined]
     columns, thresholds = tree.feature, tree.threshold  # type: ignore[attr-defined]

@@ -133,24 +133,24 @@ class Recipe(_Described):
         return self.model_copy(update={"settings": merged(self.settings, self.quick.settings), "parts": parts})
 
 
-def names() -> tuple[str, ...]:
+def recipe_names() -> tuple[str, ...]:
     """Return the names of the bundled recipes."""
     return tuple(sorted(path.name.removesuffix(".yaml") for path in _folder().iterdir() if path.name.endswith(".yaml")))
 
 
 def titles() -> dict[str, str]:
     """Return the question of each bundled recipe."""
-    return {name: read_recipe(name).title for name in names()}
+    return {name: read_recipe(name).title for name in recipe_names()}
 
 
-def text_of(name: str) -> str:
+def recipe_yaml(name: str) -> str:
     """Return the YAML of a bundled recipe.
 
     Raises:
         UnknownNameError: there is no such recipe.
     """
-    if name not in names():
-        raise UnknownNameError("recipe", name, names(), "A recipe of your own is a YAML file: give its path.")
+    if name not in recipe_names():
+        raise UnknownNameError("recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path.")
     return str((_folder() / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
@@ -166,7 +166,7 @@ def read_recipe(name: str) -> Recipe:
     """
     if is_file_name(name):
         return recipe_of(read_yaml(name), name)
-    text_of(name)
+    recipe_yaml(name)
     with resources.as_file(_folder() / f"{name}.yaml") as path:
         return recipe_of(read_yaml(path), name)
 

@@ -61,7 +61,7 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
     return chosen.model_copy(update={"settings": settings})
 
 
-def listed(value: object) -> list[str]:
+def names_listed(value: object) -> list[str]:
     """Return names that stand in a list, or in a text with commas between them."""
     return [str(one) for one in value] if isinstance(value, (list, tuple)) else list(split_names(str(value)))
 
@@ -71,7 +71,7 @@ def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[Planned]:
     settings = {**recipe.settings, **part.settings}
     several = kind.several if issubclass(kind, SceneConfig) and part.command != "attack" else ()
     axes = {
-        axis: listed(settings.get(axis) or default)
+        axis: names_listed(settings.get(axis) or default)
         for axis, default in (("object", ""), ("environment", DEFAULT_ENVIRONMENT), ("model", "reference"))
         if axis not in several or axis == "object"
     }

@@ -120,7 +120,7 @@ class Table:
             found.setdefault(self.value(row, column), []).append(row)
         numbers = all(isinstance(value, (int, float)) for value in found)
         keys = sorted(found) if numbers else list(found)
-        return {written(key): found[key] for key in keys}
+        return {figure_value(key): found[key] for key in keys}
 
 
 def counted(name: str, rows: Iterable[Answered]) -> NamedCount:
@@ -145,7 +145,7 @@ def most_frequent(rows: Iterable[Answered]) -> list[tuple[str, int]]:
     return sorted(Counter(row.answer for row in rows).items(), key=lambda one: (-one[1], one[0]))
 
 
-def written(value: float | str) -> str:
+def figure_value(value: float | str) -> str:
     """Return a value as figures write it; of a file, its name without folder and suffix."""
     if isinstance(value, str):
         return Path(short_name(value)).stem if "/" in value else value
@@ -184,7 +184,7 @@ def _rows(part: str, folder: Path, summary: AttackSummary | SweepSummary, kinds:
             values = {name: one["value"] for name, one in row.values.items()}
             values |= {TRIAL: TRIALS[row.kind]} if row.kind in TRIALS else {}
             values |= {"model": summary.model} if part == PHOTOGRAPHS and "," not in summary.model else {}
-            named = {name: written(str(values.get(name, of_all))) for name, of_all in outer.items()}
+            named = {name: figure_value(str(values.get(name, of_all))) for name, of_all in outer.items()}
             units = {name: one["unit"] for name, one in row.values.items() if one["unit"]}
             answer = row.label or "none", bool(row.correct)
             rows.append(Answered(part, {**values, **named}, units, *answer, row.time, row.margin))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from advsearch.runs.results.precision import PrecisionPoint, PrecisionResult
 
-Points = Sequence["PrecisionPoint"]
+PrecisionPoints = Sequence["PrecisionPoint"]
 
 COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f")
 MARKERS = "osD^vP*X<"
@@ -53,10 +53,10 @@ def precision_figures(report: PrecisionResult) -> Figures:
     return drawn(draw, (PANEL[0] * wide, PANEL[1] * tall + 0.8))
 
 
-def _panels(report: PrecisionResult) -> list[tuple[str, str, Points]]:
+def _panels(report: PrecisionResult) -> list[tuple[str, str, PrecisionPoints]]:
     """Title, what the vertical axis shows, and points of each diagram."""
     image = [one for one in report.points if one.quantity == "image"]
-    found: list[tuple[str, str, Points]] = []
+    found: list[tuple[str, str, PrecisionPoints]] = []
     for family, title in (("raw", "picture: samplers, denoiser"), ("depth", "picture: path depth")):
         shown = [one for one in image if (one.family == "depth") == (family == "depth")]
         found += [(title, "error", shown)] if shown else []
@@ -69,7 +69,7 @@ def _panels(report: PrecisionResult) -> list[tuple[str, str, Points]]:
     return found + ([("best verified objective", "objective", objective)] if objective else [])
 
 
-def _errors(axes: Axes, points: Points, measure: str, report: PrecisionResult) -> None:
+def _errors(axes: Axes, points: PrecisionPoints, measure: str, report: PrecisionResult) -> None:
     """Error against seconds, one line for each estimator."""
     usable = [one for one in points if 0.0 < one.error_by(measure).value < math.inf]
     for number, name in enumerate(dict.fromkeys(one.estimator for one in usable)):
@@ -102,7 +102,7 @@ def _errors(axes: Axes, points: Points, measure: str, report: PrecisionResult) -
     )
 
 
-def _line(axes: Axes, line: Points, measure: str, number: int, label: str) -> None:
+def _line(axes: Axes, line: PrecisionPoints, measure: str, number: int, label: str) -> None:
     found = [one.error_by(measure) for one in line]
     color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
     seconds = [one.seconds for one in line]
@@ -125,7 +125,7 @@ def _line(axes: Axes, line: Points, measure: str, number: int, label: str) -> No
     axes.plot([], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label)
 
 
-def _named(name: str, points: Points, measure: str, report: PrecisionResult) -> str:
+def _named(name: str, points: PrecisionPoints, measure: str, report: PrecisionResult) -> str:
     """An estimator with the slope of its line against samples, and theory where it disagrees with that."""
     control = points[0].control
     for one in report.slopes:
@@ -140,7 +140,7 @@ def _minus(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
 
 
-def _theory(axes: Axes, points: Points, measure: str) -> None:
+def _theory(axes: Axes, points: PrecisionPoints, measure: str) -> None:
     """A dashed line of slope -1/2 under the points."""
     low, high = min(one.seconds for one in points), max(one.seconds for one in points)
     if high < 1.5 * low:
@@ -172,7 +172,7 @@ def _plain_axis(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _gains(axes: Axes, points: Points, kind: str, report: PrecisionResult) -> None:
+def _gains(axes: Axes, points: PrecisionPoints, kind: str, report: PrecisionResult) -> None:
     """Objective against seconds, median and quartiles, one line for each policy."""
     for number, name in enumerate(dict.fromkeys(one.estimator for one in points)):
         line = sorted((one for one in points if one.estimator == name), key=lambda one: one.renders or 0)

@@ -89,7 +89,7 @@ def nothing_there(why: str) -> Claim:
 
 def _attack(result: AttackSummary) -> Iterator[Claim]:
     rate, spent = result.verified, _searches(result.renders, result.policy, result.baseline is not None)
-    said = wording.verdict(result)
+    said = wording.attack_verdict(result)
     extent = _extent("fresh renders that count as a success", rate)
     if result.ending == "found" and rate is not None and rate.successes:
         yield _claim("found", f"{said} How many such configurations there are is not known.", extent)

@@ -30,7 +30,7 @@ def explain_text(result: ExplainResult) -> str:
     if not result.rules:
         return (
             f"No rule is told from chance in {result.total:,} rows, of which one half chooses and the other counts: "
-            f"the model is right in {share_text(result)}."
+            f"the model is right in {right_share_text(result)}."
         )
     return f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
 
@@ -38,9 +38,10 @@ def explain_text(result: ExplainResult) -> str:
 def rule_text(number: int, rule: RuleRow) -> str:
     """Return a rule as a sentence."""
     rest = "elsewhere" if number == 0 else "in what no rule before covers"
-    text = f"{conditions_text(rule.conditions)}: right in {share_text(rule)}; {rest} {share_text(rule.elsewhere)}."
+    share, others = right_share_text(rule), right_share_text(rule.elsewhere)
+    text = f"{conditions_text(rule.conditions)}: right in {share}; {rest} {others}."
     fresh = rule.confirmed
-    return text if fresh is None else f"{text} Fresh renders inside it: right in {share_text(fresh)}."
+    return text if fresh is None else f"{text} Fresh renders inside it: right in {right_share_text(fresh)}."
 
 
 def not_told_text(result: ExplainResult) -> str:
@@ -65,7 +66,7 @@ def conditions_text(conditions: Sequence[ConditionRow]) -> str:
     return " and ".join(one.text for one in conditions) or "everything that was looked at"
 
 
-def share_text(counted: RightOf) -> str:
+def right_share_text(counted: RightOf) -> str:
     """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
     if not counted.total:
         return "none of 0"
@@ -80,8 +81,8 @@ def envelope_text(result: ExplainResult) -> str:
         return "No box of enough rows promises the accuracy that was asked for."
     where = conditions_text(box.conditions)
     if not box.held:
-        return f"Not shown: inside {where} the rows that did not choose it are right in {share_text(box)}."
-    return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {share_text(box)}."
+        return f"Not shown: inside {where} the rows that did not choose it are right in {right_share_text(box)}."
+    return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {right_share_text(box)}."
 
 
 def pair_text(pair: NearestRight) -> str:

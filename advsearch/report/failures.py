@@ -19,13 +19,13 @@ def failures_text(known: DifferentFailures) -> str:
     where = f"{known.found} of {count(known.seen, 'draw')}"
     if known.places is not None:
         where = f"{known.found} of {known.places} cells over {' and '.join(known.over)} ({known.seen} were seen)"
-    share = "" if known.share is None else f"; {share_text(known.share)}"
+    share = "" if known.share is None else f"; {failing_share_text(known.share)}"
     if not known.tried:
         return f"claimed in {where}{share}; none of these was tried with fresh renders"
     return f"claimed in {where}{share}; with fresh renders {known.held} of the {known.tried} that were tried hold"
 
 
-def share_text(share: FailingShare) -> str:
+def failing_share_text(share: FailingShare) -> str:
     """Return how large a part of all configurations fails."""
     interval = f"of all configurations {interval_text(share.interval)} fail in one render (95 % interval)"
     return interval if share.estimate is None else f"{interval}, {percent(share.estimate)} by the estimate"

@@ -28,9 +28,9 @@ def element(tag: str, *children: str | None, **attributes: str | float) -> Html:
     )
     if tag in _VOID:
         return Html(f"<{tag}{given}>")
-    return Html(f"<{tag}{given}>{join(*children)}</{tag}>")
+    return Html(f"<{tag}{given}>{join_html(*children)}</{tag}>")
 
 
-def join(*parts: str | None) -> Html:
+def join_html(*parts: str | None) -> Html:
     """Return the parts one after the other, escaped where they are not `Html`."""
     return Html("".join(part if isinstance(part, Html) else escape(part) for part in parts if part is not None))

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from advsearch.report import wording
 from advsearch.report.drawing import Figures
-from advsearch.report.markup import Html, element, join
-from advsearch.report.phrases import beside_text, cells, percent
+from advsearch.report.markup import Html, element, join_html
+from advsearch.report.phrases import answer_cells, beside_text, percent
 from advsearch.report.studies import sweep_figure
 from advsearch.runs.images import png_bytes
 from advsearch.runs.results.attack import AttackSummary, VerifiedRate
@@ -46,12 +46,14 @@ def attack_html(summary: AttackSummary, pictures: Mapping[str, ArrayLike]) -> st
     rate = (
         _rate("right", control.correct, control.trials, control.interval, control.not_a_number) if control else ["", ""]
     )
-    rows.append(["clean", *cells(summary.task, summary.clean), *rate])
+    rows.append(["clean", *answer_cells(summary.task, summary.clean), *rate])
     if summary.adversarial:
-        rows.append(["adversarial", *cells(summary.task, summary.adversarial), *_verified(success, summary.verified)])
+        rows.append(
+            ["adversarial", *answer_cells(summary.task, summary.adversarial), *_verified(success, summary.verified)]
+        )
     if summary.baseline:
         rows.append(["random search", "", "", *_verified(success, summary.baseline.verified)])
-    return element("div", element("p", wording.verdict(summary)), *shown, _table(rows))
+    return element("div", element("p", wording.attack_verdict(summary)), *shown, _table(rows))
 
 
 def sweep_html(summary: SweepSummary) -> str:
@@ -111,5 +113,5 @@ def _table(rows: Sequence[Sequence[str]]) -> Html:
     return element(
         "table",
         element("thead", element("tr", *(element("th", cell) for cell in head))),
-        element("tbody", join(*(element("tr", *(element("td", cell) for cell in row)) for row in body))),
+        element("tbody", join_html(*(element("tr", *(element("td", cell) for cell in row)) for row in body))),
     )

@@ -140,7 +140,7 @@ def wanted(objective: str, thing: str) -> str:
     return _WANTED.get(objective, "makes the model miss {}").format(thing)
 
 
-def cells(task: str, answer: Said) -> list[str]:
+def answer_cells(task: str, answer: Said) -> list[str]:
     """Return an answer and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
     0.12"]``.
     """
@@ -158,7 +158,7 @@ def cells(task: str, answer: Said) -> list[str]:
 
 def answer_text(task: str, answer: Said) -> str:
     """Return an answer on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
-    label, number = cells(task, answer)
+    label, number = answer_cells(task, answer)
     if task == SEGMENTATION and number and label.startswith(_NONE):
         return f"{label} found, accuracy over the object's pixels {percent(answer.probability)}"
     if task == SEGMENTATION and number:

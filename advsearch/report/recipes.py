@@ -24,7 +24,7 @@ from advsearch.runs.results.recipe import (
     TernaryFigure,
 )
 
-Numbers = tuple[list[str], list[list[str]]]
+HeadsAndRows = tuple[list[str], list[list[str]]]
 """Heads and rows of a table."""
 
 COUNT_HEADS = ["right", "accuracy", "95 % interval"]
@@ -44,7 +44,7 @@ def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:
     return told
 
 
-def figure_table(made: AnyFigure) -> Numbers:
+def figure_table(made: AnyFigure) -> HeadsAndRows:
     """Return the numbers of a figure as a table."""
     match made:
         case BarsFigure():
@@ -71,7 +71,7 @@ def figure_table(made: AnyFigure) -> Numbers:
             return _surface(made)
 
 
-def written(value: float) -> str:
+def figure_number(value: float) -> str:
     """Return a number as figures write it."""
     return f"{value:.4g}"
 
@@ -89,7 +89,7 @@ def _counts(counts: Sequence[NamedCount]) -> list[list[str]]:
     ]
 
 
-def _answers(made: AnswersFigure) -> Numbers:
+def _answers(made: AnswersFigure) -> HeadsAndRows:
     rows = [
         [row.name, one.name, f"{one.correct} of {one.configurations}", interval_text(one.interval), str(one.right)]
         for row in made.rows
@@ -98,7 +98,7 @@ def _answers(made: AnswersFigure) -> Numbers:
     return [made.by, "answer", "given in", "95 % interval", "right"], rows
 
 
-def _agreement(made: AgreementFigure) -> Numbers:
+def _agreement(made: AgreementFigure) -> HeadsAndRows:
     rows = [
         [one.name, row.name, *map(str, (row.right_right, row.right_wrong, row.wrong_right, row.wrong_wrong)),
          str(row.same_answer), *_counts([row.agreeing])[0][1:]]
@@ -109,7 +109,7 @@ def _agreement(made: AgreementFigure) -> Numbers:
     return ["rendering and", "object", *both, "agree", "share", "95 % interval"], rows
 
 
-def _corruptions(made: CorruptionFigure) -> Numbers:
+def _corruptions(made: CorruptionFigure) -> HeadsAndRows:
     rows = [
         [model.model, *row]
         for model in made.models
@@ -118,7 +118,7 @@ def _corruptions(made: CorruptionFigure) -> Numbers:
     return ["model", "corruption", "wrong", "error", "95 % interval"], rows
 
 
-def _cues(made: CuesFigure) -> Numbers:
+def _cues(made: CuesFigure) -> HeadsAndRows:
     rows = [
         [one.name, f"{one.correct} of {one.configurations}", f"{one.textured} of {one.configurations}"]
         for one in made.rows
@@ -126,18 +126,20 @@ def _cues(made: CuesFigure) -> Numbers:
     return [made.texture, "the object", "the texture"], rows
 
 
-def _curve(made: CurveFigure) -> Numbers:
+def _curve(made: CurveFigure) -> HeadsAndRows:
     rows = []
     for line in made.lines:
         counts = [
-            NamedCount(name=f"{written(one.low)} to {written(one.high)}", **one.model_dump(exclude={"low", "high"}))
+            NamedCount(
+                name=f"{figure_number(one.low)} to {figure_number(one.high)}", **one.model_dump(exclude={"low", "high"})
+            )
             for one in line.bins
         ]
         rows += [[line.name, *row] for row in _counts(counts)]
     return [made.by or "line", made.along, *COUNT_HEADS], rows
 
 
-def _heat_map(made: HeatMapFigure) -> Numbers:
+def _heat_map(made: HeatMapFigure) -> HeadsAndRows:
     rows = [
         [name, *(f"{right} of {seen}" for right, seen in zip(correct, configurations, strict=True))]
         for name, correct, configurations in zip(made.rows, made.correct, made.configurations, strict=True)
@@ -145,12 +147,12 @@ def _heat_map(made: HeatMapFigure) -> Numbers:
     return [made.row, *made.columns], rows
 
 
-def _points(made: PointsFigure) -> Numbers:
+def _points(made: PointsFigure) -> HeadsAndRows:
     rows = [[name, *row] for name, counts in zip(made.rows, made.counts, strict=True) for row in _counts(counts)]
     return [made.by, made.series, *COUNT_HEADS], rows
 
 
-def _ternary(made: TernaryFigure) -> Numbers:
+def _ternary(made: TernaryFigure) -> HeadsAndRows:
     if made.leads:
         rows = [[one.name, str(one.configurations), f"{one.mean:.3g}", f"{one.error:.2g}"] for one in made.leads]
         return ["where most is", "pictures", "mean lead of the right answer", "standard error"], rows
@@ -161,7 +163,7 @@ def _ternary(made: TernaryFigure) -> Numbers:
     return ["answer", "given", *(f"where most is {bare(name)}" for name in made.shares)], rows
 
 
-def _scaling(made: ScalingFigure) -> Numbers:
+def _scaling(made: ScalingFigure) -> HeadsAndRows:
     rows = [
         [str(one.workers), *(", ".join(f"{value:.3g}" for value in values) for values in (one.rates, one.gains))]
         for one in made.points
@@ -169,7 +171,7 @@ def _scaling(made: ScalingFigure) -> Numbers:
     return ["workers", "pictures a second", "over the fewest workers"], rows
 
 
-def _surface(made: SurfaceFigure) -> Numbers:
+def _surface(made: SurfaceFigure) -> HeadsAndRows:
     tables = [table for one in made.maps for table in one.tables]
     rows = [
         [one.object, short_name(one.model), one.part, *map(str, (one.seen, one.compared, one.worse, one.better))]

@@ -35,7 +35,7 @@ _REASONS = {
 """Why a search ended without an answer, where the name of the ending doesn't say it."""
 
 
-def verdict(summary: AttackSummary) -> str:
+def attack_verdict(summary: AttackSummary) -> str:
     """Return what the run found, in one sentence that holds on its own."""
     ending, verified = summary.ending, summary.verified
     thing = f"this {noun(summary)}"

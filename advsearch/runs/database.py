@@ -104,7 +104,7 @@ MIGRATIONS = (
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
 
-def is_ours(path: Path) -> bool:
+def is_results_database(path: Path) -> bool:
     """Return whether the file at `path` starts like a results.sqlite of advsearch."""
     try:
         with open_regular(path, "a results.sqlite", LARGEST) as file:

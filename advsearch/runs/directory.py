@@ -407,7 +407,7 @@ def run_path(run: str | Path) -> Path:
     return HOME / path if is_name else path.expanduser()
 
 
-def shown(path: str | Path) -> str:
+def typed_name(path: str | Path) -> str:
     """Return what a user types to name the run in a folder: its name in `HOME`, or its path."""
     path = Path(path)
     return path.name if path.parent == HOME else str(path)
@@ -438,7 +438,7 @@ def only_here(path: Path) -> list[str]:
 
 def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
-    if database.is_ours(path / store.NAME):
+    if database.is_results_database(path / store.NAME):
         return True
     from advsearch.settings import HEADER
 
@@ -498,7 +498,7 @@ def _clear(path: Path) -> None:
 
 def _never_began(path: Path) -> bool:
     """Whether a run was killed before its settings were written: there is nothing in it to lose."""
-    if (path / CONFIG).exists() or not database.is_ours(path / store.NAME):
+    if (path / CONFIG).exists() or not database.is_results_database(path / store.NAME):
         return False
     with suppress(AdvsearchError):
         if (path / summary.NAME).exists():

@@ -38,7 +38,7 @@ GROUP = 8192
 """Rows of a Parquet row group, and so what is held in memory at once."""
 
 
-def export(store: Store, format: str, out: Path | None, stream: IO[bytes], kind: str | None = None) -> int:
+def write_rows(store: Store, format: str, out: Path | None, stream: IO[bytes], kind: str | None = None) -> int:
     """Write the rows and return how many there were.
 
     Args:
@@ -59,7 +59,7 @@ def export(store: Store, format: str, out: Path | None, stream: IO[bytes], kind:
     if kind is not None and kind not in counts:
         raise UnknownNameError("kind of rows", kind, counts)
     write = {"csv": _csv, "json": _json, "parquet": _parquet}[format]
-    names = columns(store.rows(kind))
+    names = as_columns(store.rows(kind))
     if out is None:
         write(_records(store.rows(kind)), names, stream)
     else:
@@ -68,7 +68,7 @@ def export(store: Store, format: str, out: Path | None, stream: IO[bytes], kind:
     return counts[kind] if kind is not None else sum(counts.values())
 
 
-def columns(rows: Iterable[Row]) -> list[str]:
+def as_columns(rows: Iterable[Row]) -> list[str]:
     """Return the columns of a table of these rows; metrics and values in the order in which they first occur."""
     metrics: dict[str, None] = {}
     seen: dict[str, None] = {}
@@ -78,7 +78,7 @@ def columns(rows: Iterable[Row]) -> list[str]:
     return [*OWN, *metrics, *seen, *AFTER]
 
 
-def record(row: Row) -> JsonObject:
+def as_record(row: Row) -> JsonObject:
     """Return a row as column to value."""
     own = {one.name: getattr(row, one.name) for one in fields(row) if one.name not in ("values", "metrics")}
     return own | dict(row.metrics) | _values(row.values)
@@ -93,9 +93,9 @@ def to_pandas(rows: Iterable[Row]) -> Any:
         InputError: pandas is not installed.
     """
     pandas, listed = _pandas(), list(rows)
-    names = {one: one.partition(" [")[0] for one in columns(listed)}
+    names = {one: one.partition(" [")[0] for one in as_columns(listed)}
     units = {plain: one.removeprefix(f"{plain} [").removesuffix("]") for one, plain in names.items() if plain != one}
-    records = [{names[name]: value for name, value in record(row).items()} for row in listed]
+    records = [{names[name]: value for name, value in as_record(row).items()} for row in listed]
     frame = pandas.DataFrame(records, columns=list(names.values()))
     frame.attrs = {"units": units}
     return frame
@@ -127,7 +127,7 @@ def _pandas() -> Any:
 
 
 def _records(rows: Iterable[Row]) -> Iterator[JsonObject]:
-    return (record(row) for row in rows)
+    return (as_record(row) for row in rows)
 
 
 def _values(values: Mapping[str, Value | JsonValue]) -> JsonObject:

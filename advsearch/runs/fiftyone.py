@@ -184,10 +184,10 @@ def _sample(one: Pictured, number: int, dataset: str, label: str, fields: _Value
 
 
 Box = tuple[float, float, float, float]
-Found = tuple[str, Box, float | None]
+Detected = tuple[str, Box, float | None]
 
 
-def _boxes(one: Pictured) -> tuple[Box | None, list[Found]] | None:
+def _boxes(one: Pictured) -> tuple[Box | None, list[Detected]] | None:
     """The true box and those that were found, as x, y, width and height in shares of the picture; None without."""
     kept = one.row.payload
     if one.size is None or not isinstance(kept, dict) or not isinstance(kept.get("found"), list):
@@ -199,7 +199,7 @@ def _boxes(one: Pictured) -> tuple[Box | None, list[Found]] | None:
         return x0 / width, y0 / height, (x1 - x0) / width, (y1 - y0) / height
 
     try:
-        found: list[Found] = [
+        found: list[Detected] = [
             (str(each["label"]), relative(each["box"]), float(each["score"]))  # type: ignore[index,call-overload,arg-type]
             for each in kept["found"]  # type: ignore[union-attr]
         ]
@@ -208,7 +208,7 @@ def _boxes(one: Pictured) -> tuple[Box | None, list[Found]] | None:
         raise FileFormatError(f"row {one.row.id}: expected boxes as detection keeps them, got something else") from None
 
 
-def _detections(key: str, field: str, found: Sequence[Found]) -> JsonObject:
+def _detections(key: str, field: str, found: Sequence[Detected]) -> JsonObject:
     listed: list[JsonValue] = [
         _label(f"{key} {number}", "Detection", field, label=label, bounding_box=list(box), confidence=score,
                attributes={})

@@ -45,27 +45,27 @@ class Listed:
     when: float | None
 
 
-def listed(folder: Path) -> list[Listed]:
+def listed_runs(folder: Path) -> list[Listed]:
     """Return the runs in a folder, by name; what cannot be read is shown as far as it can."""
     if not folder.is_dir():
         return []
-    return [described(path) for path in sorted(folder.iterdir()) if path.is_dir() and is_run(path)]
+    return [listed_run(path) for path in sorted(folder.iterdir()) if path.is_dir() and is_run(path)]
 
 
 def finished(path: Path) -> bool:
     """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
     if not (path / summary.NAME).is_file() or summary.read_result(path).goes_on:
         return False
-    return not database.is_ours(path / store.NAME) or not goes_on(path)
+    return not database.is_results_database(path / store.NAME) or not can_resume(path)
 
 
-def goes_on(path: Path) -> bool:
+def can_resume(path: Path) -> bool:
     """Whether a run keeps what a search needs to go on."""
     with store.Store(path / store.NAME, read_only=True) as results:
         return results.goes_on
 
 
-def described(path: Path, *, counts: bool = True) -> Listed:
+def listed_run(path: Path, *, counts: bool = True) -> Listed:
     """Return the run in a folder; what cannot be read is shown as far as it can.
 
     Args:

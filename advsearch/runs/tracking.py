@@ -40,13 +40,13 @@ PROJECT = "advsearch"
 
 _LOG = logging.getLogger("advsearch")
 
-Numbers = Mapping[str, float]
+MetricValues = Mapping[str, float]
 
 
 class Backend(Protocol):
     """One tracker with an open run."""
 
-    def tell(self, numbers: Numbers, step: int) -> None:
+    def tell(self, numbers: MetricValues, step: int) -> None:
         """Tell numbers by name, of a step of their kind."""
 
     def close(self) -> None:
@@ -86,7 +86,7 @@ class Tracker:
     def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
         self._name = name
         self._right: dict[str, list[int]] = defaultdict(lambda: [0, 0])
-        self._waiting: Queue[tuple[Numbers, int] | None] = Queue(WAITING)
+        self._waiting: Queue[tuple[MetricValues, int] | None] = Queue(WAITING)
         told = {key: str(value)[:LONGEST] for key, value in settings.items() if value is not None}
         self._thread = threading.Thread(
             target=self._work, args=(lambda: OPEN[name](_package(name), folder, told),), name=name, daemon=True
@@ -106,7 +106,7 @@ class Tracker:
         self._put(None)
         self._thread.join(PATIENCE)
 
-    def _numbers(self, kind: str, rows: Sequence[Row]) -> Numbers:
+    def _numbers(self, kind: str, rows: Sequence[Row]) -> MetricValues:
         numbers = {}
         for name in NUMBERS:
             given = [float(value) for row in rows if (value := getattr(row, name)) is not None]
@@ -119,7 +119,7 @@ class Tracker:
             numbers[f"{kind}/accuracy"] = counts[0] / counts[1]
         return numbers
 
-    def _put(self, message: tuple[Numbers, int] | None) -> None:
+    def _put(self, message: tuple[MetricValues, int] | None) -> None:
         try:
             self._waiting.put_nowait(message)
         except Full:
@@ -144,7 +144,7 @@ class _Mlflow:
         mlflow.start_run(run_name=folder.name, nested=True)
         mlflow.log_params(settings)
 
-    def tell(self, numbers: Numbers, step: int) -> None:
+    def tell(self, numbers: MetricValues, step: int) -> None:
         self._mlflow.log_metrics(dict(numbers), step=step)
 
     def close(self) -> None:
@@ -157,7 +157,7 @@ class _Tensorboard:
     def __init__(self, summary: Any, folder: Path, settings: Mapping[str, str]) -> None:
         self._writer = summary.Writer(str(folder / "artifacts" / "tensorboard"))
 
-    def tell(self, numbers: Numbers, step: int) -> None:
+    def tell(self, numbers: MetricValues, step: int) -> None:
         for name, value in numbers.items():
             self._writer.add_scalar(name, value, step)
 
@@ -171,7 +171,7 @@ class _Wandb:
     def __init__(self, wandb: Any, folder: Path, settings: Mapping[str, str]) -> None:
         self._run = wandb.init(project=PROJECT, name=folder.name, config=dict(settings), reinit="create_new")
 
-    def tell(self, numbers: Numbers, step: int) -> None:
+    def tell(self, numbers: MetricValues, step: int) -> None:
         kind = next(iter(numbers), "rows/").partition("/")[0]
         self._run.log({**numbers, f"{kind}/step": step})
 

@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.report.phrases import percent
 from advsearch.runs.results.photos import PhotoAgreement, PhotographedRendering
 from advsearch.viewer.document import data_script, document
@@ -48,7 +48,7 @@ def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: 
 def _hint(names: Sequence[str]) -> Html:
     shown = ", ".join(names[:8]) + (f", ... {names[-1]}" if len(names) > 8 else "")
     first = "Lay a rendering over what the camera sees, move the real object until both agree, and take a photograph."
-    return join(
+    return join_html(
         element("p", first),
         element("p", f"Renderings of this run ({len(names)}): {shown}.", class_="soft", id="renderings"),
         element("noscript", element("p", "The camera needs JavaScript, which is switched off.")),
@@ -129,7 +129,7 @@ def table_html(table: PhotoAgreement) -> Html:
         element("tbody", *(_rendering(one, several) for one in table.renderings)),
     )
     counts = element("table", element("thead", head), element("tbody", *rows), class_="agreement")
-    return join(
+    return join_html(
         counts,
         element("p", text),
         element("div", each, class_="scroll", tabindex="0", role="region", aria_label="by rendering"),
@@ -142,7 +142,7 @@ def _row(name: str, *cells: str) -> Html:
 
 def _rendering(one: PhotographedRendering, several: bool) -> Html:
     photos = [
-        join(element("a", label or "nothing", href=f"photos/{quote(file, safe='')}"), " ")
+        join_html(element("a", label or "nothing", href=f"photos/{quote(file, safe='')}"), " ")
         for label, file in zip(one.labels, one.files, strict=True)
     ]
     name = element("a", one.rendering, href=f"renderings/{quote(one.rendering, safe='')}")

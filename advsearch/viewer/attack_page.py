@@ -15,7 +15,7 @@ from advsearch.files import JsonObject
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.failures import FAILURE_HEADS, answered_text, failure_rows, failures_text, range_text
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.report.method import PLAN_HEADS, method_facts, plan_rows, plan_text
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, is_command, marks_text, objective_label
 from advsearch.runs import directory, images, store
@@ -23,7 +23,7 @@ from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, DifferentFailure, FoundValue, PicturedAnswer
 from advsearch.runs.summary import attack_of
 from advsearch.viewer.document import data_script, data_url, document, scrolled
-from advsearch.viewer.study_page import facts_table, heading, named, table
+from advsearch.viewer.study_page import facts_table, heading, study_table, subject_html
 from advsearch.viewer.turning import object_data, object_section, read_object
 
 LARGE_PICTURE = 1_000_000
@@ -75,7 +75,7 @@ def write_report(run: str | Path) -> Path:
         StorageError: the page cannot be written.
     """
     data = read_run(Path(run))
-    return write_text(data.path / directory.REPORT, page(data), durable=False)
+    return write_text(data.path / directory.REPORT, attack_page_html(data), durable=False)
 
 
 def read_run(path: Path) -> RunData:
@@ -92,7 +92,7 @@ def read_run(path: Path) -> RunData:
     )
 
 
-def page(data: RunData) -> str:
+def attack_page_html(data: RunData) -> str:
     """Return the page as HTML."""
     summary = data.summary
     main = element(
@@ -115,8 +115,10 @@ def page(data: RunData) -> str:
 
 
 def _header(summary: AttackSummary) -> Html:
-    about = named(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
-    return heading(join(f"{wording.budget_text(summary)}; ", about), wording.verdict(summary), wording.remarks(summary))
+    about = subject_html(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
+    return heading(
+        join_html(f"{wording.budget_text(summary)}; ", about), wording.attack_verdict(summary), wording.remarks(summary)
+    )
 
 
 def _pictures(data: RunData) -> Html:
@@ -135,9 +137,9 @@ def _pictures(data: RunData) -> Html:
     trials = [name for name in data.pictures if name.startswith("images/verification")]
     trials = ([name for name in trials if name.endswith("-answer.png")] or trials)[:MOST_TRIALS]
     compare = element("div", id="compare", hidden="hidden")
-    steps = join(element("h2", "The search, step by step"), element("div", id="search"))
+    steps = join_html(element("h2", "The search, step by step"), element("div", id="search"))
     search = element("div", steps, hidden="hidden", class_="screen")
-    return join(
+    return join_html(
         element("h2", "What the model sees"),
         compare,
         _section("", shown, note=_same_conditions(summary)),
@@ -169,11 +171,11 @@ def _failures(data: RunData) -> Html:
         if one.picture and one.holds
     ]
     rows = failure_rows(known)
-    return join(
+    return join_html(
         element("h2", "Different failures"),
         element("p", f"Failures are {failures_text(known)}."),
         element("div", *shown, class_="pictures") if shown else None,
-        table(FAILURE_HEADS, rows) if rows else None,
+        study_table(FAILURE_HEADS, rows) if rows else None,
     )
 
 
@@ -211,7 +213,7 @@ def _rates(summary: AttackSummary) -> Html:
     head = element("tr", *(element("th", text, scope="col") for text in heads), element("td", class_="hide-small"))
     spp = summary.verified.spp if summary.verified else None
     note = "Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals"
-    return join(
+    return join_html(
         element("h2", "Verified rates"),
         scrolled(element("table", element("thead", head), element("tbody", *lines))),
         element("p", note + (f", {spp} samples per pixel." if spp else "."), class_="soft"),
@@ -244,7 +246,7 @@ def _curve(data: RunData) -> Html:
     zero = f"above: {above}" if objective in SUCCESS_ABOVE_ZERO else ""
     charts = [objective_chart(curves, objective_label(objective), zero, width) for width in (WIDE, NARROW)]
     note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
-    return join(
+    return join_html(
         element("h2", "The search"),
         element("div", *charts),
         element("p", note, class_="soft"),
@@ -271,7 +273,7 @@ def _cost(summary: AttackSummary) -> Html:
         "Model": summary.model,
         "Seed": str(summary.seed),
     }
-    return join(element("h2", "Cost and conditions"), facts_table(facts), _method(summary))
+    return join_html(element("h2", "Cost and conditions"), facts_table(facts), _method(summary))
 
 
 def _method(summary: AttackSummary) -> Html:
@@ -280,7 +282,7 @@ def _method(summary: AttackSummary) -> Html:
     rows = plan_rows(summary)
     if not rows:
         return worked
-    return join(worked, element("details", element("summary", plan_text(summary)), table(PLAN_HEADS, rows)))
+    return join_html(worked, element("details", element("summary", plan_text(summary)), study_table(PLAN_HEADS, rows)))
 
 
 def _repeat(data: RunData) -> Html:
@@ -294,7 +296,9 @@ def _repeat(data: RunData) -> Html:
     if data.summary.goes_on:
         resume = shlex.join(["advsearch", "resume", str(data.summary.run or data.path)])
         on = [element("h2", "Go on, and verify the answer"), element("pre", resume, class_="wrap")]
-    return join(*on, element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe)
+    return join_html(
+        *on, element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe
+    )
 
 
 def _section(heading: str, figures: Iterable[Html | None], css: str = "", note: str = "") -> Html:
@@ -303,7 +307,7 @@ def _section(heading: str, figures: Iterable[Html | None], css: str = "", note: 
         return Html("")
     remark = element("p", note, class_="soft") if note else None
     title = element("h2", heading) if heading else None
-    return join(title, element("div", *shown, class_=f"pictures {css}".strip()), remark)
+    return join_html(title, element("div", *shown, class_=f"pictures {css}".strip()), remark)
 
 
 def _details(heading: str, figures: Iterable[Html | None], css: str = "") -> Html:
@@ -358,7 +362,7 @@ def _changes(summary: AttackSummary) -> Html:
         for row, name in enumerate(found)
     ]
     head = element("thead", element("tr", *(element("th", text, scope="col") for text in ("parameter", *shown))))
-    return join(element("h2", "What was changed"), scrolled(element("table", head, element("tbody", *lines))))
+    return join_html(element("h2", "What was changed"), scrolled(element("table", head, element("tbody", *lines))))
 
 
 def _value_text(one: FoundValue) -> str:
@@ -382,7 +386,7 @@ def _place(one: FoundValue) -> Html | None:
     stopped = min(one.value - one.low, one.high - one.value) <= AT_THE_END * width
     dot = element("span", style=at(one.value), class_="to")
     drawn = element("div", *marks, dot, class_="place", role="img", aria_label=words, title=words)
-    return join(drawn, element("span", "at its end", class_="soft") if stopped else None)
+    return join_html(drawn, element("span", "at its end", class_="soft") if stopped else None)
 
 
 def _animation(data: RunData) -> JsonObject:

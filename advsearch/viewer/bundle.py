@@ -13,7 +13,7 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.pages import write_page
-from advsearch.viewer.sweep_page import SweepSource, page
+from advsearch.viewer.sweep_page import SweepSource, sweep_page_html
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 INDEX = "index.html"
@@ -47,7 +47,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
         if len(sweeps) < len(results):
             raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
         sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
-        return write_text(folder / INDEX, page(sweeps, sources))
+        return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
 
 
 def _alone(run: Path, folder: Path) -> Path:

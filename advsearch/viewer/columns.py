@@ -39,7 +39,7 @@ BOX_STEPS = 8
 
 NO_BOX = 65535
 
-Array = npt.NDArray[Any]
+AnyArray = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Column:
     name: str
     unit: str
     levels: tuple[str, ...] | None
-    data: Array
+    data: AnyArray
     edges: tuple[float, ...] | None = None
 
 
@@ -80,15 +80,15 @@ class Columns:
         running: whether further rows are still being made.
     """
 
-    step: Array
-    margin: Array
-    answer: Array
-    probability: Array
-    right: Array
+    step: AnyArray
+    margin: AnyArray
+    answer: AnyArray
+    probability: AnyArray
+    right: AnyArray
     answers: tuple[str, ...]
     parameters: tuple[Column, ...]
     last: int
-    boxes: Array | None = None
+    boxes: AnyArray | None = None
     more: bool = False
     running: bool = False
 
@@ -131,7 +131,7 @@ class Columns:
         columns = (one.astype(one.dtype.newbyteorder("<")).tobytes() for _, one in self._arrays())
         return b"".join([len(head).to_bytes(4, "little"), head, *columns])
 
-    def _arrays(self) -> list[tuple[str, Array]]:
+    def _arrays(self) -> list[tuple[str, AnyArray]]:
         own = [
             ("step", self.step),
             ("margin", self.margin),
@@ -193,7 +193,7 @@ def columns_of(rows: Iterable[Row]) -> Columns:
     )
 
 
-def _filled(boxes: array[int], count: int) -> Array:
+def _filled(boxes: array[int], count: int) -> AnyArray:
     boxes.extend([NO_BOX] * (8 * count - len(boxes)))
     return np.array(boxes, np.uint16).reshape(count, 8)
 

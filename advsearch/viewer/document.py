@@ -11,7 +11,7 @@ from functools import cache
 from importlib import resources
 
 from advsearch import __version__
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.report.style import CSS
 
 
@@ -48,7 +48,7 @@ def document(
         element("style", Html(CSS + asset("viewer.css"))),
     )
     end = element("footer", f"advsearch {__version__}, {footer or title}")
-    shown = Html(re.sub(r"(\d) %", r"\1&nbsp;%", join(*body, end)) + join(*data))
+    shown = Html(re.sub(r"(\d) %", r"\1&nbsp;%", join_html(*body, end)) + join_html(*data))
     page = element("html", head, element("body", shown, element("script", Html(code)) if code else None), lang="en")
     return f"<!doctype html>\n{page}\n"
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from advsearch.report.evidence_runs import sections
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.report.wording import interval_text
 from advsearch.runs.results.evidence import Evidence, EvidenceRun
 from advsearch.viewer.document import document
-from advsearch.viewer.study_page import again, facts_table, heading, table
+from advsearch.viewer.study_page import again, facts_table, heading, study_table
 
 CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 
@@ -40,9 +40,9 @@ def _run(one: EvidenceRun) -> Html:
     ]
     facts = {name: "; ".join(lines) for name, lines in sections(one).items()}
     beside = element("details", element("summary", "On what, how, and what is left out"), facts_table(facts), open="")
-    return join(
+    return join_html(
         element("h2", f"{one.run} ({one.command})"),
-        table(CLAIM_HEADS, rows),
+        study_table(CLAIM_HEADS, rows),
         beside,
         again(one.command_line) if one.command_line else None,
     )

@@ -15,13 +15,13 @@ from advsearch.report.explanations import (
     not_told_text,
     pair_text,
     pairs_text,
-    share_text,
+    right_share_text,
     weight_rows,
 )
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.runs.results.explain import ExplainResult, FailureCluster, NearestRight
 from advsearch.viewer.document import data_url, document
-from advsearch.viewer.study_page import again, facts_table, heading, named, table
+from advsearch.viewer.study_page import again, facts_table, heading, study_table, subject_html
 
 RULE_HEADS = ("rule", "right", "where no rule so far holds", "fresh renders inside")
 
@@ -31,9 +31,9 @@ def explain_page(run: Path, result: ExplainResult) -> str:
     rules = [
         [
             conditions_text(one.conditions),
-            share_text(one),
-            share_text(one.elsewhere),
-            "" if one.confirmed is None else share_text(one.confirmed),
+            right_share_text(one),
+            right_share_text(one.elsewhere),
+            "" if one.confirmed is None else right_share_text(one.confirmed),
         ]
         for one in result.rules
     ]
@@ -49,15 +49,19 @@ def explain_page(run: Path, result: ExplainResult) -> str:
     )
     main = element(
         "main",
-        join(element("h2", "Rules"), table(RULE_HEADS, rules), element("p", note, class_="soft")) if rules else None,
+        join_html(element("h2", "Rules"), study_table(RULE_HEADS, rules), element("p", note, class_="soft"))
+        if rules
+        else None,
         element("p", not_told_text(result)) if result.not_told else None,
-        join(element("h2", "What decides"), table(WEIGHT_HEADS, weights), element("p", decides, class_="soft"))
+        join_html(
+            element("h2", "What decides"), study_table(WEIGHT_HEADS, weights), element("p", decides, class_="soft")
+        )
         if weights
         else None,
         element("h2", "Where it can be relied on"),
         element("p", envelope_text(result)),
         _pairs(run, result) if result.pairs_sought else None,
-        join(
+        join_html(
             element("h2", "Kinds of failures"),
             element("p", clusters_text(result.clusters)),
             element("div", *(_cluster(run, one) for one in result.clusters.listed), class_="pictures"),
@@ -67,7 +71,7 @@ def explain_page(run: Path, result: ExplainResult) -> str:
         element("h2", "Cost and conditions"),
         facts_table(
             {
-                "Rows": f"right in {share_text(result)}",
+                "Rows": f"right in {right_share_text(result)}",
                 "Sweeps": ", ".join(result.sweeps),
                 "Parameters": ", ".join(result.parameters),
                 "Renders": str(result.renders),
@@ -78,7 +82,9 @@ def explain_page(run: Path, result: ExplainResult) -> str:
         again(result.command_line),
     )
     header = heading(
-        join("explain; ", named(("", result.object), ("", result.model))), explain_text(result), result.warnings
+        join_html("explain; ", subject_html(("", result.object), ("", result.model))),
+        explain_text(result),
+        result.warnings,
     )
     return document(f"{run.name}, explained", header, main, footer=f"run {run.name}. This page needs no other file.")
 
@@ -100,7 +106,7 @@ def _cluster(run: Path, one: FailureCluster) -> Html | None:
 
 def _pairs(run: Path, result: ExplainResult) -> Html:
     pairs = (_pair(run, one) for one in result.pairs)
-    return join(element("h2", "One thing changed"), element("p", pairs_text(result)), *pairs)
+    return join_html(element("h2", "One thing changed"), element("p", pairs_text(result)), *pairs)
 
 
 def _pair(run: Path, pair: NearestRight) -> Html:
@@ -115,4 +121,6 @@ def _pair(run: Path, pair: NearestRight) -> Html:
         for name, text in zip(pair.pictures, words, strict=False)
         if (file := _kept(run, name)) is not None
     ]
-    return join(element("p", pair_text(pair)), element("div", *figures, class_="pictures pair") if figures else None)
+    return join_html(
+        element("p", pair_text(pair)), element("div", *figures, class_="pictures pair") if figures else None
+    )

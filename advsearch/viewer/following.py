@@ -25,14 +25,14 @@ START = 0
 """Where a page begins: the last row that it has."""
 
 
-def goes_on(run: Path) -> bool:
+def is_under_way(run: Path) -> bool:
     """Whether a run has no page that says what came out: none at all, or one of an attack that is being resumed."""
-    return not (run / REPORT).is_file() or (lock.is_held(run) and listing.goes_on(run))
+    return not (run / REPORT).is_file() or (lock.is_held(run) and listing.can_resume(run))
 
 
 def following_page(name: str, run: Path) -> str:
     """Return the page that follows a run, by its name in the dashboard. Without its script it says how far it is."""
-    one = listing.described(run)
+    one = listing.listed_run(run)
     what = ", ".join(filter(None, (one.command, one.object, " and ".join(one.controls))))
     state = (
         "A process is working on it." if one.state == "running" else f"It was stopped: advsearch resume {name} goes on."
@@ -51,7 +51,7 @@ def following_page(name: str, run: Path) -> str:
     )
 
 
-def progress(run: Path, after: int) -> bytes:
+def progress_json(run: Path, after: int) -> bytes:
     """Return what is new in a run as JSON.
 
     Args:
@@ -62,7 +62,10 @@ def progress(run: Path, after: int) -> bytes:
         FileFormatError: what it keeps is damaged.
     """
     last = after
-    running, ended = lock.is_held(run), not goes_on(run)  # before what it has is read: what comes later is asked for
+    running, ended = (
+        lock.is_held(run),
+        not is_under_way(run),
+    )  # before what it has is read: what comes later is asked for
     rows: list[Row] = []
     pictures: list[dict[str, object]] = []
     if (run / store.NAME).is_file():

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from advsearch.report import wording
 from advsearch.report.hardening import HEADS, hardened_rows, hardened_text
-from advsearch.report.markup import element, join
+from advsearch.report.markup import element, join_html
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results.harden import HardenResult
 from advsearch.viewer.document import data_url, document, scrolled
-from advsearch.viewer.study_page import again, facts_table, heading, named, table
+from advsearch.viewer.study_page import again, facts_table, heading, study_table, subject_html
 
 ROUND_HEADS = ("round", "views trained on", "part of the way", "plain pictures right", "worst pictures right", "kept")
 SPLIT_HEADS = ("side", "objects", "environments", "scenes", "views")
@@ -58,18 +58,18 @@ def harden_page(run: Path, result: HardenResult) -> str:
     }
     main = element(
         "main",
-        join(element("h2", "Before and after"), image, table(HEADS, rows), element("p", note, class_="soft"))
+        join_html(element("h2", "Before and after"), image, study_table(HEADS, rows), element("p", note, class_="soft"))
         if rows
         else None,
-        join(element("h2", "The training"), table(ROUND_HEADS, rounds), element("p", trained, class_="soft"))
+        join_html(element("h2", "The training"), study_table(ROUND_HEADS, rounds), element("p", trained, class_="soft"))
         if rounds
         else None,
         element("h2", "What it was trained and measured on"),
-        table(SPLIT_HEADS, split),
+        study_table(SPLIT_HEADS, split),
         element("h2", "Cost and conditions"),
         facts_table(facts),
         again(result.command_line),
     )
-    what = join("harden; ", named(("", ",".join(result.objects)), ("", ", ".join(result.controls))))
+    what = join_html("harden; ", subject_html(("", ",".join(result.objects)), ("", ", ".join(result.controls))))
     header = heading(what, hardened_text(result), result.warnings)
     return document(f"{run.name}, harden", header, main, footer=f"run {run.name}. This page needs no other file.")

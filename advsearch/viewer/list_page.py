@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.runs import listing
 from advsearch.runs.listing import Listed
 from advsearch.viewer.document import document, scrolled
@@ -16,7 +16,7 @@ from advsearch.viewer.document import document, scrolled
 
 def list_page(runs: Mapping[str, Path]) -> str:
     """Return the page that lists runs, by the name under which each is shown; the newest first."""
-    found = [(name, listing.described(path, counts=False)) for name, path in runs.items()]
+    found = [(name, listing.listed_run(path, counts=False)) for name, path in runs.items()]
     found.sort(key=lambda one: one[1].when or 0.0, reverse=True)
     sweeps = sum(one.command == "sweep" for _, one in found)
     heads = [*(["side by side"] if sweeps > 1 else []), "picture", "run", "what came out", "begun"]
@@ -36,13 +36,13 @@ def _line(name: str, one: Listed, *, comparable: bool) -> Html:
     picture = element("img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72")
     about = ", ".join(filter(None, (one.command, wording.short_names(one.object), " and ".join(one.controls))))
     photos = element("a", "photographs", href=f"{place}align/", aria_label=f"photographs of {name}")
-    beside = join(" ", photos) if one.command in ("attack", "sweep") else None
+    beside = join_html(" ", photos) if one.command in ("attack", "sweep") else None
     begun = "" if one.when is None else time.strftime("%Y-%m-%d %H:%M", time.localtime(one.when))
     return element(
         "tr",
         element("td", box) if comparable else None,
         element("td", element("a", picture, href=place, tabindex="-1", aria_hidden="true")),
         element("th", element("a", name, href=place), element("div", about, beside, class_="soft"), scope="row"),
-        element("td", join(one.state, f": {one.answer}" if one.answer else None)),
+        element("td", join_html(one.state, f": {one.answer}" if one.answer else None)),
         element("td", begun, class_="number"),
     )

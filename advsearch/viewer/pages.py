@@ -37,7 +37,7 @@ def write_page(run: Path, result: Result) -> Path:
         case AttackSummary():
             return attack_page.write_report(run)
         case SweepSummary():
-            return sweep_page.write_page(run, result)
+            return sweep_page.write_sweep_page(run, result)
         case GapResult():
             text = study_page.gap_page(run, result)
         case CurveResult():

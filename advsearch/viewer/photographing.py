@@ -25,7 +25,7 @@ SENDING = 60.0
 KEY = "X-Advsearch-Key"
 """The header with which this server's page sends a photograph; another page could not send it."""
 
-Answered = tuple[str, bytes]
+Response = tuple[str, bytes]
 """A media type, and the data."""
 
 
@@ -39,19 +39,19 @@ class PhotoTaker(Protocol):
         """Return the run's table."""
 
 
-def page(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> bytes:
+def photographs_html(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> bytes:
     """Return the page of a run's photographs; arguments as for `align_page`."""
     table = _there(taker).agreement(run)
     return align_page(name, rendering_names(run), table, key, elsewhere).encode()
 
 
-def rendering(run: Path, name: str) -> Answered:
+def rendering_picture(run: Path, name: str) -> Response:
     """Return the picture of a rendering."""
     file = _found(rendering_file, run, name)
     return "image/png" if file.suffix == ".png" else "image/jpeg", file.read_bytes()
 
 
-def photo(run: Path, name: str) -> Answered:
+def photo(run: Path, name: str) -> Response:
     """Return a photograph that was kept."""
     return "image/jpeg", _found(photo_file, run, name).read_bytes()
 
@@ -67,7 +67,7 @@ def check_sender(headers: Message, key: str) -> None:
         raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")
 
 
-def take(taker: PhotoTaker | None, run: Path, name: str, data: Callable[[], bytes]) -> Answered:
+def take(taker: PhotoTaker | None, run: Path, name: str, data: Callable[[], bytes]) -> Response:
     """Take a photograph in.
 
     Args:
@@ -87,7 +87,7 @@ def take(taker: PhotoTaker | None, run: Path, name: str, data: Callable[[], byte
     return "application/json", json.dumps({"table": str(table_html(table))}).encode()
 
 
-def body(headers: Message, stream: BufferedIOBase) -> bytes:
+def request_body(headers: Message, stream: BufferedIOBase) -> bytes:
     """Return what was sent along; nothing is read of what says that it is larger than `LARGEST`.
 
     Raises:

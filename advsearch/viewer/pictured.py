@@ -37,7 +37,7 @@ def pictured(run: Path) -> Iterator[Pictured]:
         raise InputError(f"format fiftyone: belongs to runs of sweep and attack, not of {result.command}")
 
 
-def object_of(run: Path) -> str:
+def name_of_object(run: Path) -> str:
     """Return what the object of a run is called."""
     result: Result = read_result(run)
     return str(getattr(result, "object", "object"))

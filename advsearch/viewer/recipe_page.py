@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.report.recipes import figure_table, told_once
 from advsearch.runs.directory import IMAGES, PARTS
 from advsearch.runs.results.recipe import AnyFigure, RecipePart, RecipeResult
 from advsearch.viewer.document import data_url, document, scrolled
-from advsearch.viewer.study_page import again, facts_table, heading, part_links, table
+from advsearch.viewer.study_page import again, facts_table, heading, part_links, study_table
 
 
 def recipe_page(run: Path, result: RecipeResult) -> str:
@@ -34,7 +34,7 @@ def recipe_page(run: Path, result: RecipeResult) -> str:
             _section(one, texts, run / IMAGES / f"figure-{number}.png")
             for number, (one, texts) in enumerate(zip(result.figures, told_once(result.figures), strict=True), start=1)
         ),
-        join(element("h2", "Cost and conditions"), facts_table(facts)),
+        join_html(element("h2", "Cost and conditions"), facts_table(facts)),
         _runs(run, result.parts),
         again(result.command_line),
     )
@@ -57,16 +57,16 @@ def _section(made: AnyFigure, texts: list[str], picture: Path) -> Html:
     if picture.is_file():
         alt = " ".join(made.text) or made.title
         image = element("img", src=data_url(picture.read_bytes(), "image/png"), alt=alt)
-    return join(
+    return join_html(
         element("h2", made.title),
         *(element("p", text) for text in texts),
         element("figure", scrolled(image, "wide")) if image else None,
-        element("details", element("summary", "The numbers"), table(heads, rows)) if rows else None,
+        element("details", element("summary", "The numbers"), study_table(heads, rows)) if rows else None,
     )
 
 
 def _runs(run: Path, parts: list[RecipePart]) -> Html:
     rows = [[one.name, one.command, one.ending, str(one.renders)] for one in parts]
     links = part_links(run, [one.name for one in parts])
-    listed = table([f"runs in {PARTS}/", "command", "ending", "renders"], rows, links)
+    listed = study_table([f"runs in {PARTS}/", "command", "ending", "renders"], rows, links)
     return element("details", element("summary", wording.count(len(rows), "run")), listed)

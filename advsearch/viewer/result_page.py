@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results.base import Fields, Formation, Result
 from advsearch.viewer.document import data_url, document
-from advsearch.viewer.study_page import again, facts_table, heading, named, table
+from advsearch.viewer.study_page import again, facts_table, heading, study_table, subject_html
 
 LONG = 24
 """Rows of a table above which it is folded."""
@@ -29,7 +29,7 @@ def result_page(run: Path, result: Result) -> str:
     """Return the page of what is in the folder `run`."""
     values = {name: getattr(result, name) for name in type(result).model_fields}
     about = [values.get("object"), *[", ".join(values.get(one) or ()) for one in ("objects", "controls")]]
-    what = join(result.command, *(join("; ", named(("", _text(one)))) for one in about if one))
+    what = join_html(result.command, *(join_html("; ", subject_html(("", _text(one)))) for one in about if one))
     tables = [(name, rows) for name, value in values.items() if (rows := _rows(value))]
     rest = {name: value for name, value in values.items() if name not in _ELSEWHERE and not _rows(value)}
     plain = {_words(name): _text(value) for name, value in rest.items()}
@@ -39,8 +39,8 @@ def result_page(run: Path, result: Result) -> str:
     main = element(
         "main",
         *_figures(run),
-        *(join(element("h2", _words(name)), _folded(rows)) for name, rows in tables),
-        join(element("h2", "Cost and conditions"), facts_table(plain)),
+        *(join_html(element("h2", _words(name)), _folded(rows)) for name, rows in tables),
+        join_html(element("h2", "Cost and conditions"), facts_table(plain)),
         _meanings(result, plain, [rows for _, rows in tables]),
         again(str(values.get("command_line") or f"advsearch show {run.name}")),
     )
@@ -81,7 +81,7 @@ def _rows(value: object) -> Sequence[Fields]:
 def _folded(rows: Sequence[Fields]) -> Html:
     """A table of what differs or is not empty; a long one is folded."""
     names = _columns(rows)
-    made = table(
+    made = study_table(
         [_words(name) for name in names], [[_text(getattr(row, name, None)) for name in names] for row in rows]
     )
     return made if len(rows) <= LONG else element("details", element("summary", f"{len(rows)} rows"), made)

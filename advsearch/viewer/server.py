@@ -34,11 +34,11 @@ from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
 from advsearch.viewer import photographing
 from advsearch.viewer.certificate import https_context, reachable
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.following import START, following_page, goes_on, progress
+from advsearch.viewer.following import START, following_page, is_under_way, progress_json
 from advsearch.viewer.list_page import list_page
 from advsearch.viewer.photographing import PhotoTaker
 from advsearch.viewer.refused import Refused
-from advsearch.viewer.sweep_page import SweepSource, page, result_of
+from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
 from advsearch.viewer.thumbnails import cover, kept_pictures, path_of
 
 LOOPBACK = "127.0.0.1"
@@ -286,12 +286,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _page(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         run = self._run(name)
-        if listing.described(run, counts=False).command == "sweep":
-            return _html(page([(run, result_of(run))], [_source(name, run, "")]).encode(), "../../")
+        if listing.listed_run(run, counts=False).command == "sweep":
+            return _html(sweep_page_html([(run, result_of(run))], [_source(name, run, "")]).encode(), "../../")
         report = run / REPORT
         if report.is_symlink():
             raise Refused(HTTPStatus.NOT_FOUND, f"{name} has no page; advsearch show {name} prints what it has")
-        if goes_on(run):
+        if is_under_way(run):
             return _html(following_page(name, run).encode(), "../../")
         return _html(report.read_bytes(), "../../")
 
@@ -299,7 +299,7 @@ class _Handler(BaseHTTPRequestHandler):
         after = query.get("after", [str(START)])[0]
         if not re.fullmatch(r"[0-9]{1,15}", after):
             raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
-        return "application/json", progress(self._run(name), int(after))
+        return "application/json", progress_json(self._run(name), int(after))
 
     def _part(self, _query: Mapping[str, list[str]], name: str, part: str) -> tuple[str, bytes]:
         """The page of one of the attacks that a study consists of, where the study's page links to it."""
@@ -314,11 +314,11 @@ class _Handler(BaseHTTPRequestHandler):
         if not names:
             raise Refused(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
         runs = [(name, self._run(name)) for name in names]
-        other = [name for name, run in runs if listing.described(run, counts=False).command != "sweep"]
+        other = [name for name, run in runs if listing.listed_run(run, counts=False).command != "sweep"]
         if other:
             raise Refused(HTTPStatus.BAD_REQUEST, f"only sweeps can be shown side by side; {', '.join(other)} is none")
         sources = [_source(name, run, f"../runs/{quote(name, safe='')}/") for name, run in runs]
-        return _html(page([(run, result_of(run)) for _, run in runs], sources).encode(), "../")
+        return _html(sweep_page_html([(run, result_of(run)) for _, run in runs], sources).encode(), "../")
 
     def _rows(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         run = self._run(name)
@@ -339,18 +339,20 @@ class _Handler(BaseHTTPRequestHandler):
     def _align(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         path = f"/runs/{quote(name, safe='')}/align/"
         elsewhere = self.server.address_of(path) if self.server.token else None
-        made = photographing.page(self.server.photographs, self._run(name), name, self.server.key, elsewhere)
+        made = photographing.photographs_html(
+            self.server.photographs, self._run(name), name, self.server.key, elsewhere
+        )
         return _html(made, "../../../", ("../", name))
 
     def _rendering(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
-        return photographing.rendering(self._run(name), rendering)
+        return photographing.rendering_picture(self._run(name), rendering)
 
     def _photo(self, _query: Mapping[str, list[str]], name: str, photo: str) -> tuple[str, bytes]:
         return photographing.photo(self._run(name), photo)
 
     def _take(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
         photographing.check_sender(self.headers, self.server.key)
-        data = partial(photographing.body, self.headers, self.rfile)
+        data = partial(photographing.request_body, self.headers, self.rfile)
         return photographing.take(self.server.photographs, self._run(name), rendering, data)
 
     def _picture(self, _query: Mapping[str, list[str]], name: str, number: str) -> tuple[str, bytes]:
@@ -360,8 +362,8 @@ class _Handler(BaseHTTPRequestHandler):
         return "image/jpeg", file.read_bytes()
 
 
-Answer = Callable[..., tuple[str, bytes]]
-Routes = tuple[tuple[str, Answer], ...]
+Handler = Callable[..., tuple[str, bytes]]
+Routes = tuple[tuple[str, Handler], ...]
 
 _ROUTES: Routes = (
     ("/", _Handler._list),

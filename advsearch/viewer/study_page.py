@@ -11,7 +11,7 @@ from urllib.parse import quote
 from advsearch.files import MESHES
 from advsearch.report import gaps, wording
 from advsearch.report.charts import HEIGHT, NARROW, WIDE, study_chart
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.report.replays import HEADS, replay_rows, replay_text
 from advsearch.report.studies import curve_axes, gap_axes
 from advsearch.report.transfer import matrix_heads, matrix_rows, matrix_text
@@ -38,7 +38,7 @@ def gap_page(run: Path, result: GapResult) -> str:
     body = [
         element("h2", "The worst case beside the average"),
         _charts(lambda axes: gap_axes(result, axes), words, high) if result.table else None,
-        table(gaps.GAP_HEADS, gaps.gap_rows(result), links),
+        study_table(gaps.GAP_HEADS, gaps.gap_rows(result), links),
         element("p", note, class_="soft"),
     ]
     return _study_page(run, result, gaps.gap_text(result), body)
@@ -58,10 +58,10 @@ def curve_page(run: Path, result: CurveResult) -> str:
     body = [
         element("h2", "Robust accuracy") if rows else None,
         _charts(lambda axes: curve_axes(result, axes), words, HEIGHT) if len(points) > 1 else None,
-        table(gaps.CURVE_HEADS, rows) if rows else None,
+        study_table(gaps.CURVE_HEADS, rows) if rows else None,
         element("p", note, class_="soft") if rows else None,
         element("h2", "The objects, at the last epsilon tried"),
-        table(gaps.OBJECT_HEADS, gaps.object_rows(result), links),
+        study_table(gaps.OBJECT_HEADS, gaps.object_rows(result), links),
         element("p", f"{gaps.margin_meaning(result)}.".capitalize(), class_="soft"),
     ]
     return _study_page(run, result, gaps.curve_text(result), body)
@@ -89,7 +89,7 @@ def matrix_page(run: Path, result: MatrixResult) -> str:
     links = [""] * before + part_links(run, [row.run for row in result.table])
     body = [
         element("h2", "Attacked on, tested on"),
-        table(matrix_heads(result), rows, links, rates),
+        study_table(matrix_heads(result), rows, links, rates),
         element("p", note, class_="soft"),
     ]
     return _study_page(run, result, matrix_text(result), body, facts)
@@ -97,9 +97,9 @@ def matrix_page(run: Path, result: MatrixResult) -> str:
 
 def replay_page(run: Path, result: ReplayResult) -> str:
     """Return the page of a replay in the folder `run`."""
-    what = join(
+    what = join_html(
         f"answer of {Path(result.answer).name} ({result.answered}); ",
-        named(("", result.object), ("", ", ".join(result.controls))),
+        subject_html(("", result.object), ("", ", ".join(result.controls))),
     )
     note = (
         "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
@@ -117,9 +117,9 @@ def replay_page(run: Path, result: ReplayResult) -> str:
     main = element(
         "main",
         element("h2", "Under other conditions"),
-        table(HEADS, replay_rows(result)),
+        study_table(HEADS, replay_rows(result)),
         element("p", note, class_="soft"),
-        join(element("h2", "Cost and conditions"), facts_table(facts)),
+        join_html(element("h2", "Cost and conditions"), facts_table(facts)),
         again(result.command_line),
     )
     header = heading(what, replay_text(result), result.warnings)
@@ -131,10 +131,10 @@ def replay_page(run: Path, result: ReplayResult) -> str:
 
 def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
     """Return the header of a page: what was asked, the answer, and what has to be known beside it."""
-    return element("header", element("p", eyebrow, class_="eyebrow"), element("h1", text), beside(remarks))
+    return element("header", element("p", eyebrow, class_="eyebrow"), element("h1", text), remarks_html(remarks))
 
 
-def beside(remarks: Sequence[str]) -> Html:
+def remarks_html(remarks: Sequence[str]) -> Html:
     """Return what has to be known beside an answer, and below it, folded where it is much, how files were read."""
     notes = [one for one in remarks if _OF_A_FILE.match(one)]
     listed, noted = (
@@ -143,15 +143,16 @@ def beside(remarks: Sequence[str]) -> Html:
     )
     if len(notes) > MOST_NOTES:
         noted = element("details", element("summary", f"{len(notes)} notes on how files were read"), noted)
-    return join(listed, noted)
+    return join_html(listed, noted)
 
 
-def named(*parts: tuple[str, str]) -> Html:
+def subject_html(*parts: tuple[str, str]) -> Html:
     """Return what a run is about: kinds with their names, the paths among which are short, and whole on hover."""
     shown = (
-        join(f"{kind} " if kind else "", element("span", wording.short_names(text), title=text)) for kind, text in parts
+        join_html(f"{kind} " if kind else "", element("span", wording.short_names(text), title=text))
+        for kind, text in parts
     )
-    return join(*(join(", " if number else "", one) for number, one in enumerate(shown)))
+    return join_html(*(join_html(", " if number else "", one) for number, one in enumerate(shown)))
 
 
 def facts_table(facts: Mapping[str, str]) -> Html:
@@ -162,7 +163,7 @@ def facts_table(facts: Mapping[str, str]) -> Html:
     return element("table", element("tbody", *lines), class_="facts")
 
 
-def table(
+def study_table(
     heads: Sequence[str],
     rows: Sequence[Sequence[str]],
     links: Sequence[str] = (),
@@ -225,7 +226,9 @@ def _study_page(
     run: Path, result: StudyResult, said: str, body: Sequence[Html | None], facts: Mapping[str, str] | None = None
 ) -> str:
     """The page of several attacks: what is said of them, the attacks and how they came about."""
-    what = named(("", ",".join(result.objects)), ("", ", ".join(result.controls)), ("environment", result.environment))
+    what = subject_html(
+        ("", ",".join(result.objects)), ("", ", ".join(result.controls)), ("environment", result.environment)
+    )
     conditions = {
         "Model": result.model,
         "Environment": result.environment,
@@ -242,7 +245,7 @@ def _study_page(
         "main",
         *body,
         element("details", summary, element("ul", *parts)) if parts else None,
-        join(element("h2", "Cost and conditions"), facts_table(conditions)),
+        join_html(element("h2", "Cost and conditions"), facts_table(conditions)),
         again(result.command_line),
     )
     title = f"{', '.join(result.objects)}, {result.command}"
@@ -251,4 +254,4 @@ def _study_page(
 
 def again(command_line: str) -> Html:
     """Return the command that asks the same again."""
-    return join(element("h2", "Do it again"), element("pre", command_line, class_="wrap"))
+    return join_html(element("h2", "Do it again"), element("pre", command_line, class_="wrap"))

@@ -1,7 +1,7 @@
 """The page of one or several sweeps: still pictures and tables that need no script, and the explorer over them.
 
-The same page is a file that needs no other (`write_page`), a page of `advsearch dashboard`, and one of a folder that
-any web server serves: only where its rows and pictures come from differs (`SweepSource`).
+The same page is a file that needs no other (`write_sweep_page`), a page of `advsearch dashboard`, and one of a folder
+that any web server serves: only where its rows and pictures come from differs (`SweepSource`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.report.notebook import axis_cells
 from advsearch.report.phrases import answer_text, beside_text, is_command, percent
 from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
@@ -28,7 +28,7 @@ from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.viewer.columns import Columns, read_columns
 from advsearch.viewer.document import data_script, data_url, document, scrolled
-from advsearch.viewer.study_page import beside, facts_table, named, table
+from advsearch.viewer.study_page import facts_table, remarks_html, study_table, subject_html
 from advsearch.viewer.thumbnails import Kept, kept_pictures
 
 MOST_EMBEDDED = 3_000_000
@@ -61,7 +61,7 @@ class SweepSource:
     folder: str | None = None
 
 
-def write_page(run: Path, summary: SweepSummary) -> Path:
+def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
     """Write `report.html` of a sweep that has ended, and its rows as columns, into its folder; return the page's path.
 
     Raises:
@@ -72,10 +72,10 @@ def write_page(run: Path, summary: SweepSummary) -> Path:
     write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
     rows = columns if len(columns.step) <= MOST_ROWS else None
     source = SweepSource(run.name, rows, pictures=kept_pictures(run))
-    return write_text(run / directory.REPORT, page([(run, summary)], [source]), durable=False)
+    return write_text(run / directory.REPORT, sweep_page_html([(run, summary)], [source]), durable=False)
 
 
-def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:
+def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:
     """Return the page as HTML.
 
     Args:
@@ -99,7 +99,7 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
         *left_out,
         *(_still(path, summary) for path, summary in summaries),
         *(_surface(path, summary) for path, summary in summaries),
-        *(join(_axes(summary), _cost(path, summary)) for path, summary in summaries),
+        *(join_html(_axes(summary), _cost(path, summary)) for path, summary in summaries),
     )
     return document(
         title,
@@ -149,15 +149,15 @@ def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
         if summary is None:
             lines += [element(title, f"{path.name}: this sweep has not ended yet")]
             continue
-        what = named(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
-        lines += [element("p", f"sweep {path.name}; ", what, class_="eyebrow"), element(title, verdict(summary))]
-        lines += [beside(summary.warnings)]
+        what = subject_html(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
+        lines += [element("p", f"sweep {path.name}; ", what, class_="eyebrow"), element(title, sweep_verdict(summary))]
+        lines += [remarks_html(summary.warnings)]
     return element("header", element("h1", "Sweeps side by side") if len(runs) > 1 else None, *lines)
 
 
 def _too_many(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     """What stands in the explorer's place in a file that would take more rows along than it may."""
-    served = shlex.join(["advsearch", "dashboard", *(directory.shown(path) for path, _ in runs)])
+    served = shlex.join(["advsearch", "dashboard", *(directory.typed_name(path) for path, _ in runs)])
     counts = ", ".join(f"{summary.configurations:,}" for _, summary in runs if summary is not None)
     return element(
         "p",
@@ -182,7 +182,7 @@ def _left_out(described: JsonObject, source: SweepSource) -> Html | None:
     return element("p", said, class_="soft")
 
 
-def verdict(summary: SweepSummary) -> str:
+def sweep_verdict(summary: SweepSummary) -> str:
     """Return what a sweep came to, in one sentence."""
     if not summary.configurations:
         return "No configuration was looked at."
@@ -197,7 +197,7 @@ def _still(path: Path, summary: SweepSummary) -> Html:
     """What a page without a script shows in the explorer's place."""
     figure = _figure(path / "images" / "sweep.png", f"Accuracy over {_axes_text(summary)}.")
     worst = _figure(path / "images" / "worst.png", _worst_text(summary))
-    return join(
+    return join_html(
         element("div", figure, class_="pictures", data_still="true") if figure else None,
         element("h2", "The worst configuration") if worst else None,
         element("div", worst, class_="pictures pair") if worst else None,
@@ -211,7 +211,7 @@ def _surface(path: Path, summary: SweepSummary) -> Html:
     said = surface_sentences(summary.surface)
     figure = _figure(path / "images" / "surface.png", " ".join(said), wide=True)
     tables = [_parts(one) for one in summary.surface.tables if one.strongest]
-    return join(
+    return join_html(
         element("h2", "The surface that was seen"),
         element("div", figure, class_="pictures") if figure else element("p", " ".join(said)),
         *tables,
@@ -235,7 +235,7 @@ def _parts(told: SurfaceTable) -> Html:
     ]
     who = f"{wording.short_name(told.object)}, {wording.short_name(told.model)}"
     what = f"{who}: the {told.part}s that are told most clearly"
-    return element("details", element("summary", what), table(heads, cells))
+    return element("details", element("summary", what), study_table(heads, cells))
 
 
 def _axes_text(summary: SweepSummary) -> str:
@@ -269,12 +269,12 @@ def _axes(summary: SweepSummary) -> Html:
         mine = [row for row in summary.axes if row.axis == name]
         if len(mine) <= MOST_LISTED:
             tables.append(element("details", element("summary", f"Accuracy by {name}"), _table(mine)))
-    return join(element("h2", "In numbers"), *tables) if tables else Html("")
+    return join_html(element("h2", "In numbers"), *tables) if tables else Html("")
 
 
 def _table(rows: Sequence[AxisRow]) -> Html:
     heads = ("value", "configurations", "right", "accuracy", "95 % interval")
-    return table(heads, [axis_cells(row)[1:] for row in rows])
+    return study_table(heads, [axis_cells(row)[1:] for row in rows])
 
 
 def _cost(path: Path, summary: SweepSummary) -> Html:
@@ -290,7 +290,7 @@ def _cost(path: Path, summary: SweepSummary) -> Html:
         else "",
         "Command": summary.command_line,
     }
-    return join(element("h2", "Cost and conditions"), facts_table(facts))
+    return join_html(element("h2", "Cost and conditions"), facts_table(facts))
 
 
 def result_of(run: Path) -> SweepSummary | None:

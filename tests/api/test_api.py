@@ -19,7 +19,7 @@ from advsearch.cli.attack import answer as answer_text
 from advsearch.config import AttackConfig
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
-from advsearch.runs.listing import goes_on, listed
+from advsearch.runs.listing import can_resume, listed_runs
 from advsearch.runs.store import Row, Store
 
 SIZE = 32
@@ -155,11 +155,11 @@ def test_a_stopped_run_goes_on_where_it_was(
     with monkeypatch.context() as patch:
         interrupted(patch, 3)
         stopped = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **options)
-    assert stopped.summary.ending == "interrupted" and goes_on(tmp_path / "run")
+    assert stopped.summary.ending == "interrupted" and can_resume(tmp_path / "run")
     again = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", resume=True, **options)
     assert torch.equal(again.u, whole.u) and again.summary.verified == whole.summary.verified
     assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole")
-    assert not goes_on(tmp_path / "run")
+    assert not can_resume(tmp_path / "run")
 
 
 def rows_of(run: Path) -> list[Row]:
@@ -352,6 +352,6 @@ def test_an_answer_whose_check_is_interrupted_is_told_and_verified_later(
     assert first.summary.ending == "interrupted" and first.summary.verified is None and first.search is not None
     assert said in answer_text(first.summary) and said in (run / "report.html").read_text()
     assert "advsearch resume" in (run / "report.html").read_text()
-    assert listed(tmp_path)[0].answer == "vase, unverified"
+    assert listed_runs(tmp_path)[0].answer == "vase, unverified"
     done = advsearch.attack(scene, wrong, **asked, resume=True)
-    assert done.found and torch.equal(done.u, first.u) and listed(tmp_path)[0].answer == "6/6"
+    assert done.found and torch.equal(done.u, first.u) and listed_runs(tmp_path)[0].answer == "6/6"

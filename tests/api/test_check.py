@@ -22,7 +22,7 @@ from advsearch.config import CheckConfig
 from advsearch.engine.measuring import OutOfTime, Results
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.listing import finished, listed
+from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckedRow, CheckResult
 from advsearch.runs.summary import read_result
@@ -75,7 +75,7 @@ def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
     stopped = kept(folder)
     assert stopped.ending == "interrupted" and 1 <= len(stopped.rows) < len(whole.rows)
     assert values(stopped) == values(whole)[: len(stopped.rows)]
-    assert listed(tmp_path)[0].state == "stopped"
+    assert listed_runs(tmp_path)[0].state == "stopped"
     main(["resume", str(folder), "--json"])
     answer = CheckResult.of(json.loads(capfd.readouterr().out))
     assert answer.ending == "done" and values(answer) == values(whole)

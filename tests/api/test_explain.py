@@ -19,7 +19,7 @@ from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
 from advsearch.explanations.observations import Factor, Observations
-from advsearch.explanations.renders import along, inside, lies_inside
+from advsearch.explanations.renders import along, lies_inside, sweep_inside
 from advsearch.explanations.rules import CountedRule, RuleCondition
 from advsearch.recipes.table import Answered
 from advsearch.report.explanations import pairs_text
@@ -204,7 +204,7 @@ def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:
         RuleCondition(1, options=frozenset({1})),
         RuleCondition(2, high=1.0),
     )
-    made = inside(config, FOUND, conditions, 20, 7)
+    made = sweep_inside(config, FOUND, conditions, 20, 7)
     assert made.grid == {"pose.yaw": [90.0, 180.0]} and made.environment == "studio" and made.samples == 10
     assert made.controls == {"light": {"power": [0.5, 1.0]}} and made.seed == 7 and made.spp == config.spp
     assert lies_inside(conditions, FOUND.factors, {"pose.yaw": 90.0, "environment": "studio", "light.power": 0.7})

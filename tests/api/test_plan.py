@@ -23,7 +23,7 @@ from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.listing import finished, listed
+from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results.plan import CosineRow, GainRow, PathLength, PlanResult
 from advsearch.runs.summary import read_result
 
@@ -116,7 +116,7 @@ def test_a_plan_that_is_stopped_anywhere_goes_on_to_the_same_result(
         if number == 0:
             assert stopped.not_measured == LEFT and before == 1
             assert "not measured, it was stopped:\n  step and samples of camera\n" in answer(stopped)
-            assert listed(tmp_path)[0].state == "stopped"
+            assert listed_runs(tmp_path)[0].state == "stopped"
     INTERRUPTS.count = 0
     assert main(["resume", str(folder), "--json", "--quiet"]) == 0
     resumed = PlanResult.of(json.loads(capsys.readouterr().out))

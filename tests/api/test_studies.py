@@ -25,7 +25,7 @@ from advsearch.config import AttackConfig, GapConfig, RegionConfig
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.listing import finished, listed
+from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.summary import read_result
 
@@ -180,7 +180,7 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
     assert said.startswith("Stopped before the box was known.") and "renders   1\n" in said
     assert said.endswith(f"Go on with: advsearch resume {folder}\n")
     assert main(["show", str(folder)]) == 0 and capsys.readouterr().out == said
-    assert not finished(folder) and listed(tmp_path)[0].state == "stopped"
+    assert not finished(folder) and listed_runs(tmp_path)[0].state == "stopped"
 
 
 @pytest.mark.parametrize(

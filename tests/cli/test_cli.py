@@ -31,8 +31,8 @@ from advsearch.cli import list as listing
 from advsearch.cli.attack import answer
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
-from advsearch.cli.output import columns
-from advsearch.cli.progress import watching
+from advsearch.cli.output import aligned
+from advsearch.cli.progress import watch_progress
 from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
@@ -919,8 +919,8 @@ def test_a_table_of_almost_nothing() -> None:
 
 
 def test_columns() -> None:
-    assert columns([["a", "bb", "c"], ["aaa", "b"]]) == "  a     bb   c\n  aaa   b"
-    assert columns([]) == ""
+    assert aligned([["a", "bb", "c"], ["aaa", "b"]]) == "  a     bb   c\n  aaa   b"
+    assert aligned([]) == ""
 
 
 # ---- progress ----
@@ -965,7 +965,7 @@ def test_lines_come_where_nothing_is_counted_too(monkeypatch: pytest.MonkeyPatch
     stream = io.StringIO()
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setattr("advsearch.watching.PATIENCE", 0.0)
-    with watching() as progress:
+    with watch_progress() as progress:
         progress.stage("compiling")
         for _ in range(100):
             if stream.getvalue():
@@ -999,7 +999,7 @@ def test_a_terminal_shows_the_last_stages_with_counts_and_times(monkeypatch: pyt
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setenv("COLUMNS", "120")
-    with watching() as progress:
+    with watch_progress() as progress:
         for number in range(9):
             progress.stage(f"stage {number}")
         progress.stage("searching", 40, hint="`steps` shortens it", at_most=True)
@@ -1029,7 +1029,7 @@ def test_what_loads_much_says_that_it_starts(
 
 def test_who_watches(monkeypatch: pytest.MonkeyPatch) -> None:
     def watcher(quiet: bool = False) -> type[Progress]:
-        with watching(quiet=quiet) as progress:
+        with watch_progress(quiet=quiet) as progress:
             progress.stage("search", 3)
             progress.advance(1, best=0.5)
             progress.message("text")

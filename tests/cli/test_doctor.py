@@ -28,7 +28,7 @@ def _fresh() -> Iterator[None]:
 @pytest.fixture
 def well(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every part works, and nothing is really tried."""
-    monkeypatch.setattr(doctor, "probe", lambda: ALL_WELL)
+    monkeypatch.setattr(doctor, "run_probe", lambda: ALL_WELL)
     monkeypatch.setattr(doctor, "reference_weights", lambda: doctor.Component("reference model", "", doctor.OK))
 
 
@@ -57,7 +57,7 @@ def test_table_names_every_part_and_says_that_all_is_well(well: None, capsys: py
 def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(
     well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "probe", lambda: ALL_WELL | {"xatlas": (False, "ImportError: no such file")})
+    monkeypatch.setattr(doctor, "run_probe", lambda: ALL_WELL | {"xatlas": (False, "ImportError: no such file")})
     assert doctor.run() == doctor.FELL_SHORT == 3
     text = capsys.readouterr().out
     assert "broken" in text and "ImportError: no such file" in text
@@ -88,7 +88,7 @@ def test_a_process_that_is_taken_down_leaves_the_parts_before_it_and_how_it_ende
         "print(json.dumps({'name': 'numpy', 'ok': True, 'detail': ''}), flush=True)\n"
         "print('LLVM ERROR: Cannot select: f32 = fminimum', file=sys.stderr, flush=True); os.abort()"
     )
-    tried = doctor.probe(process_that(code))
+    tried = doctor.run_probe(process_that(code))
     assert set(tried) == {"numpy", ""}
     parts = {part.name: part for part in doctor.packages(tried)}
     assert parts["numpy"].status == doctor.OK
@@ -99,7 +99,7 @@ def test_a_process_that_is_taken_down_leaves_the_parts_before_it_and_how_it_ende
 
 def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "SECONDS_ALLOWED", 0.5)
-    tried = doctor.probe(process_that("import time; time.sleep(60)"))
+    tried = doctor.run_probe(process_that("import time; time.sleep(60)"))
     assert tried[""] == (False, "the trial took longer than 0.5 s")
 
 
@@ -109,7 +109,7 @@ def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "find", lambda: candidates)
     monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LLVM(chosen, (19, 1)))
-    part = doctor.llvm()
+    part = doctor.check_llvm()
     assert (part.version, part.status, part.fix) == ("19.1", doctor.OK, "")
     assert f"chosen: {chosen}" in part.detail
     assert f"refused: {other} (15: it aborts the process" in part.detail
@@ -118,14 +118,14 @@ def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest
 def test_llvm_without_a_usable_one_tells_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "find", lambda: [])
-    part = doctor.llvm()
+    part = doctor.check_llvm()
     assert part.status == doctor.MISSING
     assert llvm.install_command() in part.fix and llvm.VARIABLE in part.fix
 
 
 def test_llvm_that_the_variable_names_wrongly_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
-    part = doctor.llvm()
+    part = doctor.check_llvm()
     assert part.status == doctor.BROKEN and "does not exist" in part.detail
     assert part.fix == f"unset {llvm.VARIABLE}"
 
@@ -138,15 +138,15 @@ def test_a_cache_folder_that_cannot_be_made_is_a_warning(tmp_path: Path) -> None
 
 
 def test_little_disk_or_memory_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (doctor.disk(tmp_path).status, doctor.machine().status) == (doctor.OK, doctor.OK)
+    assert (doctor.disk(tmp_path).status, doctor.check_hardware().status) == (doctor.OK, doctor.OK)
     monkeypatch.setattr(doctor, "DISK_WANTED", 2**80)
     monkeypatch.setattr(doctor, "MEMORY_WANTED", 2**80)
-    assert (doctor.disk(tmp_path).status, doctor.machine().status) == (doctor.WARNING, doctor.WARNING)
+    assert (doctor.disk(tmp_path).status, doctor.check_hardware().status) == (doctor.WARNING, doctor.WARNING)
 
 
 def test_every_part_really_works_here() -> None:
     """The only test that tries them: imports, a render with its gradient, a denoised picture."""
-    tried = doctor.probe()
+    tried = doctor.run_probe()
     assert {name for name, (worked, _) in tried.items() if not worked} == set(), tried
     assert set(tried) == set(ALL_WELL)
 
@@ -162,7 +162,7 @@ def test_an_old_llvm_takes_the_probe_down_and_nothing_else(monkeypatch: pytest.M
     )
     monkeypatch.setenv(llvm.VARIABLE, str(old[0]))
     monkeypatch.setenv("HOME", os.devnull + "/none")  # no kernels from an earlier render
-    tried = doctor.probe(process_that(code))
+    tried = doctor.run_probe(process_that(code))
     if tried.get("render", (False, ""))[0]:
         pytest.skip("this processor can do without the operation that old versions lack")
     assert "signal SIGABRT" in tried[""][1] or "fminimum" in tried[""][1]

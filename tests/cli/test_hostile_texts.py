@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.cli.screen import printable, shortened
+from advsearch.cli.screen import escaped, shortened
 from advsearch.errors import FileFormatError
 from advsearch.models import read_labels
 from advsearch.settings import parse_assignment, read_yaml
@@ -147,9 +147,9 @@ def test_label_files_are_ordinary_files(tmp_path: Path) -> None:
 
 
 def test_what_steers_a_terminal_becomes_readable() -> None:
-    assert printable(f"a{ESCAPES}b") == r"a\x1b]0;title\x07\x9b31m\x7f\u202e\x0db"
-    assert printable("mug \u2014 coffee\u00a0cup\n\t\u00e9") == "mug \u2014 coffee\u00a0cup\n\t\u00e9"
-    assert printable("\u00e9\udc80", "ascii") == r"\xe9\udc80"
+    assert escaped(f"a{ESCAPES}b") == r"a\x1b]0;title\x07\x9b31m\x7f\u202e\x0db"
+    assert escaped("mug \u2014 coffee\u00a0cup\n\t\u00e9") == "mug \u2014 coffee\u00a0cup\n\t\u00e9"
+    assert escaped("\u00e9\udc80", "ascii") == r"\xe9\udc80"
 
 
 def test_long_words_of_a_message_are_shortened() -> None:

@@ -18,7 +18,7 @@ from samples import make_run
 from stored_sweeps import make_sweep
 
 from advsearch.cli.main import main
-from advsearch.cli.picture import pictures_of
+from advsearch.cli.terminal_pictures import best_pictures
 
 SIXEL, KITTY = b"\x1bP", b"\x1b_G"
 
@@ -96,11 +96,11 @@ def test_without_the_package_it_is_named(
 
 
 def test_of_another_run_the_first_picture_is_shown(run: Path, tmp_path: Path) -> None:
-    assert [one.name for one in pictures_of(run)] == ["clean.png", "adversarial.png"]
+    assert [one.name for one in best_pictures(run)] == ["clean.png", "adversarial.png"]
     swept = make_sweep(tmp_path / "swept")
     (swept / "images").mkdir(exist_ok=True)
     (swept / "images" / "sweep.png").write_bytes(b"")
-    assert [one.name for one in pictures_of(swept)] == ["sweep.png"]
+    assert [one.name for one in best_pictures(swept)] == ["sweep.png"]
     (swept / "images" / "sweep.png").unlink()
     (swept / "images" / "sweep.png").symlink_to(swept / "run.yaml")
-    assert pictures_of(swept) == []
+    assert best_pictures(swept) == []

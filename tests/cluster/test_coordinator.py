@@ -14,7 +14,7 @@ from advsearch.cluster.coordinator import DEPTH, PATIENCE, Coordinator
 from advsearch.cluster.executor import Done, Work
 from advsearch.cluster.inputs import Files
 from advsearch.cluster.machine import version
-from advsearch.cluster.worker import MOST_LOADED, Carried, Ready, carry_out, prepare
+from advsearch.cluster.worker import MOST_LOADED, Carried, Ready, carry_out_range, prepare
 from advsearch.errors import ClusterError
 
 COUNT, SIZE = 400, 16
@@ -221,7 +221,7 @@ def test_an_error_of_ours_ends_the_run_with_its_words_and_a_bug_with_its_trace()
 def test_a_worker_that_forgot_gets_ready_again_and_is_counted_once() -> None:
     class Forgetful(Simulated):
         def submit(self, ticket: int, worker: str, function: Callable[..., object], *args: object) -> None:
-            if function is carry_out and args[1] in forgotten and worker in self._free_at:
+            if function is carry_out_range and args[1] in forgotten and worker in self._free_at:
                 forgotten.remove(args[1])
                 self._at[ticket] = worker
                 self._later(0.1, self._answer(ticket, Failure("it is not ready", forgotten=True)))
@@ -253,9 +253,9 @@ def test_runs_that_share_a_worker_all_get_on(monkeypatch: pytest.MonkeyPatch) ->
         for key in keys:
             assert isinstance(prepare(key, Work("cluster_work:squares", {}), Files({}, {}), version()), Ready)
         for key in keys * 2:
-            done = carry_out(key, 3, 5)
+            done = carry_out_range(key, 3, 5)
             assert isinstance(done, Carried) and done.value == [9, 16]
-        unknown = carry_out("another", 3, 5)
+        unknown = carry_out_range("another", 3, 5)
         assert isinstance(unknown, Failure) and unknown.forgotten
     finally:
         threads.configure()

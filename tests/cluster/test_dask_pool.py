@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import socket
@@ -12,11 +13,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from conftest import ROOT
 
+from advsearch.cluster.dask_pool import scheduler_gone
 from advsearch.cluster.executor import Executor, Work
 from advsearch.cluster.opening import CLASSES, executor_of, place_of
 from advsearch.errors import ClusterError, FileFormatError, InputError
@@ -131,7 +134,23 @@ def test_a_scheduler_and_workers_of_their_own(tmp_path: Path) -> None:
             first.wait()
             with started(*scheduler), started(*worker):
                 seen += [number for done in results for number in done.numbers]
-                assert sorted(seen) == list(range(200)) and any("the scheduler has gone" in text for text in told)
+                assert sorted(seen) == list(range(200))
+                assert any("the scheduler has gone" in text for text in told)
+
+
+def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its client runs at both, over another connection: what was under way is lost all the same."""
+    monkeypatch.setattr("advsearch.cluster.dask_pool.LOOK", 0.01)
+    client = SimpleNamespace(status="running", scheduler_comm=object())
+
+    async def look() -> None:
+        gone = asyncio.create_task(scheduler_gone(client))
+        await asyncio.sleep(0.05)
+        assert not gone.done()
+        client.scheduler_comm = object()
+        await asyncio.wait_for(gone, 1.0)
+
+    asyncio.run(look())
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from advsearch import load_scene
 from advsearch.api.attack import problem_from_config
 from advsearch.api.check import attempts, check_from_config
-from advsearch.cli.check import table
+from advsearch.cli.check import check_table
 from advsearch.config import AttackConfig, CheckConfig
 from advsearch.controls import make_control
 from advsearch.engine.gradients import (
@@ -642,5 +642,5 @@ def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> N
             and math.isfinite(row.gradient)
         )
         assert row.status in ("ok", "noisy", "biased", "reference unusable")
-    text = table(rows)
+    text = check_table(rows)
     assert "smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

@@ -16,7 +16,7 @@ from advsearch.attacks import Trials
 from advsearch.engine.rows import control_group, judgement_of, rate_of, trial_row
 from advsearch.errors import InputError
 from advsearch.report import wording
-from advsearch.report.phrases import calls, cells
+from advsearch.report.phrases import answer_cells, calls
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.tasks import Answer, Judgement
 
@@ -49,11 +49,13 @@ def told(successes: int, nothing: int) -> AttackSummary:
 
 
 def test_the_headline_never_calls_it_right_or_wrong() -> None:
-    assert wording.verdict(told(0, 0)).endswith("in 0 of 20 fresh renders (95 % interval 0-20 %). The budget is spent.")
-    all_of_them = wording.verdict(told(0, 20))
+    assert wording.attack_verdict(told(0, 0)).endswith(
+        "in 0 of 20 fresh renders (95 % interval 0-20 %). The budget is spent."
+    )
+    all_of_them = wording.attack_verdict(told(0, 20))
     assert "it is wrong in none of 20 fresh renders: in 20 its answer is not a number." in all_of_them
     assert "0 of 20 fresh" not in all_of_them.replace("none of 20", "")
-    some = wording.verdict(told(2, 5))
+    some = wording.attack_verdict(told(2, 5))
     assert "in 2 of 20 fresh renders (95 % interval 0-20 %), and in 5 its answer is not a number." in some
     assert wording.tally("wrong", 0, 20, 20) == "not a number in 20 of 20"
     assert wording.tally("wrong", 2, 20, 5) == "wrong in 2, not a number in 5 of 20"
@@ -63,14 +65,14 @@ def test_the_headline_never_calls_it_right_or_wrong() -> None:
 def test_a_clean_scene_without_a_number_is_said_as_such() -> None:
     clean = {**samples.ATTACK["clean"], "label": "not a number", "index": None, "probability": None, "correct": False}
     clean["control"] = {**clean["control"], "correct": 0, "rate": 0.0, "not_a_number": 20}
-    verdict = wording.verdict(samples.attack(ending="already wrong", clean=clean))
+    verdict = wording.attack_verdict(samples.attack(ending="already wrong", clean=clean))
     assert verdict.startswith("The model already answers nothing for this mug, for its answer is not a number")
     clean["control"] = {**clean["control"], "correct": 17, "not_a_number": 2}
     (first, *_) = wording.remarks(samples.attack(clean=clean))
     assert "fails 3 of its 20 trials; in 2 the answer is not a number." in first
     for task in ("classification", "detection", "segmentation", "depth"):
         assert calls(task, "this mug", "not a number") == "answers nothing for this mug, for its answer is not a number"
-        assert cells(task, Answer("not a number")) == ["not a number", ""]
+        assert answer_cells(task, Answer("not a number")) == ["not a number", ""]
     assert calls("segmentation", "this bottle", "no bottle") == "finds no bottle"
 
 

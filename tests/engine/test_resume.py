@@ -29,7 +29,7 @@ from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
 from advsearch.runs import database
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.listing import goes_on
+from advsearch.runs.listing import can_resume
 from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import Config
 
@@ -82,7 +82,7 @@ def test_killed_at_random_moments_it_ends_with_the_same_rows(tmp_path: Path, pol
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 5, "it was hardly killed"
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
-    assert not goes_on(tmp_path / "run")
+    assert not can_resume(tmp_path / "run")
 
 
 def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
         run.write_config(config)
         attack = attack_on(problem, config, make_policy("pgd"), Stages(NullProgress()), run)
         assert attack.carry_out().interrupted
-    assert goes_on(tmp_path / "run")
+    assert can_resume(tmp_path / "run")
     found = carry_out(tmp_path / "run", config, resume=True)
     assert found.search is not None and len(found.search.history) == 25
     assert len(found.frames) == 25  # those from before the interrupt too
@@ -224,7 +224,7 @@ def test_what_a_search_was_told_comes_back_bit_for_bit_until_the_run_is_done(tmp
         assert store.told("search", 2) is None, "it was told nothing"
         store.forget()
         assert store.told("search", 0) is None and store.count() == 4
-    assert not goes_on(tmp_path)
+    assert not can_resume(tmp_path)
 
 
 def test_two_processes_on_one_run_are_refused(tmp_path: Path) -> None:

@@ -29,17 +29,17 @@ from advsearch.evaluation.precision.fits import (
     FURTHEST,
     INDEPENDENT,
     STRATIFIED,
-    confirmed,
-    fit,
+    confirm_recommendation,
+    fit_line,
     fixed_seconds,
     levels_off,
     reaching,
     recommend,
     warning_of,
 )
-from advsearch.evaluation.precision.gradient import MATRIX, GradientBench, matrix_groups, parts_of
+from advsearch.evaluation.precision.gradient import MATRIX, GradientBench, estimated_parts, matrix_groups
 from advsearch.evaluation.precision.image import COUNTS, variants
-from advsearch.evaluation.precision.machine import machine
+from advsearch.evaluation.precision.machine import timing_machine
 from advsearch.evaluation.precision.objective import PolicyCurve, SearchMark, curve_of, marks_at, missing, sooner
 from advsearch.evaluation.precision.points import (
     WARM_UP,
@@ -193,7 +193,7 @@ def test_quartiles() -> None:
 def test_independent_noise_has_slope_minus_a_half() -> None:
     points = measured(exact())
     for against in ("samples", "seconds"):
-        line = fit(points, against, INDEPENDENT)
+        line = fit_line(points, against, INDEPENDENT)
         assert line is not None and line.slope == pytest.approx(-0.5, abs=TOLERANCE)
         assert line.interval[0] < -0.5 < line.interval[1] or abs(line.slope + 0.5) < 0.02
         assert line.agrees is True and line.points == 5
@@ -201,14 +201,14 @@ def test_independent_noise_has_slope_minus_a_half() -> None:
 
 
 def test_the_slope_survives_a_reference_that_is_hardly_better() -> None:
-    line = fit(measured(rough(256)), theory=INDEPENDENT)
+    line = fit_line(measured(rough(256)), theory=INDEPENDENT)
     assert line is not None and line.points == 4  # 1,024 samples are below the reference
     assert line.slope == pytest.approx(-0.5, abs=TOLERANCE)
 
 
 def test_a_bias_levels_off_and_is_warned_of() -> None:
     points = measured(exact(), bias=0.1)
-    line = fit(points, theory=INDEPENDENT)
+    line = fit_line(points, theory=INDEPENDENT)
     assert line is not None and line.slope > -0.35 and line.agrees is False
     assert levels_off(points) and not levels_off(measured(exact()))
     assert "levels off" in str(warning_of(line, points))
@@ -216,7 +216,7 @@ def test_a_bias_levels_off_and_is_warned_of() -> None:
 
 def test_a_steeper_slope_agrees_only_where_theory_allows_it() -> None:
     points = measured(exact(), power=-0.75)
-    strict, free = fit(points, theory=INDEPENDENT), fit(points, theory=STRATIFIED)
+    strict, free = fit_line(points, theory=INDEPENDENT), fit_line(points, theory=STRATIFIED)
     assert strict is not None and free is not None
     assert strict.slope == pytest.approx(-0.75, abs=TOLERANCE)
     assert strict.agrees is False and free.agrees is True
@@ -225,16 +225,16 @@ def test_a_steeper_slope_agrees_only_where_theory_allows_it() -> None:
 def test_a_fixed_cost_keeps_points_out_of_the_slope_against_seconds() -> None:
     points = measured(exact(), fixed=0.01)
     assert fixed_seconds(points) == pytest.approx(0.01, rel=1e-6)
-    line = fit(points, "seconds", INDEPENDENT)
+    line = fit_line(points, "seconds", INDEPENDENT)
     assert line is not None and line.points == 3 and line.fixed_seconds == pytest.approx(0.01)
     assert line.agrees is True and line.slope == pytest.approx(-0.5, abs=0.1)
-    slow = fit(measured(exact(), fixed=1.0), "seconds", INDEPENDENT)
+    slow = fit_line(measured(exact(), fixed=1.0), "seconds", INDEPENDENT)
     assert slow is not None and slow.points == 5 and slow.slope < -1.0 and slow.agrees is None
 
 
 def test_a_line_needs_three_known_points() -> None:
-    assert fit(measured(exact())[:2]) is None
-    assert fit(measured(rough(4))) is None
+    assert fit_line(measured(exact())[:2]) is None
+    assert fit_line(measured(rough(4))) is None
 
 
 # ---- what is recommended --------------------------------------------------------------------------------------------
@@ -280,7 +280,7 @@ def test_new_measurements_of_a_recommended_setting_are_what_is_promised(
     error: float, times: int, promised: float
 ) -> None:
     one, spp, _ = reached(reaching(measured(exact()), 0.1))
-    found = confirmed(one, Point(setting(spp), "error", error, (0.0, 1.0), True, 0.0, 0.5, 12), up)
+    found = confirm_recommendation(one, Point(setting(spp), "error", error, (0.0, 1.0), True, 0.0, 0.5, 12), up)
     assert (found.basis, found.repeats, found.spp) == ("confirmed", 12, times * spp)
     assert found.error == pytest.approx(promised) and found.seconds == pytest.approx(0.5 * times)
 
@@ -298,7 +298,7 @@ def test_what_is_chosen_among_noisy_points_looks_better_than_it_is_until_it_is_m
         lines = {name: [point(name, spp, 4) for spp in (4, 16, 64, 256)] for name in "abc"}
         one, spp, error = reached(recommend({setting(4, name).line: points for name, points in lines.items()}, 0.1))
         before.append(math.log(spp**-0.5 / error))
-        _, spp, error = reached(confirmed(one, point(str(one.estimator), spp, 24), up))
+        _, spp, error = reached(confirm_recommendation(one, point(str(one.estimator), spp, 24), up))
         after.append(math.log(spp**-0.5 / error))
     assert np.mean(before) > 0.2
     assert abs(np.mean(after)) < 0.05 and np.quantile(np.abs(after), 0.95) < math.log(1.5)
@@ -461,26 +461,28 @@ def group(parameter: str, *valid: str) -> Group:
 
 
 def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> None:
-    found = parts_of([group("x", "differences"), group("power", "adjoint", "differences"), group("kind")], linear=True)
+    found = estimated_parts(
+        [group("x", "differences"), group("power", "adjoint", "differences"), group("kind")], linear=True
+    )
     assert [one.name for one in found] == ["light.x", "light.power"]
     assert found[0].estimators == ("differences",)
     assert found[1].estimators == ("adjoint", "differences")
     secant = [group("x", "secant", "differences")]
-    assert parts_of(secant, linear=True)[0].estimators == ("differences",)
-    assert "secant" in parts_of(secant, linear=False)[0].estimators
+    assert estimated_parts(secant, linear=True)[0].estimators == ("differences",)
+    assert "secant" in estimated_parts(secant, linear=False)[0].estimators
 
 
 def test_a_part_has_a_matrix_where_all_of_its_groups_have_one() -> None:
     texels, frame = group("texels", "adjoint"), group("frame", "adjoint")
-    assert parts_of([texels, frame], linear=True, by_matrix=[texels.name])[0].estimators == ("adjoint",)
-    assert parts_of([texels], linear=True, by_matrix=[texels.name])[0].estimators == ("adjoint", MATRIX)
+    assert estimated_parts([texels, frame], linear=True, by_matrix=[texels.name])[0].estimators == ("adjoint",)
+    assert estimated_parts([texels], linear=True, by_matrix=[texels.name])[0].estimators == ("adjoint", MATRIX)
 
 
 def test_a_matrix_gives_the_gradient_of_the_adjoint_and_the_next_one_sooner() -> None:
     renderer = load_scene("mug").renderer("texture", resolution=24, denoise="none")
     assert matrix_groups(renderer) == {"texture.texels"}
     assert not matrix_groups(load_scene("mug").renderer("pose", resolution=24))
-    (part,) = parts_of(renderer.plan.groups, linear=True, by_matrix=matrix_groups(renderer))
+    (part,) = estimated_parts(renderer.plan.groups, linear=True, by_matrix=matrix_groups(renderer))
     loss = smooth_loss((24, 24))
     bench = GradientBench(renderer, loss, renderer.start, part)
     bench.reference = reference_of([part.of(renderer.gradient(loss, renderer.start, seed, 1024)[1]) for seed in (1, 2)])
@@ -548,8 +550,8 @@ def test_settings_go_through_yaml_and_the_command_line(tmp_path: Path) -> None:
 def test_the_machine_is_named(tmp_path: Path) -> None:
     info = tmp_path / "cpuinfo"
     info.write_text("processor : 0\nmodel name : An  Example CPU\n", encoding="utf-8")
-    assert machine(info).cpu == "An Example CPU"
-    assert machine(tmp_path / "none").cpu and machine().cores >= 1
+    assert timing_machine(info).cpu == "An Example CPU"
+    assert timing_machine(tmp_path / "none").cpu and timing_machine().cores >= 1
 
 
 def test_a_tiny_scene_from_end_to_end(

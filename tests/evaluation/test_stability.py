@@ -19,7 +19,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.evaluation.stability import suite
 from advsearch.evaluation.stability.case import holds
 from advsearch.evaluation.stability.cases_noise import clipped_mean, median_of_means
-from advsearch.evaluation.stability.search import Toy, condition_number, hessian, numbers, quadratic
+from advsearch.evaluation.stability.closed_form import Toy, box_domain, condition_number, hessian, quadratic
 from advsearch.evaluation.stability.suite import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Outcome, chosen, run_case
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.results.stability import StabilityResult
@@ -268,7 +268,7 @@ def test_median_of_means_and_clipping_ignore_one_huge_sample() -> None:
 
 
 def test_a_toy_counts_its_cost_and_breaks_where_it_is_told_to() -> None:
-    toy = Toy(quadratic([0.5], [1.0]), numbers([0.0]), broken=frozenset({3}))
+    toy = Toy(quadratic([0.5], [1.0]), box_domain([0.0]), broken=frozenset({3}))
     u = torch.zeros(1)
     assert toy(Query(u, 0, number=2, gradient=True)).finite and not toy(Query(u, 0, number=3, gradient=True)).finite
     assert toy(Query(u, 0, number=2, samples=4)).cost == 4

@@ -193,4 +193,4 @@ def test_a_library_that_is_missing_is_named_with_the_command(monkeypatch: pytest
 
     monkeypatch.setattr("importlib.import_module", absent)
     with pytest.raises(InputError, match=r"needs scikit-learn.*pip install 'advsearch\[explain\]'"):
-        libraries.library("sklearn.tree")
+        libraries.import_library("sklearn.tree")

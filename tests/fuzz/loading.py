@@ -74,9 +74,9 @@ def load_labels(path: Path) -> None:
 
 def load_settings(path: Path) -> None:
     """Read a YAML file as `advsearch run` does."""
-    from advsearch.cli.run import command_in, described
+    from advsearch.cli.run import command_in, config_of_file
 
-    described(command_in(path), path, {})
+    config_of_file(command_in(path), path, {})
 
 
 def load_run(path: Path) -> None:
@@ -84,13 +84,13 @@ def load_run(path: Path) -> None:
     import io
 
     from advsearch.cli.show import show_run
-    from advsearch.runs.export import export
-    from advsearch.runs.listing import described
+    from advsearch.runs.export import write_rows
+    from advsearch.runs.listing import listed_run
     from advsearch.runs.store import NAME, Store
 
-    described(path.parent)
+    listed_run(path.parent)
     with Store(path.parent / NAME, read_only=True) as store:
-        export(store, "json", None, io.BytesIO())
+        write_rows(store, "json", None, io.BytesIO())
     show_run(str(path.parent), as_json=False)
 
 

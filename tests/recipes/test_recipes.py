@@ -19,8 +19,8 @@ from advsearch.cli.main import main
 from advsearch.config import RecipeConfig, SweepConfig
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.recipes.columns import check_figures
-from advsearch.recipes.description import Recipe, names, read_recipe, titles
-from advsearch.recipes.figures import FIGURES, compute, draw, heat_map, read_options
+from advsearch.recipes.description import Recipe, read_recipe, recipe_names, titles
+from advsearch.recipes.figures import FIGURES, compute, draw_figure, heat_map, read_options
 from advsearch.recipes.figures.answers import fitting
 from advsearch.recipes.parts import planned
 from advsearch.recipes.table import Answered, Table, count_of
@@ -71,7 +71,7 @@ def figure(
 # ---- what a file may say --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", recipe_names())
 @pytest.mark.parametrize("quick", [False, True])
 def test_every_bundled_recipe_is_one_that_can_be_carried_out(name: str, quick: bool) -> None:
     described = read_recipe(name)
@@ -196,13 +196,13 @@ def test_a_figure_of_what_no_row_will_have_is_refused_before_anything_is_rendere
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", recipe_names())
 def test_the_figures_of_every_bundled_recipe_name_columns_that_there_are(name: str) -> None:
     described, config = read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug")
     check_figures(described, carrying_out._check_runs(planned(described, config)), name)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", recipe_names())
 def test_every_bundled_recipe_takes_an_environment_of_ones_own(tmp_path: Path, name: str) -> None:
     room = tmp_path / "room.exr"
     room.write_bytes((SCENES / "loft.exr").read_bytes())
@@ -210,7 +210,7 @@ def test_every_bundled_recipe_takes_an_environment_of_ones_own(tmp_path: Path, n
     assert runs and carrying_out._check_runs(runs).keys() == {one.part for one in runs}
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", recipe_names())
 def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> None:
     described = read_recipe(name)
     config = RecipeConfig(recipe=name, object="mug", task="detection={overlap: 0.4}", label="cup")
@@ -490,7 +490,7 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
     empty = sum(cell.lead is None for cell in cells)
     assert empty == sum(not cell.configurations for cell in cells) == 1
     assert made.text[2] == "No picture was drawn in 1 of 16 parts of the diagram, which are hatched."
-    assert draw(made, Path())["png"] and figure_table(made)[1][1][0] == "m"
+    assert draw_figure(made, Path())["png"] and figure_table(made)[1][1][0] == "m"
     same = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=-3.0) for one in answered])
     assert "No difference is shown" in same.text[1]
     unknown = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=None) for one in answered])
@@ -627,7 +627,7 @@ def test_every_figure_is_drawn_and_is_a_table(kind: str, tmp_path: Path) -> None
     assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
     heads, lines = figure_table(made)
     assert lines and all(len(one) == len(heads) for one in lines)
-    assert draw(made, tmp_path)["png"].startswith(b"\x89PNG")
+    assert draw_figure(made, tmp_path)["png"].startswith(b"\x89PNG")
 
 
 EXAMPLE_ROWS = [

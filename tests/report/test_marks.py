@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from advsearch.report.marks import SAID, SMALLEST, TINT, TRUE, marked
-from advsearch.report.phrases import answer_text, calling, calls, cells, margin_text, marks_text, wanted
+from advsearch.report.phrases import answer_cells, answer_text, calling, calls, margin_text, marks_text, wanted
 from advsearch.tasks import Answer, Mark
 
 
@@ -122,4 +122,4 @@ def test_margins_and_objectives_in_words() -> None:
     assert len({marks_text(task) for task in ("detection", "segmentation", "yaw")}) == 3
     assert wanted("vanish", "this mug") == "makes the model miss this mug"
     assert wanted("displace", "this mug") == "makes the model see this mug elsewhere"
-    assert cells("detection", Answer("no cup", None, 0.124)) == ["no cup found", "best score of cup 0.12"]
+    assert answer_cells("detection", Answer("no cup", None, 0.124)) == ["no cup found", "best score of cup 0.12"]

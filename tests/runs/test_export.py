@@ -17,8 +17,8 @@ from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.errors import UnknownNameError
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.export import FORMATS, columns, export
-from advsearch.runs.listing import finished, listed
+from advsearch.runs.export import FORMATS, as_columns, write_rows
+from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.store import NAME, Row, Store
 
 TWO: Any = {"light.place": {"value": [1.0, 2.0], "unit": ""}}
@@ -43,12 +43,12 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def table(run: Path, format: str, kind: str | None = None) -> bytes:
     stream = io.BytesIO()
     with Store(run / NAME, read_only=True) as store:
-        assert export(store, format, None, stream, kind) == (3 if kind is None else 2)
+        assert write_rows(store, format, None, stream, kind) == (3 if kind is None else 2)
     return stream.getvalue()
 
 
 def test_units_stand_in_the_columns_and_vectors_are_spread() -> None:
-    names = columns(ROWS)
+    names = as_columns(ROWS)
     assert names[:3] == ["id", "kind", "step"] and names[-4:] == ["renders", "machine", "seconds", "time"]
     assert names[names.index("payload") + 1 : -4] == [
         "pose.yaw [degrees]",
@@ -118,7 +118,7 @@ def test_a_table_that_cannot_be_written_names_out(run: Path, capsys: pytest.Capt
 
 def test_an_unknown_kind_leaves_no_file(run: Path) -> None:
     with Store(run / NAME, read_only=True) as store, pytest.raises(UnknownNameError):
-        export(store, "csv", run / "x.csv", io.BytesIO(), "none")
+        write_rows(store, "csv", run / "x.csv", io.BytesIO(), "none")
     assert not (run / "x.csv").exists()
 
 
@@ -126,9 +126,9 @@ def test_an_unknown_kind_leaves_no_file(run: Path) -> None:
 
 
 def test_runs_says_how_each_ended(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert [(one.name, one.state, one.rows) for one in listed(run.parent)] == [("one", "stopped", 3)]
+    assert [(one.name, one.state, one.rows) for one in listed_runs(run.parent)] == [("one", "stopped", 3)]
     with RunDirectory.resume("one"):
-        assert listed(run.parent)[0].state == "running"
+        assert listed_runs(run.parent)[0].state == "running"
     with RunDirectory.create("two") as other:
         other.write_config(AttackConfig(object="bowl", controls="texture"))
         other.write_summary(attack(verified=rated(19)))

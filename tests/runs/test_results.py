@@ -7,12 +7,12 @@ import math
 from typing import ClassVar
 
 from advsearch.cli.plan import answer as plan_text
-from advsearch.runs.results.base import Fields, Interval, Number, Result
+from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result
 from advsearch.runs.results.plan import DenoiserAdvice, EstimatorLimit, PlanResult
 
 
 class Inner(Fields):
-    value: Number
+    value: JsonFloat
     interval: Interval
 
 

@@ -32,9 +32,9 @@ from advsearch.errors import FileFormatError, InputError, RunExistsError, Storag
 from advsearch.runs import directory, images
 from advsearch.runs.database import MIGRATIONS
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
-from advsearch.runs.export import FORMATS, export
+from advsearch.runs.export import FORMATS, write_rows
 from advsearch.runs.files import PART, replacing, write_bytes, write_text
-from advsearch.runs.listing import finished, listed
+from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.lock import RunLock
 from advsearch.runs.results.base import Result, plain
 from advsearch.runs.store import Row, Store
@@ -710,7 +710,7 @@ COLUMNS = [
 def exported(store: Store, format: str, kind: str | None = None) -> bytes:
     """The bytes that standard output would get."""
     stream = io.BytesIO()
-    export(store, format, None, stream, kind)
+    write_rows(store, format, None, stream, kind)
     return stream.getvalue()
 
 
@@ -730,7 +730,7 @@ def test_json_and_parquet_have_the_same_rows(filled: Store, tmp_path: Path) -> N
     assert rows[0]["objective"] == 0.1 + 0.2 and rows[0]["success"] is True and rows[1]["objective"] is None
     assert rows[2]["success"] is None and rows[1]["camera.target[0] [sizes]"] == 0.5
     out = tmp_path / "rows.parquet"
-    assert export(filled, "parquet", out, io.BytesIO()) == 3
+    assert write_rows(filled, "parquet", out, io.BytesIO()) == 3
     table = pyarrow.parquet.read_table(out)
     assert table.column_names == COLUMNS and table.to_pylist() == rows
     assert str(table.schema.field("seed").type) == "int64" and str(table.schema.field("success").type) == "bool"
@@ -749,7 +749,7 @@ def test_one_kind_of_rows_alone(filled: Store) -> None:
 @pytest.mark.parametrize("format", FORMATS)
 def test_a_run_without_rows_is_a_table_without_lines(run: RunDirectory, tmp_path: Path, format: str) -> None:
     out = tmp_path / f"rows.{format}"
-    assert export(run.store, format, out, io.BytesIO()) == 0
+    assert write_rows(run.store, format, out, io.BytesIO()) == 0
     assert out.stat().st_size > 0
 
 
@@ -759,7 +759,7 @@ def test_without_pyarrow_parquet_says_what_to_do_and_leaves_nothing(
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     (tmp_path / "rows.parquet").write_text("mine")
     with pytest.raises(InputError, match="format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"):
-        export(filled, "parquet", tmp_path / "rows.parquet", io.BytesIO())
+        write_rows(filled, "parquet", tmp_path / "rows.parquet", io.BytesIO())
     assert (tmp_path / "rows.parquet").read_text() == "mine"
     assert not list(tmp_path.glob(f"{PART}*"))
 
@@ -769,7 +769,7 @@ def test_parquet_takes_more_rows_than_one_group(
 ) -> None:
     monkeypatch.setattr("advsearch.runs.export.GROUP", 4)
     run.record(*(Row("sweep", step, values={"p": {"value": step / 3, "unit": ""}}) for step in range(11)))
-    export(run.store, "parquet", tmp_path / "rows.parquet", io.BytesIO())
+    write_rows(run.store, "parquet", tmp_path / "rows.parquet", io.BytesIO())
     file = pyarrow.parquet.ParquetFile(tmp_path / "rows.parquet")
     assert file.num_row_groups == 3
     assert file.read().column("p").to_pylist() == [step / 3 for step in range(11)]
@@ -793,8 +793,8 @@ def test_runs_are_listed_with_their_state(home: Path) -> None:
     Path("runs/e-damaged/results.sqlite").write_bytes(Path("runs/a-killed/results.sqlite").read_bytes()[:100])
     Path("runs/not-a-run").mkdir()
     with RunDirectory.resume("c-ctrl-c"):
-        during = {one.name: one.state for one in listed(Path("runs"))}
-    found = listed(Path("runs"))
+        during = {one.name: one.state for one in listed_runs(Path("runs"))}
+    found = listed_runs(Path("runs"))
     assert [one.name for one in found] == ["a-killed", "b-found", "c-ctrl-c", "d-sweep", "e-damaged"]
     assert [one.state for one in found] == ["stopped", "found", "stopped", "finished", "stopped"]
     assert during["c-ctrl-c"] == "running" and during["b-found"] == "found"
@@ -803,4 +803,4 @@ def test_runs_are_listed_with_their_state(home: Path) -> None:
     assert found[1].controls == ("pose", "light") and found[0].controls == ("pose",)
     assert (found[0].object, found[0].command, found[4].object) == ("mug", "attack", "?")
     assert [finished(Path(one.path)) for one in found] == [False, True, False, True, False]
-    assert listed(Path("nowhere")) == []
+    assert listed_runs(Path("nowhere")) == []

@@ -32,7 +32,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
-from advsearch.report.markup import Html, element, join
+from advsearch.report.markup import Html, element, join_html
 from advsearch.report.phrases import objective_label, percent
 from advsearch.report.studies import gap_figure
 from advsearch.report.style import CSS
@@ -226,7 +226,7 @@ def test_a_run_that_has_little_still_has_a_page(tmp_path: Path, ending: str) -> 
     clean = {**ATTACK["clean"], "control": None}
     summary = attack(ending=ending, steps=3, clean=clean, adversarial=None, verified=None, baseline=None)
     page = page_of(make_run(tmp_path / "run", summary, pictures=False, rows=False))
-    assert wording.verdict(summary) in page.text
+    assert wording.attack_verdict(summary) in page.text
     assert not page.all("img") and "Verified rates" not in page.text
 
 
@@ -257,7 +257,7 @@ def test_without_a_summary_there_is_no_page(tmp_path: Path) -> None:
 def test_text_is_escaped_and_markup_is_not() -> None:
     assert element("p", "<b>", Html("<i></i>"), None, class_='"') == '<p class="&quot;">&lt;b&gt;<i></i></p>'
     assert element("img", src="&") == '<img src="&amp;">'
-    assert join("<", element("br")) == "&lt;<br>"
+    assert join_html("<", element("br")) == "&lt;<br>"
 
 
 @pytest.mark.parametrize("width", [WIDE, NARROW])
@@ -392,14 +392,14 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
     ],
 )
 def test_the_verdict_says_what_is_known_and_no_more(fields: dict[str, Any], sentence: str) -> None:
-    assert wording.verdict(attack(**fields)) == sentence
+    assert wording.attack_verdict(attack(**fields)) == sentence
 
 
 @pytest.mark.parametrize("goal", [ANY, TARGET, EASIER], ids=["wrong", "target", "easier"])
 def test_every_ending_has_a_verdict(goal: dict[str, Any]) -> None:
     from advsearch.attacks.ending import Ending
 
-    said = [wording.verdict(attack(ending=ending.value, **goal)) for ending in Ending]
+    said = [wording.attack_verdict(attack(ending=ending.value, **goal)) for ending in Ending]
     assert len(set(said)) == len(said)
     assert all("mug" in text for text in said)
 

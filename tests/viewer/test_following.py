@@ -13,7 +13,7 @@ from stored_sweeps import described, serving
 from advsearch.config import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
-from advsearch.viewer.following import START, following_page, goes_on, progress
+from advsearch.viewer.following import START, following_page, is_under_way, progress_json
 
 
 def step(run: RunDirectory, number: int, *, picture: bool = True) -> None:
@@ -25,7 +25,7 @@ def step(run: RunDirectory, number: int, *, picture: bool = True) -> None:
 
 
 def news(run: Path, after: int = START) -> dict[str, Any]:
-    found = json.loads(progress(run, after))
+    found = json.loads(progress_json(run, after))
     assert isinstance(found, dict)
     return found
 
@@ -64,9 +64,9 @@ def test_its_own_page_is_shown_when_it_has_ended(tmp_path: Path) -> None:
             assert answer.headers["Content-Type"] == "application/json"
             assert len(json.load(answer)["rows"]) == 1
         (path / "report.html").write_text("what came out")
-        assert goes_on(path)  # an attack that is resumed has the page of its first sitting
+        assert is_under_way(path)  # an attack that is resumed has the page of its first sitting
         run.finish()
-        assert not goes_on(path) and news(path)["ended"]
+        assert not is_under_way(path) and news(path)["ended"]
         with urlopen(address) as answer:
             assert answer.read() == b"what came out"
 

@@ -15,7 +15,7 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.runs.threedb import read_threedb
 from advsearch.viewer import thumbnails
-from advsearch.viewer.sweep_page import write_page
+from advsearch.viewer.sweep_page import write_sweep_page
 
 MOST_PIXELS = 1 << 22
 """Of a picture that is read."""
@@ -56,7 +56,7 @@ def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bo
             raise FileFormatError(f"{folder}: expected the log of 3DB with at least one line, got an empty one")
         summary = counts.summary(kept.path, folder)
         kept.write_summary(summary)
-        write_page(kept.path, summary)
+        write_sweep_page(kept.path, summary)
         return kept.path
 
 

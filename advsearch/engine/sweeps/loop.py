@@ -57,7 +57,7 @@ from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 from advsearch.viewer.columns import EDGES
-from advsearch.viewer.sweep_page import write_page
+from advsearch.viewer.sweep_page import write_sweep_page
 
 NOT_FINITE = "pictures not finite"
 """The note under which the store keeps that there were some."""
@@ -427,7 +427,7 @@ class Sweep:
             self.run.write_summary(summary)
             for suffix, data in sweep_figure(summary).items():
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
-            write_page(self.run.path, summary)
+            write_sweep_page(self.run.path, summary)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
 
     def _gains(self) -> dict[str, float]:

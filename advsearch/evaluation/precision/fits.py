@@ -52,7 +52,7 @@ STRATIFIED = Theory(MONTE_CARLO, at_most=True)
 UNKNOWN = Theory()
 
 
-def fit(points: Sequence[Point], against: Against = "samples", theory: Theory = UNKNOWN) -> PrecisionSlope | None:
+def fit_line(points: Sequence[Point], against: Against = "samples", theory: Theory = UNKNOWN) -> PrecisionSlope | None:
     """Return the least-squares line of log error against log samples or seconds.
 
     Only points whose error is known count: one below the reference's own error says nothing. None where fewer than
@@ -202,7 +202,7 @@ def reaching(points: Sequence[Point], goal: float, round_up: RoundUp | None = No
     )
 
 
-def confirmed(one: Recommended, point: Point, round_up: RoundUp) -> Recommended:
+def confirm_recommendation(one: Recommended, point: Point, round_up: RoundUp) -> Recommended:
     """Return a recommendation that rests on measurements made after it was chosen, with seeds of their own.
 
     What looks cheapest among noisy points is mostly a lucky one, and its error looks smaller than it is. New
@@ -231,7 +231,7 @@ def confirmed(one: Recommended, point: Point, round_up: RoundUp) -> Recommended:
 
 def _explaining(ordered: Sequence[Point]) -> PrecisionSlope | None:
     """The fitted line, if it falls and goes through the intervals of all known points, of at least four."""
-    line = fit(ordered)
+    line = fit_line(ordered)
     if line is None or line.points < LEAST_POINTS + 1 or line.slope > -0.1:
         return None
     known = [point for point in ordered if point.known]
@@ -270,7 +270,7 @@ def _samples_for(ordered: Sequence[Point], goal: float) -> tuple[float | None, s
 
 
 def _extrapolated(ordered: Sequence[Point], goal: float) -> float | None:
-    line, last = fit(ordered), ordered[-1]
+    line, last = fit_line(ordered), ordered[-1]
     if line is None or not last.known or line.slope > -0.1 or levels_off(ordered):
         return None
     factor = (goal / last.error) ** (1.0 / max(line.slope, -1.0))
@@ -285,7 +285,7 @@ def _at(ordered: Sequence[Point], spp: int, what: Literal["seconds", "error"]) -
     values = [math.log(max(1e-300, getattr(point, what))) for point in ordered]
     if spp <= counts[-1]:
         return math.exp(float(np.interp(math.log(spp), np.log(counts), values)))
-    line = fit(ordered)
+    line = fit_line(ordered)
     slope = 1.0 if what == "seconds" else (MONTE_CARLO if line is None else max(line.slope, -1.0))
     return math.exp(values[-1] + slope * math.log(spp / counts[-1]))
 

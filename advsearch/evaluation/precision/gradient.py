@@ -65,7 +65,7 @@ class GradientPart:
         return _array(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
-def parts_of(groups: Sequence[Group], *, linear: bool, by_matrix: Collection[str] = ()) -> list[GradientPart]:
+def estimated_parts(groups: Sequence[Group], *, linear: bool, by_matrix: Collection[str] = ()) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them.
 
     Args:

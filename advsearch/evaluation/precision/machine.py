@@ -12,7 +12,7 @@ from advsearch.runs.results.precision import Machine
 _CPU_INFO = Path("/proc/cpuinfo")
 
 
-def machine(cpu_info: Path = _CPU_INFO) -> Machine:
+def timing_machine(cpu_info: Path = _CPU_INFO) -> Machine:
     """Return what a time has to be read with: the processor, its cores, and the threads in use.
 
     Args:

@@ -12,8 +12,8 @@ from advsearch.evaluation.precision.fits import (
     Against,
     RoundUp,
     Theory,
-    confirmed,
-    fit,
+    confirm_recommendation,
+    fit_line,
     recommend,
     warning_of,
 )
@@ -32,7 +32,7 @@ from advsearch.runs.results.precision import (
 )
 from advsearch.scene.formation import next_count
 
-Line = tuple[str, str, str]
+TableLine = tuple[str, str, str]
 AGAINST: tuple[Against, ...] = ("samples", "seconds")
 FAMILIES = {"raw": "without denoiser", "oidn": "with denoiser", "depth": "by path depth"}
 
@@ -50,7 +50,7 @@ class MeasuredLine:
         again: the setting that was recommended, from measurements after that.
     """
 
-    line: Line
+    line: TableLine
     measure: str
     points: list[Point]
     theory: Theory
@@ -133,7 +133,7 @@ def report_of(subject: PrecisionSubject, section: Section, goal: float) -> Preci
     slopes, warnings = [], list(section.warnings)
     for one in section.lines:
         for against in AGAINST:
-            slope = fit(one.points, against, one.theory)
+            slope = fit_line(one.points, against, one.theory)
             said = None if slope is None else warning_of(slope, one.points)
             slopes += [] if slope is None else [slope]
             warnings += [] if said is None else [said]
@@ -155,7 +155,7 @@ def report_of(subject: PrecisionSubject, section: Section, goal: float) -> Preci
 
 def _points(section: Section) -> list[PrecisionPoint]:
     """One entry a setting; the margin's error stands beside the picture's."""
-    found: dict[tuple[Line, int], dict[str, Point]] = {}
+    found: dict[tuple[TableLine, int], dict[str, Point]] = {}
     families = {one.line: one.family for one in section.lines if one.family}
     for one in section.lines:
         for point in one.points:
@@ -221,7 +221,7 @@ def _place(setting: MeasuredSetting) -> SettingPlace:
 
 def _recommended(section: Section, goal: float) -> list[Recommended]:
     """For each thing that can be asked for: the setting that reaches the goal soonest, if any does."""
-    asked: dict[tuple[str, str, str, str], dict[Line, MeasuredLine]] = {}
+    asked: dict[tuple[str, str, str, str], dict[TableLine, MeasuredLine]] = {}
     for each in section.lines:
         if each.measure == "margin_error" and each.family == "depth":
             continue
@@ -234,7 +234,7 @@ def _recommended(section: Section, goal: float) -> list[Recommended]:
             one = Recommended(quantity=quantity, control=control or None, measure=measure, among=None, estimator=None)
         chosen = lines.get((quantity, control, one.estimator or ""))
         if chosen is not None and chosen.again is not None:
-            one = confirmed(one, chosen.again, round_up)
+            one = confirm_recommendation(one, chosen.again, round_up)
         found.append(one.model_copy(update={"among": FAMILIES.get(family)}))
     return found
 

@@ -17,12 +17,12 @@ from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import (
     BARE,
     SPP,
-    Controls,
+    ControlSettings,
     compared,
     dark,
-    domain_of,
-    examine,
+    examine_gradient,
     mesh_of,
+    search_domain,
     small,
     thing,
 )
@@ -33,7 +33,7 @@ QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]
 """A square that faces +x."""
 HALVES = [[0, 1, 2], [0, 2, 3]]
 FRONT = {"camera.azimuth": 0.0, "camera.elevation": 10.0}
-PAINTED: Controls = {"texture": {"resolution": 8}, "pose": {"y": [-0.3, 0.3]}}
+PAINTED: ControlSettings = {"texture": {"resolution": 8}, "pose": {"y": [-0.3, 0.3]}}
 SAME_PICTURE = 2e-3
 """Mean difference of two pictures that should be one: an 8-bit level is 4e-3."""
 FAR = 1e4
@@ -48,7 +48,7 @@ _WRAP = "periodic blocks wrap (Domain.project, Renderer differences)"
 
 def mesh(made: Mesh) -> Outcome:
     """A mesh of our own, seen from the front: painted and shifted."""
-    return examine(small(thing(made), PAINTED, settings=FRONT)).findings()
+    return examine_gradient(small(thing(made), PAINTED, settings=FRONT)).findings()
 
 
 @GROUP.case(
@@ -114,7 +114,7 @@ def one_triangle() -> Outcome:
 def million() -> Outcome:
     """A sphere of a million triangles: painted, and moved once each way."""
     fine, rough = (normalised(sphere(*counts)) for counts in ((501, 1000), (64, 128)))
-    found = examine(small(thing(fine), {"texture": {"resolution": 8}}), evaluations=2)
+    found = examine_gradient(small(thing(fine), {"texture": {"resolution": 8}}), evaluations=2)
     coarse, renderer = (small(thing(one), {"pose": {"x": [-0.3, 0.3]}}) for one in (rough, fine))
     _, slope = renderer.gradient(smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP)
     with torch.no_grad():
@@ -130,7 +130,7 @@ def sized(scale: float) -> Outcome:
     """The object 100 times smaller or larger: a speck, or a wall around the camera."""
     low, high = (scale, 2.0 * scale) if scale < 1.0 else (scale / 2.0, scale)
     renderer = small("mug", {"pose": {"scale": [low, high]}})
-    return examine(renderer, torch.tensor([0.0 if scale < 1.0 else 1.0]), compare=False).findings()
+    return examine_gradient(renderer, torch.tensor([0.0 if scale < 1.0 else 1.0]), compare=False).findings()
 
 
 for scale in (0.01, 100.0):
@@ -149,7 +149,7 @@ def file_units(scale: float, shift: float = 0.0) -> Outcome:
             path.write_text(_obj(points * factor + away, faces))
             renderer = small(path, {"pose": {"x": [-0.3, 0.3]}})
             pictures.append(_shown(renderer.start, renderer))
-        found = examine(renderer, compare=False)
+        found = examine_gradient(renderer, compare=False)
     apart = float((pictures[0] - pictures[1]).abs().mean())
     return found.findings(Check("mean difference from the same box at home", apart, most=SAME_PICTURE))
 
@@ -175,7 +175,7 @@ GROUP.case(
 def far_away() -> Outcome:
     """The object 10,000 sizes away: gone from the picture, and so is its derivative."""
     renderer = small("mug", {"pose": {"y": [9e3, FAR]}})
-    found = examine(renderer, torch.tensor([1.0]))
+    found = examine_gradient(renderer, torch.tensor([1.0]))
     empty = small("mug", {"pose": {"z": [-3.0, -2.0]}}, settings={"pose.x": 9e3})
     apart = float((_shown(torch.tensor([1.0]), renderer) - _shown(empty.start, empty)).abs().mean())
     return found.findings(
@@ -184,23 +184,23 @@ def far_away() -> Outcome:
     )
 
 
-def view(controls: Controls, u: Sequence[float], *, black: bool = True, compare: bool = True) -> Outcome:
+def extreme_view(controls: ControlSettings, u: Sequence[float], *, black: bool = True, compare: bool = True) -> Outcome:
     """The mug, in black on a bare sky where only its outline is to move, seen in some extreme way."""
     renderer = small(dark() if black else "mug", controls, settings=BARE if black else None)
-    return examine(renderer, torch.tensor(u, dtype=torch.float32), compare=compare).findings()
+    return examine_gradient(renderer, torch.tensor(u, dtype=torch.float32), compare=compare).findings()
 
 
 GROUP.case("grazing-view", "Looking along the ground, the gradient by the elevation is right.", _PIXEL, "camera")(
-    partial(view, {"camera": {"elevation": [-10.0, 10.0]}}, [0.5])
+    partial(extreme_view, {"camera": {"elevation": [-10.0, 10.0]}}, [0.5])
 )
 GROUP.case("near-plane", "With the camera inside the object, picture and gradient are finite.", _SCENE, "camera")(
-    partial(view, {"camera": {"distance": [0.05, 0.2]}}, [0.5], black=False, compare=False)
+    partial(extreme_view, {"camera": {"distance": [0.05, 0.2]}}, [0.5], black=False, compare=False)
 )
 GROUP.case("object-fills-the-frame", "Finite where nothing but the object is seen.", _SCENE, "camera")(
-    partial(view, {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, [0.5], black=False, compare=False)
+    partial(extreme_view, {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, [0.5], black=False, compare=False)
 )
 GROUP.case("object-leaves-the-frame", "Half outside, the gradient by the shift is right.", _PIXEL, "pose")(
-    partial(view, {"pose": {"x": [0.0, 2.0]}}, [0.5])
+    partial(extreme_view, {"pose": {"x": [0.0, 2.0]}}, [0.5])
 )
 
 
@@ -216,7 +216,7 @@ def gimbal() -> Outcome:
     angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
     locked = small(dark(), angles, settings=BARE)
     u = torch.tensor([0.7, 0.5, 0.5])
-    found = examine(locked, u, seeds=(3, 12), spp=2 * SPP)
+    found = examine_gradient(locked, u, seeds=(3, 12), spp=2 * SPP)
     with torch.no_grad():
         one = locked(torch.tensor([0.7, 0.5, 0.5]), 0, 16)
         other = locked(torch.tensor([0.5, 0.5, 0.3]), 0, 16)  # yaw 36 is roll -36 here
@@ -229,16 +229,16 @@ def gimbal() -> Outcome:
     )
 
 
-def full_turn(controls: Controls) -> Outcome:
+def full_turn(controls: ControlSettings) -> Outcome:
     """0 and 360 degrees are one place: one picture, one gradient, and a step across the seam goes on."""
     renderer = small("mug", controls)
     zero, one = torch.zeros_like(renderer.start), torch.ones_like(renderer.start)
     loss = smooth_loss(renderer.formation.resolution)
     slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, one)]
     apart = float((_shown(zero, renderer) - _shown(one, renderer)).abs().mean())
-    domain = domain_of(renderer)
+    domain = search_domain(renderer)
     wrapped = domain.project(one + 0.01)
-    found = examine(renderer, zero, compare=False)
+    found = examine_gradient(renderer, zero, compare=False)
     size = float(slopes[0].abs().max())
     return found.findings(
         Check("mean difference of the pictures", apart, most=SAME_PICTURE),

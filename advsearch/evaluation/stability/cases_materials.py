@@ -11,7 +11,7 @@ import torch
 
 from advsearch.engine.gradients import smooth_loss
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
-from advsearch.evaluation.stability.scene import ERROR, REFERENCE_SPP, SPP, Controls, examine, small
+from advsearch.evaluation.stability.scene import ERROR, REFERENCE_SPP, SPP, ControlSettings, examine_gradient, small
 from advsearch.scene import library
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
@@ -45,17 +45,17 @@ def _glass(part: GlassBall) -> Translation:
     return Translation({part.name: ball})
 
 
-def behind_glass(controls: Controls) -> Renderer:
+def behind_glass(controls: ControlSettings) -> Renderer:
     """The mug behind a ball of clear glass, which covers part of it."""
     camera = camera_to_world(describe("mug"))
     x, y, z = (float(one) for one in camera[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
     return small("mug", controls, parts=[GlassBall("glass", (x, y, z), 0.3)])
 
 
-def surface(searched: dict[str, list[float]], **values: float) -> Outcome:
+def extreme_surface(searched: dict[str, list[float]], **values: float) -> Outcome:
     """A surface with some numbers at the ends of their range, and the derivative by some of them there."""
     settings = {f"material.{name}": value for name, value in values.items()}
-    return examine(small("mug", {"material": searched}, settings=settings)).findings()
+    return examine_gradient(small("mug", {"material": searched}, settings=settings)).findings()
 
 
 GROUP.case(
@@ -63,24 +63,24 @@ GROUP.case(
     "Finite, and the gradient by the roughness is right, at the polished end.",
     "Mitsuba's lobe is never narrower than a roughness of 0.03, so the derivative is finite",
     "material",
-)(partial(surface, {"roughness": [0.0, 1.0]}, roughness=0.0))
+)(partial(extreme_surface, {"roughness": [0.0, 1.0]}, roughness=0.0))
 GROUP.case(
     "roughness-1",
     "Finite, and the gradient by the roughness is right, at the matt end.",
     _SCENE,
     "material",
     cheap=False,
-)(partial(surface, {"roughness": [0.0, 1.0]}, roughness=1.0, metallic=1.0))
+)(partial(extreme_surface, {"roughness": [0.0, 1.0]}, roughness=1.0, metallic=1.0))
 GROUP.case(
     "metallic-1",
     "Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
     _MOVED,
     "material",
     cheap=False,
-)(partial(surface, {"metallic": [0.0, 1.0]}, metallic=1.0))
+)(partial(extreme_surface, {"metallic": [0.0, 1.0]}, metallic=1.0))
 GROUP.case(
     "perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.", _MOVED, "material", cheap=False
-)(partial(surface, {"roughness": [0.0, 1.0], "metallic": [0.0, 1.0]}, roughness=0.0, metallic=1.0))
+)(partial(extreme_surface, {"roughness": [0.0, 1.0], "metallic": [0.0, 1.0]}, roughness=0.0, metallic=1.0))
 
 
 @GROUP.case(
@@ -92,12 +92,12 @@ GROUP.case(
 )
 def clear_glass() -> Outcome:
     """The object behind a ball of clear glass: light bends twice, and a texel still has its gradient."""
-    controls: Controls = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
+    controls: ControlSettings = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
     glass = behind_glass(controls)
     without = small("mug", controls)
     with torch.no_grad():
         moved = float((glass(glass.start, 0, 8) - without(without.start, 0, 8)).abs().mean())
-    return examine(glass).findings(Check("mean change of the picture by the glass", moved, least=0.01))
+    return examine_gradient(glass).findings(Check("mean change of the picture by the glass", moved, least=0.01))
 
 
 @GROUP.case(
@@ -112,7 +112,7 @@ def texels_at_the_ends() -> Outcome:
     texels = np.repeat(checks[:, :, None], 3, axis=2).astype(np.float32)
     mug = replace(library.load_object("mug"), name="checked", base_color=texels)
     renderer = small(mug, {"texture": {"resolution": 8, "epsilon": 0.2}})
-    seen = examine(renderer, compare=False)
+    seen = examine_gradient(renderer, compare=False)
     best = seen.result.best_u
     error = _inward_error(renderer)
     findings = seen.findings(

@@ -24,8 +24,8 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.engine.gradients import probes, reference, smooth_loss
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
-from advsearch.evaluation.stability.scene import REFERENCE_SPP, Controls, compared, examine, small
-from advsearch.evaluation.stability.search import Toy
+from advsearch.evaluation.stability.closed_form import Toy
+from advsearch.evaluation.stability.scene import REFERENCE_SPP, ControlSettings, compared, examine_gradient, small
 
 SAMPLES, GROUPS_OF_MEANS, CLIP = 24, 6, 3.0
 EXPERIMENTS = 4000
@@ -200,15 +200,15 @@ def _disturbance(kind: str, index: int, size: int, generator: torch.Generator) -
 )
 def one_sample() -> Outcome:
     """One sample a pixel: the mean of many gradients is that of a quiet one, and the denoiser takes such a picture."""
-    controls: Controls = {
+    controls: ControlSettings = {
         "texture": {"resolution": 8},
         "environment": {"exposure": [-1.0, 1.0]},
         "pose": {"y": [-0.3, 0.3]},
     }
     renderer = small("mug", controls)
-    seen = examine(renderer, compare=False, spp=1)
+    seen = examine_gradient(renderer, compare=False, spp=1)
     beside = compared(renderer, renderer.start, spp=1, repeats=48)
-    denoised = examine(small("mug", {"texture": {"resolution": 8}}, denoise="oidn"), compare=False, spp=1)
+    denoised = examine_gradient(small("mug", {"texture": {"resolution": 8}}, denoise="oidn"), compare=False, spp=1)
     findings = replace(seen, compared=beside).findings(
         holds("the denoised picture and its gradient are finite", denoised.finite)
     )

@@ -13,7 +13,7 @@ from advsearch.attacks import POLICIES, Ending, make_policy, search, verify
 from advsearch.attacks.evaluation import Evaluation, Query
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
-from advsearch.evaluation.stability.search import Toy, numbers, quadratic
+from advsearch.evaluation.stability.closed_form import Toy, box_domain, quadratic
 from advsearch.files import JsonObject
 from advsearch.models.model import Model, Preprocessing
 from advsearch.seeds import stream
@@ -125,7 +125,12 @@ def certain() -> Outcome:
         return FORMS["margin"](answer, IMAGE, LABELS)[0].double()
 
     flat = search(
-        partial(map, Toy(light, numbers([0.9]))), numbers([0.9]), make_policy("pgd"), steps=STEPS, seed=0, candidates=0
+        partial(map, Toy(light, box_domain([0.9]))),
+        box_domain([0.9]),
+        make_policy("pgd"),
+        steps=STEPS,
+        seed=0,
+        candidates=0,
     )
     found = logits_like([[200.0, -200.0, 0.0, -300.0], [-200.0, 200.0, 0.0, -300.0]])
     return Outcome(
@@ -149,7 +154,7 @@ def nan_at(steps: frozenset[int], *, ends: bool) -> Outcome:
     """The model answers NaN at some steps; every policy has to go on, or to give up where it is three in a row."""
     broken, endings, finite = [], set(), True
     for name in POLICIES:
-        toy = Toy(quadratic([0.7, 0.4], [1.0, 2.0]), numbers([0.2, 0.2]), broken=steps)
+        toy = Toy(quadratic([0.7, 0.4], [1.0, 2.0]), box_domain([0.2, 0.2]), broken=steps)
         policy = make_policy(name, **WITH_OPTIONS.get(name, {}))
         result = search(partial(map, toy), toy.domain, policy, steps=STEPS, seed=1, candidates=2, repeats=1)
         seen = len([one for one in result.history if one.step in steps])
@@ -178,11 +183,11 @@ GROUP.case("nan-three-times-in-a-row", "Every search ends as non-finite, with wh
 
 
 @GROUP.case("constant-model", "Nothing is found; policies that follow gradients end as stalled.", _FLAT)
-def constant() -> Outcome:
+def constant_model() -> Outcome:
     """A model whose answer never changes: nothing is found, and who follows gradients says that there are none."""
     wrong, endings = [], set()
     for name in POLICIES:
-        toy = Toy(lambda u: 0.0 * u.sum() - 1.0, numbers([0.2, 0.2]), threshold=0.0)
+        toy = Toy(lambda u: 0.0 * u.sum() - 1.0, box_domain([0.2, 0.2]), threshold=0.0)
         policy = make_policy(name, **WITH_OPTIONS.get(name, {}))
         result = search(partial(map, toy), toy.domain, policy, steps=STEPS, seed=1)
         endings.add(f"{result.ending.value}")
@@ -195,7 +200,7 @@ def constant() -> Outcome:
 def chance(rate: float, runs: int = 100) -> Outcome:
     """A model that answers at random, wrong with some probability: a search always claims something; nothing holds."""
     found = claimed = 0
-    domain = numbers([0.5, 0.5])
+    domain = box_domain([0.5, 0.5])
     for run in range(runs):
 
         def margin(seed: int) -> float:

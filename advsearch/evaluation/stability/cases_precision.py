@@ -23,8 +23,8 @@ from advsearch.attacks.policies.base import one_thread
 from advsearch.attacks.projections import project_l2_box
 from advsearch.engine.gradients import smooth_loss
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
-from advsearch.evaluation.stability.scene import SIZE, Controls, small
-from advsearch.evaluation.stability.search import Toy
+from advsearch.evaluation.stability.closed_form import Toy
+from advsearch.evaluation.stability.scene import SIZE, ControlSettings, small
 from advsearch.models import load_model
 from advsearch.scene.assets import Floats
 from advsearch.scene.formation import linear_to_srgb, to_8_bit
@@ -37,8 +37,8 @@ MOVES = 40
 LOGITS = 1e-3
 """Difference in logits that single precision may make: a thousandth of what noise moves a margin by."""
 BISECTIONS = 24
-TEXTURE: Controls = {"texture": {"resolution": 16}}
-SHIFT: Controls = {"pose": {"x": [-0.3, 0.3]}}
+TEXTURE: ControlSettings = {"texture": {"resolution": 16}}
+SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
 
 GROUP = CaseGroup("precision")
 

@@ -16,7 +16,7 @@ from advsearch.attacks import PGD, Adam, Auto, Policy, search
 from advsearch.attacks.evaluation import Query
 from advsearch.errors import InputError
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
-from advsearch.evaluation.stability.scene import Controls, Evaluator, domain_of, examine, small
+from advsearch.evaluation.stability.scene import ControlSettings, Evaluator, examine_gradient, search_domain, small
 from advsearch.scene.assets import EnvironmentAsset, Floats
 from advsearch.scene.environments import import_environment
 
@@ -54,11 +54,11 @@ def _map(value: float, texel: float | None = None) -> EnvironmentAsset:
 def bright_texel() -> Outcome:
     """A sky of 0.3 with one texel of 100,000, raw and denoised."""
     flash = _map(0.3, BRIGHT)
-    seen = examine(
+    seen = examine_gradient(
         small("mug", {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}, environment=flash)
     )
     turned = small("mug", {"environment": {"rotation": [0.0, 360.0]}}, environment=flash, denoise="oidn")
-    denoised = examine(turned, torch.tensor([0.31]), compare=False)
+    denoised = examine_gradient(turned, torch.tensor([0.31]), compare=False)
     return seen.findings(
         holds("the denoised picture and its gradient are finite", denoised.finite),
         Check("largest gradient by the rotation", denoised.gradient, least=1e-12),
@@ -70,7 +70,7 @@ def bright_texel() -> Outcome:
 )
 def black_environment() -> Outcome:
     """Nothing shines: the picture is black, no texel matters, and the search has to say that it is stuck."""
-    seen = examine(
+    seen = examine_gradient(
         small("mug", {"texture": {"resolution": 8}}, environment=_map(0.0)), compare=False, evaluations=PLATEAU_STEPS
     )
     return seen.findings(
@@ -89,11 +89,11 @@ def black_environment() -> Outcome:
 def lamp_in_the_dark() -> Outcome:
     """A black environment and a lamp: the lamp has to be able to light the scene."""
     controls = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z": 2.0}}
-    seen = examine(small("mug", controls, environment=_map(0.0)), torch.tensor([0.5]))
+    seen = examine_gradient(small("mug", controls, environment=_map(0.0)), torch.tensor([0.5]))
     return seen.findings(Check("mean of the picture", seen.mean, least=0.01))
 
 
-def refused(value: float, *, as_file: bool) -> Outcome:
+def refused_texel(value: float, *, as_file: bool) -> Outcome:
     """A texel that is no light, in a file or in an array, has to be refused in a sentence."""
     radiance = _radiance(0.3, value)
     try:
@@ -120,18 +120,18 @@ for word, value in (("negative", -1.0), ("infinite", np.inf), ("nan", np.nan)):
             "The map is refused before anything is rendered.",
             _REFUSED if as_file else _ASSET,
             "environment",
-        )(partial(refused, value, as_file=as_file))
+        )(partial(refused_texel, value, as_file=as_file))
 
 
-def exposure(control: str, stops: float) -> Outcome:
+def extreme_exposure(control: str, stops: float) -> Outcome:
     """A picture ten stops over or under."""
     low, high = sorted((stops, stops - np.sign(stops)))
     share = 1.0 if stops > 0.0 else 0.0
-    controls: Controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
+    controls: ControlSettings = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
     renderer = small("mug", controls)
     u = renderer.start.clone()
     u[0] = share
-    return examine(renderer, u).findings()
+    return examine_gradient(renderer, u).findings()
 
 
 for control in ("camera", "environment"):
@@ -142,7 +142,7 @@ for control in ("camera", "environment"):
             _SCENE,
             f"{control}, texture",
             cheap=control == "camera",
-        )(partial(exposure, control, stops))
+        )(partial(extreme_exposure, control, stops))
 
 
 def plateau(low: float, high: float) -> Outcome:
@@ -161,7 +161,7 @@ def plateau(low: float, high: float) -> Outcome:
     for policy in POLICIES:
         evaluate = Evaluator(renderer, darkness, 2)
         found = search(
-            partial(map, evaluate), domain_of(renderer, start), policy, steps=PLATEAU_STEPS, seed=0, candidates=0
+            partial(map, evaluate), search_domain(renderer, start), policy, steps=PLATEAU_STEPS, seed=0, candidates=0
         )
         flat += sum(record.gradient_norm == 0.0 for record in found.history)
         checks.append(Check(f"{policy.name} finds a picture that is not white", float(found.best_objective > 0), 1, 1))

@@ -19,8 +19,23 @@ from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
 from advsearch.engine.gradients import smooth_loss
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome
-from advsearch.evaluation.stability.scene import SHARPNESS, Controls, Evaluator, domain_of, examine, small
-from advsearch.evaluation.stability.search import Toy, Value, condition_number, hessian, numbers, quadratic, valley
+from advsearch.evaluation.stability.closed_form import (
+    Toy,
+    Value,
+    box_domain,
+    condition_number,
+    hessian,
+    quadratic,
+    valley,
+)
+from advsearch.evaluation.stability.scene import (
+    SHARPNESS,
+    ControlSettings,
+    Evaluator,
+    examine_gradient,
+    search_domain,
+    small,
+)
 from advsearch.scene.renderer import Renderer
 
 STEPS = 100
@@ -98,7 +113,7 @@ def _lamp_and_rotation(watt: float, degree: float) -> Toy:
         return -((watts - 7.3) ** 2) - 0.01 * (degrees - 33.0 - 2.0 * watts) ** 2
 
     start = [to_unit(ranges[0], False, watt), to_unit(ranges[1], False, 10.0 * degree)]
-    return Toy(value, numbers(start))
+    return Toy(value, box_domain(start))
 
 
 @GROUP.case(
@@ -112,7 +127,7 @@ def objective_units() -> Outcome:
     for name in ("pgd", "adam", "cmaes", "nes", "auto"):
         paths = []
         for scale in (1.0, 1e-6, 1e6):
-            toy = Toy(quadratic([0.7, 0.4], [1.0, 30.0]), numbers([0.1, 0.9]), scale=scale)
+            toy = Toy(quadratic([0.7, 0.4], [1.0, 30.0]), box_domain([0.1, 0.9]), scale=scale)
             paths.append(path(toy, make_policy(name), steps=60)[1])
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
     return Outcome((Check("largest distance of two trajectories in u", worst, most=SAME),), True, worst)
@@ -155,7 +170,7 @@ def _until_there(name: str, value: Value, start: list[float], peak: list[float],
 
     counts = []
     for seed in range(SEEDS):
-        _, seen = path(Toy(value, numbers(start), disturb=disturb), make_policy(name), seed=seed)
+        _, seen = path(Toy(value, box_domain(start), disturb=disturb), make_policy(name), seed=seed)
         near = ((seen - torch.tensor(peak)).abs().amax(dim=1) <= CLOSE).nonzero()
         counts.append(float(near[0]) + 1.0 if len(near) else math.inf)
     return sum(counts) / len(counts)
@@ -196,7 +211,7 @@ def curved_valley(steps: int = 400) -> Outcome:
     start, measured = [0.2, 0.75], {}
     for name in ("random", "auto", "pgd", "adam", "cmaes"):
         gaps = sorted(
-            -path(Toy(valley, numbers(start)), make_policy(name), steps=steps, seed=seed)[0].best_objective
+            -path(Toy(valley, box_domain(start)), make_policy(name), steps=steps, seed=seed)[0].best_objective
             for seed in range(SEEDS)
         )
         measured[f"{name}: median gap"] = gaps[len(gaps) // 2]
@@ -232,7 +247,9 @@ def wide_box(width: float = 1e-3) -> Outcome:
     checks, measured = [], {}
     for name in ("auto", "pgd", "adam", "cmaes", "random"):
         gaps = sorted(
-            float((path(Toy(value, numbers(start)), make_policy(name), steps=150, seed=s)[0].best_u[1] - peak[1]).abs())
+            float(
+                (path(Toy(value, box_domain(start)), make_policy(name), steps=150, seed=s)[0].best_u[1] - peak[1]).abs()
+            )
             for s in range(SEEDS)
         )
         measured[f"{name}: median distance"] = gaps[len(gaps) // 2]
@@ -258,7 +275,7 @@ def wide_range() -> Outcome:
         for one, width in ((wide, 2e4), (narrow, 0.6))
     ]
     error = float((slopes[0] / slopes[1] - 1.0).abs())
-    found = examine(wide, compare=False)
+    found = examine_gradient(wide, compare=False)
     return replace(
         found.findings(Check("error of the derivative per object size", error, most=0.2)),
         relative_error=error,
@@ -278,7 +295,7 @@ def wide_range() -> Outcome:
 )
 def light_rotation_texel() -> Outcome:
     """A lamp's power beside a rotation beside texels, rendered: how stiff it is, and whether each of them moves."""
-    controls: Controls = {
+    controls: ControlSettings = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
         "pose": {"yaw": [0.0, 360.0]},
         "texture": {"resolution": 2},
@@ -300,7 +317,7 @@ def light_rotation_texel() -> Outcome:
     units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
     (result, walked), (_, again) = (_walk(renderer, u, loss, scale) for scale in (1.0, RATIO))
     moved = (walked - walked[0]).abs().amax(dim=0)
-    found = examine(renderer, u, compare=False)
+    found = examine_gradient(renderer, u, compare=False)
     measured = {
         "condition number in u": condition_number(second),
         "condition number in watts, degrees and sRGB": condition_number(units @ second @ units),
@@ -329,5 +346,7 @@ def _walk(renderer: Renderer, u: Tensor, loss: Value, scale: float) -> tuple[Sea
         seen.append(at)
 
     evaluate = Evaluator(renderer, scaled, 8)
-    result = search(partial(map, evaluate), domain_of(renderer, u), PGD(), steps=18, seed=0, candidates=0, on_step=note)
+    result = search(
+        partial(map, evaluate), search_domain(renderer, u), PGD(), steps=18, seed=0, candidates=0, on_step=note
+    )
     return result, torch.stack(seen)

@@ -44,12 +44,12 @@ CONFIDENCE = 2.5
 SHARPNESS = 20.0
 """Logits per unit of the linear loss that the searched model answers with."""
 
-Controls = Mapping[str, Mapping[str, object]]
+ControlSettings = Mapping[str, Mapping[str, object]]
 
 
 def small(
     object: str | Path | ObjectAsset,
-    controls: Controls,
+    controls: ControlSettings,
     *,
     environment: str | Path | EnvironmentAsset | None = None,
     settings: Mapping[str, float] | None = None,
@@ -168,7 +168,7 @@ def dark() -> ObjectAsset:
     return replace(library.load_object("mug"), name="dark-mug", base_color=np.full((4, 4, 3), 0.02, np.float32))
 
 
-def examine(
+def examine_gradient(
     renderer: Renderer,
     u: Tensor | None = None,
     *,
@@ -260,7 +260,7 @@ def searched(renderer: Renderer, u: Tensor, evaluations: int, policy: Policy[Any
     def margin(image: Tensor) -> Tensor:
         return SHARPNESS * (loss(image) - here) - 1.0
 
-    domain = domain_of(renderer, u)
+    domain = search_domain(renderer, u)
     steps = evaluations * (1 + domain.gradient_cost) + 1
     return search(
         partial(map, Evaluator(renderer, margin, spp)), domain, policy, steps=steps, seed=0, candidates=1, repeats=1
@@ -288,7 +288,7 @@ class Evaluator:
         return Evaluation(objective, derivative, objective > 0.0, renderer.non_finite - bad, cost)
 
 
-def domain_of(renderer: Renderer, start: Tensor | None = None) -> Domain:
+def search_domain(renderer: Renderer, start: Tensor | None = None) -> Domain:
     """Return where a search of a renderer's space may look, from its start or another one."""
     space = renderer.space
     assert isinstance(space, Space)

@@ -13,7 +13,7 @@ from advsearch.errors import FileFormatError, UnknownNameError
 from advsearch.recipes.figures.agreement import AGREEMENT
 from advsearch.recipes.figures.answers import ANSWERS
 from advsearch.recipes.figures.bars import BARS
-from advsearch.recipes.figures.base import Kind, Options
+from advsearch.recipes.figures.base import FigureKind, Options
 from advsearch.recipes.figures.corruptions import CORRUPTION_ERROR
 from advsearch.recipes.figures.cues import CUES
 from advsearch.recipes.figures.curve import CURVE
@@ -29,7 +29,7 @@ from advsearch.runs.results.recipe import RecipeFigure
 MODEL = "model"
 """The column that says which model answered."""
 
-FIGURES: dict[str, Kind[Any, Any]] = {
+FIGURES: dict[str, FigureKind[Any, Any]] = {
     "bars": BARS,
     "heat map": HEAT_MAP,
     "curve": CURVE,
@@ -84,7 +84,7 @@ def compute(table: Table, kind: str, options: Options) -> list[RecipeFigure]:
     return found
 
 
-def draw(made: RecipeFigure, run: Path) -> Figures:
+def draw_figure(made: RecipeFigure, run: Path) -> Figures:
     """Return a figure as files; `run` is the recipe's folder."""
     kind = FIGURES[made.figure]
     return drawn(lambda figure: kind.draw(made, figure, run), kind.size(made))

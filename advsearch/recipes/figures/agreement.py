@@ -14,7 +14,7 @@ from pydantic import Field
 
 from advsearch.errors import InputError
 from advsearch.recipes.description import PHOTOGRAPHS
-from advsearch.recipes.figures.base import Kind, Options, rate
+from advsearch.recipes.figures.base import FigureKind, Options, rate_with_interval
 from advsearch.recipes.figures.curve import COLOURS, MARKS
 from advsearch.recipes.table import Answered, Table, count_of
 from advsearch.report.phrases import percent
@@ -26,7 +26,7 @@ NO_PHOTOGRAPHS = (
 )
 ALL = "all objects"
 
-Pair = tuple[Answered, Answered]
+AnswerPair = tuple[Answered, Answered]
 
 
 class AgreementOptions(Options):
@@ -89,7 +89,7 @@ def _key(row: Answered, names: Sequence[str]) -> Hashable:
     return tuple(row.values.get(name) for name in names)
 
 
-def _count(name: str, pairs: Sequence[Pair]) -> AgreementCount:
+def _count(name: str, pairs: Sequence[AnswerPair]) -> AgreementCount:
     counts = {
         (a, b): sum((x.correct, y.correct) == (a, b) for x, y in pairs) for a in (True, False) for b in (True, False)
     }
@@ -108,7 +108,7 @@ def _said(one: AgreementSeries) -> list[str]:
     total, said = one.total, []
     if total.agreeing.configurations:
         said.append(
-            f"Renderings and {one.name}: {rate(total.agreeing, 'right about both or wrong about both')}. "
+            f"Renderings and {one.name}: {rate_with_interval(total.agreeing, 'right about both or wrong about both')}. "
             f"{_share('right', total.right_right, total.right_wrong)} "
             f"{_share('wrong', total.wrong_wrong, total.wrong_right)} The answer is the same in "
             f"{total.same_answer} of {total.agreeing.configurations} "
@@ -125,9 +125,8 @@ def _said(one: AgreementSeries) -> list[str]:
 def _share(verb: str, same: int, other: int) -> str:
     if not same + other:
         return f"It is {verb} about none of the renderings."
-    return (
-        f"Where it is {verb} about the rendering, it is {rate(count_of('', same, same + other), verb)} about the other."
-    )
+    counted = rate_with_interval(count_of("", same, same + other), verb)
+    return f"Where it is {verb} about the rendering, it is {counted} about the other."
 
 
 def _draw(made: AgreementFigure, figure: Any, run: Path) -> None:
@@ -149,7 +148,7 @@ def _draw(made: AgreementFigure, figure: Any, run: Path) -> None:
     figure.legend(loc="outside lower center", ncols=1)
 
 
-AGREEMENT = Kind(
+AGREEMENT = FigureKind(
     AgreementOptions,
     AgreementFigure,
     _compute,

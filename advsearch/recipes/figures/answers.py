@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.recipes.figures.base import Kind, Options, plural
+from advsearch.recipes.figures.base import FigureKind, Options, plural
 from advsearch.recipes.table import Answered, Table, count_of, counted, most_frequent
 from advsearch.report.drawing import BLUE, GREY, RED
 from advsearch.report.phrases import percent
@@ -88,4 +88,4 @@ def _draw(made: AnswersFigure, figure: Any, run: Path) -> None:
     axes.set_title(made.title)
 
 
-ANSWERS = Kind(AnswersOptions, AnswersFigure, _compute, _draw, lambda made: (6.4, 1.2 + 0.3 * len(made.rows)))
+ANSWERS = FigureKind(AnswersOptions, AnswersFigure, _compute, _draw, lambda made: (6.4, 1.2 + 0.3 * len(made.rows)))

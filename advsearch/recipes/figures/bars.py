@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from advsearch.recipes.figures.base import Kind, Options, counted_by, extremes, plural
+from advsearch.recipes.figures.base import FigureKind, Options, counted_by, extremes, plural
 from advsearch.recipes.table import Table
 from advsearch.report.drawing import BLUE
 from advsearch.runs.results.recipe import BarsFigure
@@ -47,7 +47,7 @@ def _draw(made: BarsFigure, figure: Any, run: Path) -> None:
     axes.grid(True, axis="x")
 
 
-BARS = Kind(
+BARS = FigureKind(
     BarsOptions,
     BarsFigure,
     _compute,

@@ -38,11 +38,11 @@ class Options(BaseModel):
 
 
 Chosen = TypeVar("Chosen", bound=Options)
-Made = TypeVar("Made", bound=RecipeFigure)
+FigureType = TypeVar("FigureType", bound=RecipeFigure)
 
 
 @dataclass(frozen=True)
-class Kind(Generic[Chosen, Made]):
+class FigureKind(Generic[Chosen, FigureType]):
     """One kind of figure.
 
     Attributes:
@@ -55,14 +55,14 @@ class Kind(Generic[Chosen, Made]):
     """
 
     options: type[Chosen]
-    result: type[Made]
-    compute: Callable[[Table, Chosen], Made]
-    draw: Callable[[Made, Any, Path], None]
-    size: Callable[[Made], tuple[float, float]]
+    result: type[FigureType]
+    compute: Callable[[Table, Chosen], FigureType]
+    draw: Callable[[FigureType, Any, Path], None]
+    size: Callable[[FigureType], tuple[float, float]]
     tells_models: bool = False
 
 
-def rate(one: NamedCount, verb: str = "right") -> str:
+def rate_with_interval(one: NamedCount, verb: str = "right") -> str:
     """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is counted."""
     return (
         f"{verb} in {one.correct} of {one.configurations} "
@@ -85,13 +85,14 @@ def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str, ve
     """
     known = [one for one in counts if one.configurations]
     if len(known) < 2:
-        return [f"{one.name}: {rate(one, verb)}." for one in known]
+        return [f"{one.name}: {rate_with_interval(one, verb)}." for one in known]
     low, high = (pick(known, key=lambda one: one.accuracy or 0.0) for pick in (min, max))
     if low.accuracy == high.accuracy:
         return [f"All {len(known)} {thing} have the same share, {percent(low.accuracy)}: no difference is shown."]
-    said = f"{worst} {_tied(low, known)}: {rate(low, verb)}; {best} {_tied(high, known)}: {rate(high, verb)}."
+    least, most = rate_with_interval(low, verb), rate_with_interval(high, verb)
+    said = f"{worst} {_tied(low, known)}: {least}; {best} {_tied(high, known)}: {most}."
     widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
-    if apart(low, high, len(known)):
+    if intervals_apart(low, high, len(known)):
         return [said, f"The difference is shown: {widened} do not overlap."]
     return [said, f"No difference between the {thing} is shown: {widened} overlap."]
 
@@ -102,7 +103,7 @@ def _tied(one: NamedCount, counts: Sequence[NamedCount]) -> str:
     return f"is {one.name}" + (f" (as {others} other{'s' if others > 1 else ''})" if others else "")
 
 
-def apart(low: NamedCount, high: NamedCount, among: int = 1) -> bool:
+def intervals_apart(low: NamedCount, high: NamedCount, among: int = 1) -> bool:
     """Return whether the intervals of two rates do not overlap, each widened for a choice among so many."""
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(among, 1)
     _, top = clopper_pearson(low.correct, low.configurations, confidence)

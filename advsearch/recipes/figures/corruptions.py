@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.recipes.figures.base import Kind, Options, apart, extremes, rate
+from advsearch.recipes.figures.base import FigureKind, Options, extremes, intervals_apart, rate_with_interval
 from advsearch.recipes.figures.curve import COLOURS
 from advsearch.recipes.table import Answered, Table, count_of
 from advsearch.runs.results.recipe import CorruptionFigure, CorruptionModel, NamedCount
@@ -69,12 +69,14 @@ def _relative(errors: Sequence[NamedCount], base: CorruptionModel) -> float | No
 
 def _said(one: CorruptionModel, first: str) -> list[str]:
     """The mean error with the interval of its pictures, which are as many of each corruption."""
-    said = [f"{one.model}: {rate(one.error, 'wrong')}, the mean corruption error."]
+    said = [f"{one.model}: {rate_with_interval(one.error, 'wrong')}, the mean corruption error."]
     if one.clean is not None:
         more = (
-            "That is more than without" if apart(one.clean, one.error) else "No difference is shown to pictures without"
+            "That is more than without"
+            if intervals_apart(one.clean, one.error)
+            else "No difference is shown to pictures without"
         )
-        said.append(f"{more}: {rate(one.clean, 'wrong')}.")
+        said.append(f"{more}: {rate_with_interval(one.clean, 'wrong')}.")
     if one.relative is not None:
         said.append(f"Relative to {first}, which takes the place of AlexNet, its mCE is {one.relative:.0f} %.")
     return [*said, *extremes(one.errors, "The most harmless", "the most harmful", "corruptions", "wrong")]
@@ -103,7 +105,7 @@ def _draw(made: CorruptionFigure, figure: Any, run: Path) -> None:
         figure.legend(loc="outside lower center", ncols=min(len(made.models), 2))
 
 
-CORRUPTION_ERROR = Kind(
+CORRUPTION_ERROR = FigureKind(
     CorruptionOptions,
     CorruptionFigure,
     _compute,

@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.recipes.figures.base import Kind, Options, extremes, rate
+from advsearch.recipes.figures.base import FigureKind, Options, extremes, rate_with_interval
 from advsearch.recipes.table import Answered, Table, count_of, counted
 from advsearch.report.drawing import BLUE, RED
 from advsearch.report.phrases import percent
@@ -127,11 +127,11 @@ def _mean(cells: Sequence[_Cell]) -> float:
 def _by_texture(table: Table, options: CuesOptions, rows: list[CuesRow]) -> list[str]:
     shape = count_of("by shape", sum(one.correct for one in rows), sum(one.configurations for one in rows))
     asked = [one for one in rows if options.classes.get(one.name)]
-    said = [f"The answer is the object, whatever its texture: {rate(shape, 'so')}."]
+    said = [f"The answer is the object, whatever its texture: {rate_with_interval(shape, 'so')}."]
     if asked:
         named = count_of("by texture", sum(one.textured for one in asked), sum(one.configurations for one in asked))
         known = ", ".join(one.name for one in asked)
-        said.append(f"The answer names the texture ({known}): {rate(named, 'so')}.")
+        said.append(f"The answer names the texture ({known}): {rate_with_interval(named, 'so')}.")
         if not named.correct:
             said.append("A model that has no class for a texture cannot name it.")
     return said
@@ -183,4 +183,4 @@ def _draw(made: CuesFigure, figure: Any, run: Path) -> None:
     figure.legend(loc="outside lower center", ncols=2, title="the answer names")
 
 
-CUES = Kind(CuesOptions, CuesFigure, _compute, _draw, lambda made: (6.0, 1.7 + 0.27 * len(made.rows)))
+CUES = FigureKind(CuesOptions, CuesFigure, _compute, _draw, lambda made: (6.0, 1.7 + 0.27 * len(made.rows)))

@@ -9,9 +9,9 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.recipes.figures.base import Kind, Options, extremes, plural
+from advsearch.recipes.figures.base import FigureKind, Options, extremes, plural
 from advsearch.recipes.figures.trend import fall_of, said
-from advsearch.recipes.table import Answered, Table, count_of, written
+from advsearch.recipes.table import Answered, Table, count_of, figure_value
 from advsearch.report.drawing import BLUE, GREY, RED
 from advsearch.runs.results.recipe import CurveBin, CurveFigure, CurveLine, NamedCount
 
@@ -89,7 +89,9 @@ def _said(line: CurveLine, along: str, unit: str, lines: int) -> list[str]:
 
 
 def _span(one: CurveBin, unit: str) -> str:
-    return f"{written(one.low)} to {written(one.high)}" + (f" {unit}" if unit not in ("", "1", "name") else "")
+    return f"{figure_value(one.low)} to {figure_value(one.high)}" + (
+        f" {unit}" if unit not in ("", "1", "name") else ""
+    )
 
 
 def _between(lines: Sequence[CurveLine], by: str | None) -> list[str]:
@@ -115,7 +117,7 @@ def _trend(
         for name, rows in groups.items()
     ]
     named = "" if unit in ("", "1", "name") else f" {unit}"
-    near = f"within {written(halfway)}{named} of {written(middle)}"
+    near = f"within {figure_value(halfway)}{named} of {figure_value(middle)}"
     return said([one for one in falls if one], options.along, near)
 
 
@@ -137,4 +139,4 @@ def _draw(made: CurveFigure, figure: Any, run: Path) -> None:
         figure.legend(loc="outside lower center", ncols=min(len(made.lines), 4))
 
 
-CURVE = Kind(CurveOptions, CurveFigure, _compute, _draw, lambda made: (6.0, 3.4))
+CURVE = FigureKind(CurveOptions, CurveFigure, _compute, _draw, lambda made: (6.0, 3.4))

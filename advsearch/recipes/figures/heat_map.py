@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from advsearch.recipes.figures.base import Kind, Options, extremes, plural, rate
+from advsearch.recipes.figures.base import FigureKind, Options, extremes, plural, rate_with_interval
 from advsearch.recipes.table import Table, count_of
 from advsearch.report.recipes import bare
 from advsearch.runs.results.recipe import HeatMapFigure, NamedCount
@@ -61,7 +61,9 @@ def _said(cells: list[NamedCount], rows: str, columns: str) -> list[str]:
     known = [one for one in cells if one.configurations]
     none = [one for one in known if one.correct == 0]
     enough = [one for one in none if one.configurations >= ENOUGH]
-    some = "; ".join(f"{one.name} ({rate(one)})" for one in enough[:4]) + ("; and others" if len(enough) > 4 else "")
+    some = "; ".join(f"{one.name} ({rate_with_interval(one)})" for one in enough[:4]) + (
+        "; and others" if len(enough) > 4 else ""
+    )
     said = [f"No answer is right in {len(enough)} of {len(known)} pairs: {some}."] if enough else []
     if few := len(none) - len(enough):
         have = "have" if few > 1 else "has"
@@ -89,7 +91,7 @@ def _draw(made: HeatMapFigure, figure: Any, run: Path) -> None:
     figure.colorbar(shown, ax=axes, label="accuracy [%]", format=lambda share, _: f"{100 * share:.0f}")
 
 
-HEAT_MAP = Kind(
+HEAT_MAP = FigureKind(
     HeatMapOptions,
     HeatMapFigure,
     _compute,

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.recipes.figures.base import Kind, Options, apart, counted_by, rate
+from advsearch.recipes.figures.base import FigureKind, Options, counted_by, intervals_apart, rate_with_interval
 from advsearch.recipes.figures.curve import COLOURS, MARKS
 from advsearch.recipes.table import Table, count_of
 from advsearch.runs.results.recipe import NamedCount, PointsFigure
@@ -55,12 +55,12 @@ def _called(one: NamedCount | None, name: str, names: dict[str, str]) -> NamedCo
 
 def _said(rows: list[str], counts: list[list[NamedCount]], totals: list[NamedCount]) -> list[str]:
     """Each series against the first, over all rows and in each."""
-    said = ["; ".join(f"{one.name}: {rate(one)}" for one in totals if one.configurations) + "."]
+    said = ["; ".join(f"{one.name}: {rate_with_interval(one)}" for one in totals if one.configurations) + "."]
     for place, other in enumerate(totals[1:], start=1):
         pairs = [(name, row[0], row[place]) for name, row in zip(rows, counts, strict=True)]
         known = [(name, a, b) for name, a, b in pairs if a.configurations and b.configurations]
-        lower = [name for name, a, b in known if apart(b, a, len(known))]
-        higher = [name for name, a, b in known if apart(a, b, len(known))]
+        lower = [name for name, a, b in known if intervals_apart(b, a, len(known))]
+        higher = [name for name, a, b in known if intervals_apart(a, b, len(known))]
         unshown = [name for name, _, _ in known if name not in (*lower, *higher)]
         told = [f"lower for {', '.join(lower)}"] if lower else []
         told += [f"higher for {', '.join(higher)}"] if higher else []
@@ -89,4 +89,4 @@ def _draw(made: PointsFigure, figure: Any, run: Path) -> None:
     figure.legend(loc="outside lower center", ncols=min(len(made.names), 3))
 
 
-POINTS = Kind(PointsOptions, PointsFigure, _compute, _draw, lambda made: (6.0, 1.5 + 0.34 * len(made.rows)))
+POINTS = FigureKind(PointsOptions, PointsFigure, _compute, _draw, lambda made: (6.0, 1.5 + 0.34 * len(made.rows)))

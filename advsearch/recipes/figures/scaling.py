@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.errors import InputError
-from advsearch.recipes.figures.base import Kind, Options
-from advsearch.recipes.table import WORKERS, Answered, Table, written
+from advsearch.recipes.figures.base import FigureKind, Options
+from advsearch.recipes.table import WORKERS, Answered, Table, figure_value
 from advsearch.report.drawing import BLUE
 from advsearch.runs.results.recipe import ScalingFigure, ScalingPoint
 
@@ -95,7 +95,7 @@ def _draw(made: ScalingFigure, figure: Any, run: Path) -> None:
     for one in made.points:
         axes.plot([one.workers] * 2, [min(one.rates), max(one.rates)], color=BLUE, alpha=0.45, linewidth=3)
     axes.plot(workers, middle, "o-", color=BLUE, ms=5, label="median; bar: lowest to highest run")
-    axes.set_xticks(workers, [written(float(count)) for count in workers])
+    axes.set_xticks(workers, [figure_value(float(count)) for count in workers])
     top = max([*linear, *(rate for one in made.points for rate in one.rates)])
     axes.set(xlabel="workers", ylabel="pictures a second", ylim=(0.0, 1.08 * top))
     axes.set_title(made.title)
@@ -103,4 +103,4 @@ def _draw(made: ScalingFigure, figure: Any, run: Path) -> None:
     figure.legend(loc="outside lower center", ncols=2)
 
 
-SCALING = Kind(Options, ScalingFigure, _compute, _draw, lambda made: (6.0, 3.4), tells_models=True)
+SCALING = FigureKind(Options, ScalingFigure, _compute, _draw, lambda made: (6.0, 3.4), tells_models=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.errors import InputError
-from advsearch.recipes.figures.base import Kind, Options
+from advsearch.recipes.figures.base import FigureKind, Options
 from advsearch.recipes.table import Table
 from advsearch.report.surface_words import surface_sentences
 from advsearch.runs.directory import IMAGES, PARTS
@@ -36,6 +36,6 @@ def _draw(made: SurfaceFigure, figure: Any, run: Path) -> None:
         axes.axis("off")
 
 
-SURFACE = Kind(
+SURFACE = FigureKind(
     Options, SurfaceFigure, _compute, _draw, lambda made: (SIZE[0], SIZE[1] * len(made.maps)), tells_models=True
 )

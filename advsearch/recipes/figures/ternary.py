@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.recipes.figures.base import CONFIDENCE, Kind, Options, extremes
+from advsearch.recipes.figures.base import CONFIDENCE, FigureKind, Options, extremes
 from advsearch.recipes.table import Answered, Table, count_of, most_frequent
 from advsearch.report.phrases import percent
 from advsearch.report.recipes import bare
@@ -221,4 +221,6 @@ def _place(shares: Shares) -> tuple[float, float]:
     return shares[1] + shares[2] / 2.0, shares[2] * math.sqrt(3.0) / 2.0
 
 
-TERNARY = Kind(TernaryOptions, TernaryFigure, _compute, _draw, lambda made: (max(2.4 * len(made.answers), 4.8), 3.5))
+TERNARY = FigureKind(
+    TernaryOptions, TernaryFigure, _compute, _draw, lambda made: (max(2.4 * len(made.answers), 4.8), 3.5)
+)

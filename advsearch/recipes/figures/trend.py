@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from advsearch.recipes.figures.base import rate
+from advsearch.recipes.figures.base import rate_with_interval
 from advsearch.recipes.table import Answered, count_of
 from advsearch.runs.results.base import Interval
 from advsearch.runs.results.recipe import NamedCount
@@ -90,6 +90,6 @@ def _fall(one: Fall, along: str, near: str) -> str:
     low, high = one.interval
     verdict = "it falls" if low > 0.0 else "it rises" if high < 0.0 else "no fall is shown"
     return (
-        f"{rate(one.near)} where {along} is {near}, {rate(one.far)} elsewhere; accuracy falls by {100 * one.fall:.0f} "
-        f"points (95 % interval {100 * low:.0f} to {100 * high:.0f}): {verdict}."
+        f"{rate_with_interval(one.near)} where {along} is {near}, {rate_with_interval(one.far)} elsewhere; "
+        f"accuracy falls by {100 * one.fall:.0f} points (95 % interval {100 * low:.0f} to {100 * high:.0f}): {verdict}."
     )

@@ -12,7 +12,7 @@ from advsearch.runs.results.base import (
     Fields,
     Formation,
     Interval,
-    Number,
+    JsonFloat,
     Payload,
     SceneResult,
     VariedValue,
@@ -40,7 +40,7 @@ class PicturedAnswer(Fields):
 
     label: str
     index: int | None = Field(description="of the class")
-    probability: Number | None = Field(description="of this answer; of a detector the score of the box")
+    probability: JsonFloat | None = Field(description="of this answer; of a detector the score of the box")
     payload: Payload = Field(default=None, description="what else the task keeps of it; absent without")
     trial: int | None = Field(
         default=None, description="number of the trial, the same for both pictures; absent where nothing was tried"
@@ -73,17 +73,17 @@ class VerifiedRate(Fields):
     interval: Interval
     spp: int = Field(description="samples a pixel")
     labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
-    margin: Number = Field(description="mean over these trials, in logits; of a detector in log-odds")
+    margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
     not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
 class ObjectiveValues(Fields):
     """The objective over some trials, in its own unit."""
 
-    mean: Number
-    deviation: Number = Field(description="standard deviation of one trial")
-    low: Number = Field(description="the least")
-    high: Number = Field(description="the most")
+    mean: JsonFloat
+    deviation: JsonFloat = Field(description="standard deviation of one trial")
+    low: JsonFloat = Field(description="the least")
+    high: JsonFloat = Field(description="the most")
 
 
 class TriedObjective(Fields):
@@ -108,8 +108,8 @@ class AverageCase(Fields):
     correct: int = Field(description="how many the model got right")
     accuracy: float
     interval: Interval
-    margin: Number = Field(description="the mean, in logits")
-    worst_margin: Number = Field(description="the largest, in logits")
+    margin: JsonFloat = Field(description="the mean, in logits")
+    worst_margin: JsonFloat = Field(description="the largest, in logits")
 
 
 class SmallestEpsilon(Fields):
@@ -135,7 +135,7 @@ class DifferentFailure(Fields):
 
     ranges: dict[str, tuple[float, float] | str] = Field(description="from, to; of a discrete choice its option")
     configuration: dict[str, DescribedValue]
-    objective: Number = Field(description="of the one render that won; biased upwards")
+    objective: JsonFloat = Field(description="of the one render that won; biased upwards")
     holds: bool | None = Field(description="whether it is verified; null if it was not tried")
     verified: VerifiedRate | None = Field(description="trials that ended as soon as that was clear; null: not tried")
     picture: str | None = Field(description="the first of these trials; null if there is none")
@@ -174,16 +174,16 @@ class VerificationSamples(Fields):
 class SearchClaim(Fields):
     """What the search itself believes."""
 
-    objective: Number = Field(description="of the one render that won")
-    re_evaluated: Number = Field(description="its mean when rendered again")
-    success_rate: Number = Field(description="of these renders")
+    objective: JsonFloat = Field(description="of the one render that won")
+    re_evaluated: JsonFloat = Field(description="its mean when rendered again")
+    success_rate: JsonFloat = Field(description="of these renders")
 
 
 class SearchGradients(Fields):
     """What the search saw of its gradients."""
 
     count: int
-    cosine_with_the_one_before: Number | None = Field(description="the median: noise, and the way between")
+    cosine_with_the_one_before: JsonFloat | None = Field(description="the median: noise, and the way between")
     zero: int
     cut: int = Field(description="of which single numbers were outliers and cut")
     shortened: int = Field(description="outliers as a whole")
@@ -207,8 +207,8 @@ class NotFinite(Fields):
 class PredictionError(Fields):
     """How far a predicted picture was from a traced one, at the last comparison."""
 
-    levels: Number = Field(description="of 255: of the change of the picture, root mean square")
-    logits: Number = Field(description="of the objective")
+    levels: JsonFloat = Field(description="of 255: of the change of the picture, root mean square")
+    logits: JsonFloat = Field(description="of the objective")
 
 
 class BankOfConditions(Fields):
@@ -248,9 +248,9 @@ class PrintCost(Fields):
     """
 
     steps: int = Field(description="evaluations of the search without the terms")
-    margin_with: Number = Field(description="of the run's answer, in logits")
-    margin_without: Number = Field(description="of the answer of the search without the terms, in logits")
-    cost: Number = Field(description="the second less the first, in logits")
+    margin_with: JsonFloat = Field(description="of the run's answer, in logits")
+    margin_without: JsonFloat = Field(description="of the answer of the search without the terms, in logits")
+    cost: JsonFloat = Field(description="the second less the first, in logits")
     verified: VerifiedRate = Field(description="trials of the answer of the search without the terms")
     terms: PrintTerms = Field(description="of that answer")
 
@@ -273,10 +273,10 @@ class SharedWork(Fields):
     refused: int = Field(description="that could not do it")
     retried: int = Field(description="batches that were given out again")
     batches: int = Field(description="batches that came back")
-    busy: Number = Field(description="seconds that workers were at batches")
-    loading: Number = Field(description="seconds that they loaded scenes and models")
-    alive: Number = Field(description="seconds that they were there and ready")
-    utilisation: Number | None = Field(description="`busy` over `alive`")
+    busy: JsonFloat = Field(description="seconds that workers were at batches")
+    loading: JsonFloat = Field(description="seconds that they loaded scenes and models")
+    alive: JsonFloat = Field(description="seconds that they were there and ready")
+    utilisation: JsonFloat | None = Field(description="`busy` over `alive`")
     machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
 
     @classmethod

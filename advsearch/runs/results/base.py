@@ -24,10 +24,10 @@ INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"
 END = ("warnings", "seconds", "seed", "command_line")
 """Fields that are written last, in this order."""
 
-Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+JsonFloat = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """A number that may be NaN or infinite: null in JSON, which is read as NaN."""
 
-Interval = tuple[Number, Number]
+Interval = tuple[JsonFloat, JsonFloat]
 """Both ends of a 95 % interval."""
 
 
@@ -90,7 +90,7 @@ class RunResult(Result):
     environment: str
     controls: list[str]
     ending: str = Field(description="how it ended")
-    seconds: Annotated[dict[str, Number], having("total")] = Field(description="by part of the work, and in `total`")
+    seconds: Annotated[dict[str, JsonFloat], having("total")] = Field(description="by part of the work, and in `total`")
     seed: int = Field(description="the root seed")
     command_line: str = Field(description="the command that asks the same again")
 

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from advsearch.runs.results.base import Fields, Number, RunResult
+from advsearch.runs.results.base import Fields, JsonFloat, RunResult
 
 GradientStatus = Literal["ok", "biased", "noisy", "reference unusable"]
 
@@ -47,20 +47,20 @@ class GradientRow(CheckedPlace):
 class DirectionRow(GradientRow):
     """The gradient of a whole control beside the converged one."""
 
-    cosine: Number
-    converged: Number = Field(description="smallest cosine of two converged gradients")
+    cosine: JsonFloat
+    converged: JsonFloat = Field(description="smallest cosine of two converged gradients")
 
 
 class DerivativeRow(GradientRow):
     """The derivative along one parameter beside its reference."""
 
-    gradient: Number = Field(description="mean over seeds")
-    reference: Number = Field(description="by differences of many samples")
-    reference_steps: tuple[Number, Number] = Field(description="its value at the larger and at the smaller step")
+    gradient: JsonFloat = Field(description="mean over seeds")
+    reference: JsonFloat = Field(description="by differences of many samples")
+    reference_steps: tuple[JsonFloat, JsonFloat] = Field(description="its value at the larger and at the smaller step")
     reference_factor: float = Field(description="the larger step as a multiple of the plan's")
-    reference_noise: Number
-    relative_error: Number
-    noise: Number = Field(description="standard deviation of one gradient, relative")
+    reference_noise: JsonFloat
+    relative_error: JsonFloat
+    noise: JsonFloat = Field(description="standard deviation of one gradient, relative")
 
 
 CheckedRow = DirectionRow | DerivativeRow

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import Fields, Interval, Number, RunResult
+from advsearch.runs.results.base import Fields, Interval, JsonFloat, RunResult
 
 
 class RightOf(Fields):
@@ -50,7 +50,7 @@ class ParameterWeight(Fields):
     """What one parameter, or two together, decide of the answer."""
 
     parameters: list[str]
-    share: Number = Field(description="of the variance of the answers, by which of its parts a value lies in")
+    share: JsonFloat = Field(description="of the variance of the answers, by which of its parts a value lies in")
     interval: Interval = Field(description="of the share, 95 %")
     parts: int = Field(default=0, description="into how many its values were cut, of two all pairs of parts")
 

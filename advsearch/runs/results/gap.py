@@ -7,7 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from advsearch.runs.results.attack import AverageCase, ControlGroup, VerifiedRate
-from advsearch.runs.results.base import Fields, Interval, Number, RunResult
+from advsearch.runs.results.base import Fields, Interval, JsonFloat, RunResult
 
 EpsilonBudget = float | None | dict[str, float | None]
 
@@ -32,7 +32,7 @@ class ObjectRow(Fields):
     epsilon: EpsilonBudget = Field(default=None, description="of the last attack")
     flips_at: EpsilonBudget = Field(description="the least epsilon at which an answer was found; null: at none")
     verified: VerifiedRate | None = None
-    margin: Number | None = Field(default=None, description="mean of the trials, in logits")
+    margin: JsonFloat | None = Field(default=None, description="mean of the trials, in logits")
     run: str | None = None
     tried: float | None = Field(default=None, description="the largest epsilon that was tried")
     renders: dict[str, int] | None = Field(
@@ -70,7 +70,7 @@ class GapRow(Fields):
     average: AverageCase
     worst: VerifiedRate | None = Field(description="trials of the worst configuration")
     ending: str
-    margin: Number | None = Field(description="mean of these trials, in logits")
+    margin: JsonFloat | None = Field(description="mean of these trials, in logits")
     renders: dict[str, int]
     run: str | None
 

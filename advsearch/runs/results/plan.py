@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import Fields, Formation, Number, RunResult
+from advsearch.runs.results.base import Fields, Formation, JsonFloat, RunResult
 from advsearch.runs.results.check import GradientStatus
 
 
@@ -21,7 +21,7 @@ class GroupDerivative(Fields):
     step: float = Field(description="half-width of a difference in u")
     step_reason: str = Field(description="why it is as wide; empty where none is taken")
     reason: str = Field(description="why this estimator")
-    variance_x_seconds: dict[str, Number] = Field(
+    variance_x_seconds: dict[str, JsonFloat] = Field(
         description="squared error x time of each estimator that was measured"
     )
     step_in_unit: float | None = Field(description="the step in `unit`; null where that is no single number")
@@ -48,8 +48,8 @@ class CosineRow(Fields):
     control: str
     factor: float = Field(description="step as a multiple of the plan's")
     spp: int = Field(description="samples a pixel")
-    cosine: Number = Field(description="mean over seeds; null where the converged gradient is zero")
-    converged: Number = Field(description="smallest cosine of two converged gradients")
+    cosine: JsonFloat = Field(description="mean over seeds; null where the converged gradient is zero")
+    converged: JsonFloat = Field(description="smallest cosine of two converged gradients")
     seconds: float = Field(description="of one working gradient, median")
     status: GradientStatus = Field(description="whether it is good enough to search by")
 
@@ -68,8 +68,8 @@ class GainRow(Fields):
     item: str
     what: str
     gain: float = Field(description="a gradient's time x the picture's variance with it, over those without it")
-    picture_difference: Number = Field(description="root mean square at one seed, over that of two seeds")
-    gradient_difference: Number = Field(description="the same of gradients; 0 where there are none")
+    picture_difference: JsonFloat = Field(description="root mean square at one seed, over that of two seeds")
+    gradient_difference: JsonFloat = Field(description="the same of gradients; 0 where there are none")
     safe: bool = Field(description="whether pictures and gradients agree to within their noise")
     seconds: float = Field(description="of a gradient with it")
 

@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 from pydantic import Field
 
 from advsearch.runs.results.attack import SharedWork
-from advsearch.runs.results.base import Fields, Formation, Interval, Number, RunResult
+from advsearch.runs.results.base import Fields, Formation, Interval, JsonFloat, RunResult
 
 
 class MeasuredError(NamedTuple):
@@ -31,20 +31,20 @@ class SettingPlace(Fields):
 class PrecisionPoint(SettingPlace):
     """What repeated measurements of a setting say. Errors are relative."""
 
-    error: Number = Field(description="root mean square; where it is not known, an upper limit")
+    error: JsonFloat = Field(description="root mean square; where it is not known, an upper limit")
     interval: Interval | None = None
     known: bool | None = Field(default=None, description="well above the reference's own error")
-    reference_error: Number | None = None
-    margin_error: Number | None = Field(default=None, description="of the model's margin, with its own company")
+    reference_error: JsonFloat | None = None
+    margin_error: JsonFloat | None = Field(default=None, description="of the model's margin, with its own company")
     margin_interval: Interval | None = None
     margin_known: bool | None = None
-    margin_reference_error: Number | None = None
+    margin_reference_error: JsonFloat | None = None
     seconds: float
     repeats: int
-    cosine: Number | None = Field(default=None, description="of a gradient with its reference")
-    later_seconds: Number | None = Field(default=None, description="of another gradient from the same matrix")
+    cosine: JsonFloat | None = Field(default=None, description="of a gradient with its reference")
+    later_seconds: JsonFloat | None = Field(default=None, description="of another gradient from the same matrix")
     family: str | None = Field(default=None, description="what a line of the image is recommended among")
-    objective: Number | None = Field(default=None, description="median over searches")
+    objective: JsonFloat | None = Field(default=None, description="median over searches")
     quartiles: Interval | None = None
     renders: int | None = None
 
@@ -71,7 +71,7 @@ class PrecisionSlope(Fields):
     interval: Interval
     offset: float = Field(description="logarithm of the error at one sample or second")
     points: int
-    fixed_seconds: Number = Field(description="of a call, that don't grow with the samples")
+    fixed_seconds: JsonFloat = Field(description="of a call, that don't grow with the samples")
     theory: float | None = Field(description="what the slope should be")
     or_steeper: bool
     agrees: bool | None = Field(description="null where that can't be told")
@@ -82,12 +82,12 @@ class PrecisionReference(Fields):
 
     quantity: str
     reference: str
-    error: Number
+    error: JsonFloat
     parts: int
     spp: int
     control: str | None = None
-    margin: Number | None = None
-    margin_error: Number | None = None
+    margin: JsonFloat | None = None
+    margin_error: JsonFloat | None = None
 
 
 class Recommended(Fields):
@@ -101,8 +101,8 @@ class Recommended(Fields):
     estimator: str | None = Field(description="null where nothing that was measured reaches it")
     spp: int | None = None
     renders: int | None = None
-    seconds: Number | None = None
-    error: Number | None = None
+    seconds: JsonFloat | None = None
+    error: JsonFloat | None = None
     basis: str | None = Field(default=None, description="measured, fitted, interpolated, extrapolated or confirmed")
     repeats: int | None = Field(default=None, description="measurements that confirm it")
 

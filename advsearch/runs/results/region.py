@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, SceneResult, having
+from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, JsonFloat, SceneResult, having
 
 
 class AxisRange(Fields):
@@ -28,7 +28,7 @@ class MarginMap(Fields):
     """The margin on a grid over two parameters."""
 
     axes: tuple[AxisRange, AxisRange]
-    margins: list[list[Number]] = Field(description="logits, in rows of the second parameter from its lowest value")
+    margins: list[list[JsonFloat]] = Field(description="logits, in rows of the second parameter from its lowest value")
 
 
 class GrownRegion(Fields):

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork, VerifiedRate
-from advsearch.runs.results.base import Fields, Formation, Interval, Number, Payload, RunResult, VariedValue, having
+from advsearch.runs.results.base import Fields, Formation, Interval, JsonFloat, Payload, RunResult, VariedValue, having
 
 AxisValue = int | float | str | tuple[float, float]
 """A number, a name, or both ends of a part of a range."""
@@ -45,7 +45,7 @@ class SweepMap(Fields):
     over: list[str] = Field(description="the axes beyond")
     configurations: list[list[int]]
     correct: list[list[int]]
-    margin: list[list[Number | None]] = Field(description="the mean, in logits; null where there is none")
+    margin: list[list[JsonFloat | None]] = Field(description="the mean, in logits; null where there is none")
 
 
 class WorstClaim(Fields):
@@ -53,8 +53,8 @@ class WorstClaim(Fields):
 
     label: str
     index: int | None
-    probability: Number | None
-    margin: Number
+    probability: JsonFloat | None
+    margin: JsonFloat
     payload: Payload = Field(default=None, description="what else the task keeps of it; absent without")
 
 

@@ -17,7 +17,7 @@ FIRST = ("clean", "adversarial")
 """What is shown of an attack; of another run, the first picture there is."""
 
 
-def pictures_of(run: Path) -> list[Path]:
+def best_pictures(run: Path) -> list[Path]:
     """Return the pictures of a run that say most; none where it has none."""
     folder = run / "images"
     files = [folder / f"{name}.png" for name in FIRST]

@@ -54,7 +54,7 @@ class Toy:
         return Evaluation(objective, slope, objective > self.threshold, cost=query.samples)
 
 
-def numbers(start: Sequence[float]) -> Domain:
+def box_domain(start: Sequence[float]) -> Domain:
     """Return a box in which every number is a block of its own, as parameters of controls are."""
     return Domain(torch.tensor(start), tuple(Block(1, name=f"number {i}") for i in range(len(start))))
 
