@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -296,7 +297,8 @@ class Problem:
             return value
 
         spp, derivative = self.spp * samples, None
-        with renderer.scene.shorter(self.search_depth):
+        depth = self.search_depth
+        with nullcontext() if depth is None else renderer.scene.shorter(depth):
             if gradient:
                 value, derivative = renderer.gradient(loss, whole, seed, spp, free=gradient == "free")
                 derivative = derivative + slope if asked.used else derivative

@@ -58,10 +58,8 @@ class Searches:
     findings: Findings
     clean: CleanMatrix
 
-    @property
-    def problem(self) -> Problem:
-        """What is attacked."""
-        return self.journal.problem
+    def __post_init__(self) -> None:
+        self.problem: Problem = self.journal.problem
 
     def collect_transport(self) -> None:
         """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""

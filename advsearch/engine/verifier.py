@@ -50,10 +50,8 @@ class Verifier:
     _clean_spp: int = 0
     _asked: set[tuple[str, int]] = field(default_factory=set)
 
-    @property
-    def problem(self) -> Problem:
-        """What is tried."""
-        return self.journal.problem
+    def __post_init__(self) -> None:
+        self.problem: Problem = self.journal.problem
 
     def answers(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Answer trials, keep their pictures, and count each once."""
