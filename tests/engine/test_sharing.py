@@ -48,7 +48,7 @@ def test_what_nobody_could_answer_says_so_or_ends_the_run() -> None:
     assert answer.lost and not answer.success and answer.said.payload == {"lost": "they died"}
     for wanted in ("picture", "light"):
         with pytest.raises(ClusterError, match="they died; `advsearch resume RUN workers=null`"):
-            lost(Query(query.u, 0, wanted=wanted), "they died")  # type: ignore[arg-type]
+            lost(Query(query.u, 0, wanted=wanted), "they died")
 
 
 def test_what_is_in_the_journal_is_not_asked_again(tmp_path: Path) -> None:
