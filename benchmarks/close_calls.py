@@ -16,13 +16,14 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from torch import Tensor
 
 from advsearch import seeds, threads
 from advsearch.api.attack import problem_from_config
-from advsearch.attacks import make_policy, search
+from advsearch.attacks import Query, make_policy, search
 from advsearch.config import CLOSE_LOOKS, AttackConfig
 from advsearch.engine.problem import Problem
 
@@ -55,9 +56,9 @@ def measured(space: str, renders: int, count: int, resolution: int) -> None:
         for name, one in problems.items():
             one.seed = seeds.stream(7, "close calls", seed)
             close = CLOSE_LOOKS if name == "auto" else 0
-            evaluate, policy = one.evaluator("search"), make_policy("auto")
+            evaluate, policy = partial(map, one.evaluate), make_policy("auto")
             begun = time.perf_counter()
-            found = search(evaluate, one.domain, policy, steps=renders, seed=seed, close=close)
+            found = search(evaluate, one.domain, policy, steps=renders, seed=seed, close=close, noise=one.seed)
             seconds[name].append(time.perf_counter() - begun)
             samples[name].append(found.renders * one.spp)
             margins[name].append(verified(problems["default"], found.best_u))
@@ -77,8 +78,8 @@ def measured(space: str, renders: int, count: int, resolution: int) -> None:
 
 def verified(one: Problem, u: Tensor) -> float:
     """Mean margin of fresh trials."""
-    trials = [one.trial(u, seeds.stream(99, "trial", number), TRIAL_SPP) for number in range(TRIALS)]
-    return statistics.fmean(trial.margin for trial in trials)
+    queries = [Query(u, seeds.stream(99, "trial", number), spp=TRIAL_SPP) for number in range(TRIALS)]
+    return statistics.fmean(one.evaluate(query).said.margin for query in queries)
 
 
 def problem(space: str, resolution: int, spp: Any) -> Problem:

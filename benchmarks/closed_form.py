@@ -23,12 +23,13 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from advsearch.attacks import POLICIES, Block, Domain, Evaluation, Policy, make_policy, search, seeded
+from advsearch.attacks import POLICIES, Block, Domain, Evaluation, Policy, Query, make_policy, search, seeded
 from advsearch.errors import InputError
 
 LADDER = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000)
@@ -179,7 +180,7 @@ def reached(policy: Policy[object], objective: str, d: int, renders: int, seed: 
     """
     problem = OBJECTIVES[objective](d, seed)
     try:
-        result = search(problem.evaluate, problem.domain, policy, steps=renders, seed=seed, candidates=0)
+        result = search(partial(map, problem.evaluate), problem.domain, policy, steps=renders, seed=seed, candidates=0)
     except InputError:
         return False
     value = problem.value(result.best_u)
@@ -218,11 +219,11 @@ class Problem:
     gradient: Callable[[Tensor], Tensor]
     optimum: float
 
-    def evaluate(self, u: Tensor, *, index: int, gradient: object, samples: int = 1) -> Evaluation:
+    def evaluate(self, query: Query) -> Evaluation:
         """Evaluate without noise; more samples change nothing but the cost."""
-        value = self.value(u)
-        slope = self.gradient(u) if gradient else None
-        return Evaluation(value, slope, False, cost=samples)
+        value = self.value(query.u)
+        slope = self.gradient(query.u) if query.gradient else None
+        return Evaluation(value, slope, False, cost=query.samples)
 
 
 def domain_of(start: Tensor, norm: str) -> Domain:

@@ -25,9 +25,10 @@ import argparse
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ import transformers
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
+from advsearch.attacks import Block, Domain, Evaluate, Evaluation, Query, make_policy, search
 from advsearch.models.model import Detaching, mend_batch_norms
 from advsearch.tasks.detection import Detection, Place
 
@@ -181,16 +182,16 @@ class Search:
         found, value = self.scores(u, way)
         return float(found), torch.autograd.grad(value, u)[0]
 
-    def evaluate(self, way: str) -> Callable[..., Evaluation]:
-        def one(u: Tensor, *, index: int, gradient: object, samples: int = 1) -> Evaluation:
-            if gradient:
-                value, slope = self.slope(u, way)
+    def evaluate(self, way: str) -> Evaluate:
+        def one(query: Query) -> Evaluation:
+            if query.gradient:
+                value, slope = self.slope(query.u, way)
             else:
                 with torch.no_grad():
-                    value, slope = float(self.scores(u)[0]), None
-            return Evaluation(value, slope, value > 0.0, cost=samples)
+                    value, slope = float(self.scores(query.u)[0]), None
+            return Evaluation(value, slope, value > 0.0, cost=query.samples)
 
-        return one
+        return partial(map, one)
 
     def best(self, policy: str, way: str, epsilon: float, steps: int, seed: int) -> float:
         start = self.scene.textures[0].flatten()

@@ -25,6 +25,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -33,7 +34,7 @@ from torch import Tensor
 
 from advsearch import threads
 from advsearch.api.attack import problem_from_config
-from advsearch.attacks import Block, Domain, Evaluation, Policy, StepRecord, make_policy, search
+from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, StepRecord, make_policy, search
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.seeds import stream
@@ -112,13 +113,21 @@ def rendered_cells(
         if evaluation.success and (at not in worst or evaluation.objective > worst[at][0]):
             worst[at] = evaluation.objective, u.clone()
 
-    evaluate = problem.evaluator(policy.name)
-    search(evaluate, problem.domain, policy, steps=renders, seed=seed, candidates=0, on_step=note)
+    search(
+        partial(map, problem.evaluate),
+        problem.domain,
+        policy,
+        steps=renders,
+        seed=seed,
+        candidates=0,
+        on_step=note,
+        kind=policy.name,
+        noise=problem.seed,
+    )
 
     def holds(u: Tensor) -> bool:
-        return all(
-            problem.trial(u, stream(problem.seed, "again", number), TRIAL_SPP).success for number in range(TRIALS)
-        )
+        queries = (Query(u, stream(problem.seed, "again", number), spp=TRIAL_SPP) for number in range(TRIALS))
+        return all(problem.evaluate(query).success for query in queries)
 
     return {at for at, (_, u) in worst.items() if holds(u)}, wrong / renders
 
@@ -133,15 +142,15 @@ def failing_cells(scene: str, policy: str, renders: int, noise: float, seed: int
     spread = float(torch.tensor([margin(u) for u in sample]).std())
     cells = set()
 
-    def evaluate(u: Tensor, *, index: int, gradient: object, samples: int = 1) -> Evaluation:
-        generator = torch.Generator().manual_seed(100_003 * seed + index)
-        exact = margin(u)
+    def evaluate(query: Query) -> Evaluation:
+        generator = torch.Generator().manual_seed(100_003 * seed + query.number)
+        exact = margin(query.u)
         if exact > 0.0:
-            cells.add(cell(float(u[0]), float(u[1])))
+            cells.add(cell(float(query.u[0]), float(query.u[1])))
         seen = exact + noise * spread * float(torch.randn(1, generator=generator))
         return Evaluation(seen, None, seen > 0.0)
 
-    search(evaluate, domain, make_policy(policy), steps=renders, seed=seed, candidates=0)
+    search(partial(map, evaluate), domain, make_policy(policy), steps=renders, seed=seed, candidates=0)
     return cells
 
 

@@ -16,15 +16,15 @@ import argparse
 import statistics
 import time
 from dataclasses import replace
+from functools import partial
 
-import torch
 from torch import Tensor
 
 from advsearch import seeds, threads
 
 threads.configure()
 
-from advsearch.attacks import Evaluate, get_objective, make_policy, search  # noqa: E402
+from advsearch.attacks import Query, get_objective, make_policy, search  # noqa: E402
 from advsearch.controls import make_space  # noqa: E402
 from advsearch.controls.texture import TextureControl  # noqa: E402
 from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
@@ -77,32 +77,33 @@ def main() -> None:
 def searched(problem: Problem, predicted: bool, seconds: float) -> tuple[Tensor, int]:
     """Search for so many CPU seconds; returns the answer and the evaluations that it took."""
     end = time.process_time() + seconds
-    evaluate: Evaluate = problem.evaluator("search")
+    evaluate = problem.evaluate
     if predicted:
         transport = Transport(problem, MOST)
         transport.prepare()
-        evaluate = transport.evaluator("search")
+        evaluate = transport.evaluate
+    first = Query(problem.domain.start, seeds.stream(problem.seed, "search", 0), phase="search", gradient=True)
     begun = time.process_time()
     for _ in range(TIMED):
-        evaluate(problem.domain.start, index=0, gradient=True)
+        evaluate(first)
     steps = max(1, int((end - time.process_time()) * TIMED / (time.process_time() - begun)))
     result = search(
-        evaluate,
+        partial(map, evaluate),
         replace(problem.domain, exact=predicted),
         make_policy("auto"),
         steps=min(steps, MOST),
         seed=problem.seed,
         candidates=0 if predicted else 4,
         late=lambda _: time.process_time() >= end,
+        noise=problem.seed,
     )
     return result.best_u, len(result.history)
 
 
 def verified(problem: Problem, u: Tensor) -> float:
     """Mean margin of an answer in traced pictures with fresh seeds."""
-    with torch.no_grad():
-        trials = [problem.trial(u, seeds.stream(problem.seed, "trial", one), TRIAL_SPP) for one in range(TRIALS)]
-    return statistics.fmean(trial.margin for trial in trials)
+    queries = [Query(u, seeds.stream(problem.seed, "trial", one), spp=TRIAL_SPP) for one in range(TRIALS)]
+    return statistics.fmean(problem.evaluate(query).said.margin for query in queries)
 
 
 if __name__ == "__main__":

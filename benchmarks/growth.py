@@ -23,11 +23,11 @@ import numpy as np
 import torch
 from scipy.stats import theilslopes
 
-from advsearch import threads
+from advsearch import seeds, threads
 
 threads.configure()
 
-from advsearch.attacks import get_objective, make_policy  # noqa: E402
+from advsearch.attacks import Query, get_objective, make_policy  # noqa: E402
 from advsearch.controls import make_space  # noqa: E402
 from advsearch.controls.texture import TextureControl  # noqa: E402
 from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
@@ -50,7 +50,7 @@ def main() -> None:
     task = Classification().on(model)
     problem = Problem(renderer, space, model, task, lambda *_: Facts("mug", "mug"), get_objective("margin"), 4, 0)
     policy = make_policy("pgd")
-    evaluate = (Transport(problem, args.steps) if args.transport else problem).evaluator("search")
+    evaluate = (Transport(problem, args.steps) if args.transport else problem).evaluate
     state = policy.start(problem.domain, torch.Generator().manual_seed(0), args.steps)
     ratios, seconds, memory = [], [], []
     yardstick = torch.rand(16, args.size, args.size, 3)
@@ -60,7 +60,8 @@ def main() -> None:
         if not proposals:  # nothing more to propose: go on measuring from where it stands
             break
         u = proposals[0].u
-        state = policy.update(state, [(u, evaluate(u, index=index, gradient=True))])
+        query = Query(u, seeds.stream(0, "search", index), number=index, phase="search", gradient=True)
+        state = policy.update(state, [(u, evaluate(query))])
         seconds.append(time.perf_counter() - begun)
         begun = time.perf_counter()
         with torch.no_grad():

@@ -15,13 +15,13 @@ import math
 import sys
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Evaluation, Policy, make_policy, search
+from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy, search
 
 Doubles = npt.NDArray[np.float64]
 Function = Callable[[Doubles], Doubles]
@@ -66,13 +66,13 @@ def gap(policy: Policy[object], kind: str, d: int, renders: int, noise: float, s
     spread = float(function(sample).std()) or 1.0
 
     def answer(by: Policy[object]) -> float:
-        def evaluate(u: Tensor, *, index: int, gradient: object, samples: int = 1) -> Evaluation:
-            key = [seed, index, zlib.crc32(u.numpy().tobytes()), zlib.crc32(by.name.encode())]
-            value = float(function(u.double().numpy()[None])[0]) / spread
+        def evaluate(query: Query) -> Evaluation:
+            key = [seed, query.number, zlib.crc32(query.u.numpy().tobytes()), zlib.crc32(by.name.encode())]
+            value = float(function(query.u.double().numpy()[None])[0]) / spread
             value += noise * float(np.random.default_rng(key).normal())
             return Evaluation(value, None, False)
 
-        found = search(evaluate, domain, by, steps=renders, seed=seed).best_u
+        found = search(partial(map, evaluate), domain, by, steps=renders, seed=seed).best_u
         return float(function(found.double().numpy()[None])[0]) / spread
 
     return answer(policy) - answer(make_policy("random"))

@@ -28,13 +28,14 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds, threads
 from advsearch.api.attack import problem_from_config
-from advsearch.attacks import make_policy, search
+from advsearch.attacks import Evaluation, Query, make_policy, search
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Transport
@@ -89,14 +90,20 @@ def _answer(problem: Problem, policy: str, renders: int, seed: int) -> float:
     problem.seed = seeds.stream(7, "searches", seed)
     steps = max(1, renders - 8)  # the ranking of candidates takes eight
     found = search(
-        problem.evaluator(policy), problem.domain, make_policy(policy), steps=steps, seed=seeds.stream(seed, policy)
+        partial(map, problem.evaluate),
+        problem.domain,
+        make_policy(policy),
+        steps=steps,
+        seed=seeds.stream(seed, policy),
+        kind=policy,
+        noise=problem.seed,
     )
     return _verified(problem, found.best_u)
 
 
 def _verified(problem: Problem, u: Tensor, trials: int = TRIALS) -> float:
-    margins = [problem.trial(u, seeds.stream(99, "trial", number), TRIAL_SPP).margin for number in range(trials)]
-    return statistics.fmean(margins)
+    queries = [Query(u, seeds.stream(99, "trial", number), spp=TRIAL_SPP) for number in range(trials)]
+    return statistics.fmean(problem.evaluate(query).said.margin for query in queries)
 
 
 def _spaces(args: argparse.Namespace) -> None:
@@ -135,6 +142,11 @@ def _texture(args: argparse.Namespace) -> None:
         print(f"| {policy} | {renders} | {median:.2f} | {min(values):.2f} | {max(values):.2f} |", flush=True)
 
 
+def _evaluated(problem: Problem, transport: Transport | None, query: Query) -> Evaluation:
+    """Predicted where something predicts; the ranking is traced."""
+    return (transport if transport is not None and query.phase == "search" else problem).evaluate(query)
+
+
 def _transport(args: argparse.Namespace) -> None:
     problem = _problem(args, "texture")
     print("| pictures are | verified margin: lowest, quartiles, highest | processor's seconds, quartiles |")
@@ -144,14 +156,15 @@ def _transport(args: argparse.Namespace) -> None:
         for seed in range(args.seeds + 1):
             problem.seed = seeds.stream(7, "searches", seed)
             begun = time.process_time()
-            transport = Transport(problem, args.renders)
             predicted = name == "predicted"
+            evaluate = partial(_evaluated, problem, Transport(problem, args.renders) if predicted else None)
             found = search(
-                transport.evaluator("search") if predicted else problem.evaluator("search"),
+                partial(map, evaluate),
                 replace(problem.domain, exact=predicted),
                 make_policy("auto"),
                 steps=args.renders,
                 seed=seeds.stream(seed, "auto"),
+                noise=problem.seed,
             )
             if seed:  # the first one compiles the renderer's code
                 seconds.append(time.process_time() - begun)

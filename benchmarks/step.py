@@ -20,11 +20,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from advsearch import threads
+from advsearch import seeds, threads
 
 threads.configure()
 
-from advsearch.attacks import get_objective, make_policy  # noqa: E402
+from advsearch.attacks import Query, get_objective, make_policy  # noqa: E402
 from advsearch.controls import make_space  # noqa: E402
 from advsearch.controls.texture import TextureControl  # noqa: E402
 from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
@@ -72,15 +72,14 @@ def compare(size: int, denoise: str, spp: int, repeats: int) -> tuple[float, flo
 def steps(problem: Problem, count: int) -> Callable[[], None]:
     """Return a function that takes the next step of a search: propose, render, classify, differentiate, update."""
     policy = make_policy("pgd")
-    evaluate = problem.evaluator("search")
     state = policy.start(problem.domain, torch.Generator().manual_seed(0), count)
     index = 0
 
     def step() -> None:
         nonlocal state, index
         (proposal,), state = policy.propose(state, 1)
-        evaluation = evaluate(proposal.u, index=index, gradient=True)
-        state = policy.update(state, [(proposal.u, evaluation)])
+        query = Query(proposal.u, seeds.stream(0, "search", index), number=index, phase="search", gradient=True)
+        state = policy.update(state, [(proposal.u, problem.evaluate(query))])
         index += 1
 
     return step

@@ -470,7 +470,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("harden.md", "harden-fields"): result_fields(HardenResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,
-    ("recipes.md", "recipe-results"): recipe_results,
+    ("recipe-results.md", "recipe-results"): recipe_results,
 }
 """What makes each part of a page: (page, name of the part)."""
 

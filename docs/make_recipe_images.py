@@ -1,4 +1,4 @@
-"""Carries out the recipes, and keeps what they say and their figures for docs/recipes.md.
+"""Carries out the recipes, and keeps what they say and their figures for docs/recipe-results.md.
 
     python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME] [--until HH:MM] [--anew]
 

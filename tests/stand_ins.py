@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -185,16 +184,14 @@ class StandInWorkers:
     given: list[int] = field(default_factory=list)
     facts: Workforce | None = field(default_factory=lambda: Workforce(workers=2, most=2, busy=1.0, alive=2.0))
 
-    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
-        """The latest of those that are ready comes first, but for what waits for results."""
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
+        """The latest comes first."""
         assert given is not None
-        source, first = iter(ranges), len(self.given)
-        while ready := list(takewhile(lambda one: one is not None, source)):
-            for done in self.made.results(reversed(ready), given):
-                place = len(self.given) - first
-                self.given.append(done.numbers.start)
-                away = "it died" if first + place in self.lost else ""
-                yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
+        first = len(self.given)
+        for place, done in enumerate(self.made.results(reversed(list(ranges)), given)):
+            self.given.append(done.numbers.start)
+            away = "it died" if first + place in self.lost else ""
+            yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
 
 
 def shared(

@@ -543,7 +543,8 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
                     f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
-        found = summarise(job.config, findings, journal, stages, warnings)
+        named = job.objective if isinstance(job.objective, str) else job.config.objective
+        found = summarise(job.config, named, findings, journal, stages, warnings)
         parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
         return replace(found, parts=lambda: parts)
 

@@ -16,7 +16,6 @@ from advsearch.config import CheckConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine import run_settings
 from advsearch.engine.gradients import (
-    EXPENSIVE,
     FACTORS,
     Estimate,
     Loss,
@@ -57,7 +56,7 @@ from advsearch.runs.results.check import (
 from advsearch.runs.results.plan import CosineRow
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import STEP_RANGE
+from advsearch.scene.gradients.plan import STEP_RANGE, compared
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -364,8 +363,8 @@ def attempts(group: Group) -> list[tuple[str, float]]:
     Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
     """
     forced = "forced" in group.reason
-    names = [group.estimator] if forced else [one for one in group.valid if one not in EXPENSIVE]
-    wide = next((one for one in ("differences", "secant", "forward") if one in names), None)
+    names = [group.estimator] if forced else [*compared(group.valid, group.size)]
+    wide = next((one for one in ("differences", "secant") if one in names), None)
     tries = [(one, 1.0) for one in names]
     if wide is None:
         return tries

@@ -385,7 +385,7 @@ def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[
                 parts.progress.stage("loading the models to try the answers on")
                 problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
                 seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
-                with executor_for(config, "advsearch.api.gap:answering_of", parts.progress) as executor:
+                with executor_for(config, "advsearch.api.gap:models_answering", parts.progress) as executor:
                     kept = (problems, parts.run, parts.progress, executor)
                     tried = Transfer(*kept, trials=trials, spp=spp, seed=seed)
                     models = tried.clean()
@@ -400,7 +400,7 @@ def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[
     return models, rows
 
 
-def answering_of(settings: JsonObject) -> Call:
+def models_answering(settings: JsonObject) -> Call:
     """Return what answers queries of the models of a configuration: what a worker does."""
     config = AttackConfig(**settings)
     return answering(lambda name: problem_from_config(_alone(config, name))[0])

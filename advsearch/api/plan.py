@@ -32,7 +32,7 @@ from advsearch.runs.results.plan import (
     PlanResult,
     TexelRow,
 )
-from advsearch.scene.gradients.plan import BY_DIFFERENCES
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -286,9 +286,9 @@ def _limits() -> list[EstimatorLimit]:
 def _left_out(problem: Problem, used: set[str]) -> list[str]:
     """What a search with these estimators does not compute, in sentences."""
     sentences = []
-    if not used & {"boundary", "guided", "material"}:
+    if "material" not in used:
         sentences.append("boundary terms: nothing that an adjoint differentiates moves an outline")
-    if not used & {"adjoint", "boundary", "guided", "material"}:
+    if not used & BY_ADJOINT:
         sentences.append("adjoint renders: no coordinate needs one")
     if not used & BY_DIFFERENCES:
         sentences.append("renders for differences: every derivative is an adjoint or of the picture itself")

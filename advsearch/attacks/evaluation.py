@@ -17,7 +17,7 @@ Wanted = bool | Literal["free"]
 
 Phase = Literal["search", "ranking"]
 
-MOST, MOST_NUMBERS = 1024, 2**24
+MOST, MOST_NUMBERS = 1024, 2**21
 """Queries that are asked at once, and the numbers that their configurations have together, at most."""
 
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import torch
@@ -173,7 +174,7 @@ def search(
 
     Raises:
         InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
-        RuntimeError: the policy left the domain or `evaluate` broke its contract; a bug.
+        RuntimeError, ValueError: the policy left the domain or `evaluate` broke its contract; a bug.
     """
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}")
@@ -237,7 +238,7 @@ class _Log:
             for place, (one, index) in enumerate(zip(proposals, indices, strict=True))
         ]
         for proposal, query, raw in zip(proposals, queries, self.evaluate(queries), strict=True):
-            seconds, begun = time.perf_counter() - begun, time.perf_counter()
+            seconds = time.perf_counter() - begun
             _check_gradient(raw, proposal)
             _check_cost(raw, proposal, self.domain)
             evaluation = usable(raw)
@@ -269,6 +270,7 @@ class _Log:
             if self.on_step is not None:
                 self.on_step(self.records[-1], proposal.u, evaluation)
             yield evaluation
+            begun = time.perf_counter()
 
     def _compare(self, gradient: Tensor | None) -> None:
         """Note the cosine of a gradient with the one before that was not zero."""
@@ -286,9 +288,12 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
     state = policy.start(log.domain, generator, steps)
     in_a_row, most = 0, most_at_once(log.domain.dim)
     while log.renders < steps:
-        proposals, state = policy.propose(state, min(most, steps - log.renders))
+        asked = min(most, steps - log.renders)
+        proposals, state = policy.propose(state, asked)
         if not proposals:
             return Ending.STALLED
+        if len(proposals) > asked:
+            raise RuntimeError(f"policy {name!r} proposed {len(proposals)} configurations; expected at most {asked}")
         batch, left = list[Proposal](), steps - log.renders
         for proposal in proposals:
             _check_inside(proposal, log.domain, name)
@@ -327,17 +332,14 @@ def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
 
 def _look(log: _Log, indices: Sequence[int]) -> None:
     """Render every candidate again with the same seeds."""
-    pairs = [(candidate, index) for candidate in log.pool for index in indices]
-    proposals = [Proposal(candidate.u) for candidate, _ in pairs]
-    for (candidate, _), evaluation in zip(
-        pairs, log.evaluated(proposals, [index for _, index in pairs], "ranking"), strict=True
-    ):
-        number = next(place for place, one in enumerate(log.pool) if one.u is candidate.u)
-        before = log.pool[number]
-        seen = replace(
-            before, again=(*before.again, evaluation.objective), successes=before.successes + evaluation.success
-        )
-        log.pool = (*log.pool[:number], seen, *log.pool[number + 1 :])
+    pool = log.pool
+    answers = log.evaluated([Proposal(one.u) for one in pool for _ in indices], [*indices] * len(pool), "ranking")
+    for place, candidate in enumerate(pool):
+        again, successes = candidate.again, candidate.successes
+        for answer in islice(answers, len(indices)):
+            again, successes = (*again, answer.objective), successes + answer.success
+            seen = replace(candidate, again=again, successes=successes)
+            log.pool = (*log.pool[:place], seen, *pool[place + 1 :])
 
 
 def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:

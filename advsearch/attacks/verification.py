@@ -163,7 +163,7 @@ def run_trials(
     trials: int = 20,
     kind: str = "verification",
     keep: int = 0,
-    until: Callable[[Sequence[Judgement]], bool] = lambda done: False,
+    until: Callable[[Sequence[Judgement]], bool] | None = None,
 ) -> tuple[Judgement, ...]:
     """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification".
 
@@ -192,8 +192,10 @@ def run_trials(
     queries = [Query(u, one, kind, number, spp=spp, keep=number < keep) for number, one in enumerate(seeds)]
     for answer in evaluate(queries):
         done.append(answer.said)
-        if until(done):
-            break
+        if until is not None and until(done):
+            return tuple(done)
+    if len(done) != trials:
+        raise RuntimeError(f"evaluate answered {len(done)} of {trials} queries")
     return tuple(done)
 
 
@@ -258,8 +260,9 @@ def verify(
         beside = clean[: len(done)]
         return rule.counted(beside) - sum(map(rule.succeeded, done, beside)) > allowed
 
-    never = (lambda done: False) if not curtailed else lost
-    adversarial = run_trials(evaluate, u, spp=spp, seed=seed, trials=trials, kind=kind, keep=keep, until=never)
+    adversarial = run_trials(
+        evaluate, u, spp=spp, seed=seed, trials=trials, kind=kind, keep=keep, until=lost if curtailed else None
+    )
     outcomes = tuple(
         rule.succeeded(trial, beside) if beside.right or not rule.conditional else None
         for trial, beside in zip(adversarial, clean, strict=False)

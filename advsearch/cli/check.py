@@ -12,7 +12,7 @@ from advsearch.report import wording
 if TYPE_CHECKING:
     from advsearch.runs.results.check import CheckedRow, CheckResult, DerivativeRow
 
-HELP = "check the gradient of every parameter of a scene against differences"
+HELP = "check the gradient of every parameter of a scene against finite differences"
 MORE = ". Exit status 3 if one is biased or noisy"
 EXAMPLES = (
     "check --object mug --control pose",

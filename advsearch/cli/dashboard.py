@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from advsearch.api.photos import Photographs
     from advsearch.runs.results.photos import PhotoAgreement
 
-HELP = "serve the pages of runs to a browser on this machine"
+HELP = "show the pages of runs in a browser on this machine"
 MORE = ". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C"
 
 PORT = 8265

@@ -7,7 +7,7 @@ import sys
 
 from advsearch.cli import output
 
-HELP = "check every part that a run needs, with versions and what to do"
+HELP = "check every part that a run needs, with versions and how to mend it"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -22,10 +22,7 @@ USUAL_SIZE = 100.0
 SUFFIXES = {"pdf": "print", "xml": "mitsuba", "glb": "gltf"}
 """Formats that are not called as their files end."""
 
-HELP = (
-    "write a run's evaluated configurations as a table (CSV, JSON or Parquet), its texture or patch for printing, its "
-    "scene for Mitsuba, or its object as glTF"
-)
+HELP = "export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an object as glTF"
 EXAMPLES = (
     "export mug-texture-001",
     "export runs/mug-texture-001 --kind search --out search.parquet",

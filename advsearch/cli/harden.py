@@ -11,7 +11,7 @@ from advsearch.report import wording
 if TYPE_CHECKING:
     from advsearch.runs.results.harden import HardenResult
 
-HELP = "train a copy of a model on its worst cases, and measure it before and after on what training never saw"
+HELP = "train a copy of a model on its worst cases, and measure it before and after on scenes that training never saw"
 EXAMPLES = (
     "harden --model reference --control texture --epsilon 0.03 --quick",
     "harden --model mypackage:network@weights.safetensors --labels labels.json --control texture,pose,light",

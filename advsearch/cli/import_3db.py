@@ -7,7 +7,7 @@ from pathlib import Path
 
 from advsearch.cli import output
 
-HELP = "read a folder that 3DB wrote into a run"
+HELP = "turn a folder that 3DB wrote into a run"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

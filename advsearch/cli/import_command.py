@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from advsearch.scene.assets import ObjectAsset
     from advsearch.scene.importing.scenes import Contents
 
-HELP = "say, and picture, what is understood of a mesh or scene file"
+HELP = "show what advsearch reads from a mesh or scene file, as text or as a picture"
 MORE = ". Nothing is written but the picture"
 EXAMPLES = (
     "import mug.obj",

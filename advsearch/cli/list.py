@@ -10,7 +10,7 @@ from typing import Any
 
 from advsearch.cli import output
 
-HELP = "list the objects, environments, controls, policies, tasks, objectives, models and recipes that have names"
+HELP = "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes"
 
 REGISTRIES = {
     "objects": "advsearch.scene.library:list_objects",

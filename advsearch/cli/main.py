@@ -12,8 +12,10 @@ from __future__ import annotations
 import argparse
 import importlib
 import re
+import shutil
 import signal
 import sys
+import textwrap
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, NoReturn
@@ -23,35 +25,45 @@ from advsearch.cli.screen import end_output, open_descriptors, screens, shortene
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS
 
-COMMANDS = {
-    "attack": "advsearch.cli.attack",
-    "render": "advsearch.cli.render",
-    "sweep": "advsearch.cli.sweep",
-    "recipe": "advsearch.cli.recipe",
-    "explain": "advsearch.cli.explain",
-    "run": "advsearch.cli.run",
-    "gap": "advsearch.cli.gap",
-    "region": "advsearch.cli.region",
-    "replay": "advsearch.cli.replay",
-    "resume": "advsearch.cli.resume",
-    "runs": "advsearch.cli.runs",
-    "dashboard": "advsearch.cli.dashboard",
-    "view": "advsearch.cli.view",
-    "report": "advsearch.cli.report",
-    "export": "advsearch.cli.export",
-    "check": "advsearch.cli.check",
-    "plan": "advsearch.cli.plan",
-    "stability": "advsearch.cli.stability",
-    "precision": "advsearch.cli.precision",
-    "harden": "advsearch.cli.harden",
-    "import": "advsearch.cli.import_command",
-    "import-3db": "advsearch.cli.import_3db",
-    "list": "advsearch.cli.list",
-    "labels": "advsearch.cli.labels",
-    "show": "advsearch.cli.show",
-    "doctor": "advsearch.cli.doctor_command",
+GROUPS = {
+    "ask: what does a model get wrong?": {
+        "attack": "advsearch.cli.attack",
+        "sweep": "advsearch.cli.sweep",
+        "gap": "advsearch.cli.gap",
+        "region": "advsearch.cli.region",
+        "explain": "advsearch.cli.explain",
+        "recipe": "advsearch.cli.recipe",
+        "harden": "advsearch.cli.harden",
+    },
+    "look: at scenes, names and answers": {
+        "render": "advsearch.cli.render",
+        "show": "advsearch.cli.show",
+        "view": "advsearch.cli.view",
+        "dashboard": "advsearch.cli.dashboard",
+        "report": "advsearch.cli.report",
+        "list": "advsearch.cli.list",
+        "labels": "advsearch.cli.labels",
+    },
+    "trust: does an answer hold, and is the tool right?": {
+        "replay": "advsearch.cli.replay",
+        "check": "advsearch.cli.check",
+        "plan": "advsearch.cli.plan",
+        "precision": "advsearch.cli.precision",
+        "stability": "advsearch.cli.stability",
+        "doctor": "advsearch.cli.doctor_command",
+    },
+    "files and runs: repeat, continue, bring in, take out": {
+        "run": "advsearch.cli.run",
+        "resume": "advsearch.cli.resume",
+        "runs": "advsearch.cli.runs",
+        "export": "advsearch.cli.export",
+        "import": "advsearch.cli.import_command",
+        "import-3db": "advsearch.cli.import_3db",
+    },
 }
-"""Each command and its module, in the order in which the help shows them."""
+"""Each command and its module, in the groups and the order in which the help shows them."""
+
+COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
 
 OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
@@ -153,12 +165,18 @@ def _parse(given: list[str], command: str | None) -> argparse.Namespace:
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",
-        epilog=_EXAMPLES,
+        epilog=f"{_listing()}\n{_EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"advsearch {__version__}")
-    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", parser_class=Parser)
+    subparsers = parser.add_subparsers(
+        dest="command",
+        metavar="COMMAND",
+        title="commands",
+        help="one of those below; advsearch COMMAND --help explains it",
+        parser_class=Parser,
+    )
     for name in COMMANDS:
         add_command(subparsers, name, whole=name == command)
     args, unknown = parser.parse_known_args(given)
@@ -170,6 +188,20 @@ def _parse(given: list[str], command: str | None) -> argparse.Namespace:
     return args
 
 
+def _listing() -> str:
+    """Return the commands with what they do, group by group, as wide as the terminal."""
+    column = 4 + max(map(len, COMMANDS))
+    width = max(shutil.get_terminal_size().columns - 2, 2 * column)
+    lines = []
+    for title, commands in GROUPS.items():
+        lines.append(title)
+        for name, path in commands.items():
+            begin = f"  {name}".ljust(column)
+            lines.append(textwrap.fill(begin + _module(path).HELP, width, subsequent_indent=" " * column))
+        lines.append("")
+    return "\n".join(lines)
+
+
 def add_command(
     subparsers: argparse._SubParsersAction[Any], name: str, *, whole: bool = True
 ) -> argparse.ArgumentParser:
@@ -178,7 +210,6 @@ def add_command(
     examples = [f"  advsearch {line}\n" for line in getattr(module, "EXAMPLES", ())]
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
-        help=module.HELP,
         description=f"{module.HELP[0].upper()}{module.HELP[1:]}{getattr(module, 'MORE', '')}.",
         epilog="".join(["examples:\n", *examples]) if examples else None,
         formatter_class=argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter,

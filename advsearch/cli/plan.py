@@ -10,7 +10,7 @@ from advsearch.cli.question import QuestionCommand
 if TYPE_CHECKING:
     from advsearch.runs.results.plan import GroupDerivative, PlanResult
 
-HELP = "show how a search gets its derivatives and what it leaves out, measured on its scene, and why"
+HELP = "show how a search gets its gradients and what it leaves out, measured on its scene"
 EXAMPLES = (
     "plan --object mug --control pose,texture",
     "plan --object mug --control camera --seconds 60 --run derivatives",

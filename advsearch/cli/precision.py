@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         Recommended,
     )
 
-HELP = "draw error against run time: of the picture, of gradients and of policies, and what follows from it"
+HELP = "measure error against run time, draw it, and recommend settings"
 EXAMPLES = (
     "precision --object mug --control pose",
     "precision --object mug --control texture --seconds 300 --error 0.1 --out diagrams",

@@ -13,7 +13,7 @@ from advsearch.cli.question import Positional, QuestionCommand
 if TYPE_CHECKING:
     from advsearch.runs.results.recipe import RecipeResult
 
-HELP = "carry out an experiment that a recipe describes, with a page of figures and what they say"
+HELP = "run a whole experiment that a recipe describes, and write a page of figures"
 EXAMPLES = (
     "recipe list",
     "recipe backgrounds --quick",

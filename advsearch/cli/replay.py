@@ -11,7 +11,7 @@ from advsearch.cli.question import Positional, QuestionCommand
 if TYPE_CHECKING:
     from advsearch.runs.results.replay import ReplayResult
 
-HELP = "render the answer of a run under other conditions, each beside the clean scene"
+HELP = "render the answer of a run again under other conditions, beside the clean scene"
 EXAMPLES = (
     "replay mug-texture-001",
     "replay mug-texture-001 --ways jpeg,sensor --model torchvision:resnet18 --json",

@@ -9,7 +9,7 @@ from pathlib import Path
 from advsearch.cli import output
 from advsearch.errors import InputError
 
-HELP = "go on with a run that was stopped, where it was stopped"
+HELP = "continue a run that was stopped, from where it stopped"
 MORE = "; what it has evaluated is not rendered again"
 EXAMPLES = (
     "resume mug-texture-001",

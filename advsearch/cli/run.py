@@ -14,7 +14,7 @@ from advsearch.errors import UnknownNameError
 if TYPE_CHECKING:
     from advsearch.settings import Config
 
-HELP = "do what a YAML file describes: a run.yaml repeats its run"
+HELP = "do what a YAML file describes; the run.yaml of a run repeats it"
 
 COMMANDS = (
     *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden", "explain"),

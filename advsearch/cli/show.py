@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from advsearch.runs.listing import Listed
     from advsearch.runs.results.photos import PhotoAgreement
 
-HELP = "show what a run found, the parameters of a control, the options of a policy or a task, or a recipe"
+HELP = "show what a run found, or the details of a control, a policy, a task or a recipe"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from advsearch.evaluation.stability.case import Case
     from advsearch.runs.results.stability import StabilityResult
 
-HELP = "check numerical stability on stiff and extreme cases"
+HELP = "run stiff and extreme cases, and check that each of them holds"
 MORE = ". Exit status 3 if one falls short"
 EXAMPLES = (
     "stability",

@@ -8,7 +8,7 @@ from pathlib import Path
 from advsearch.cli import output
 from advsearch.errors import InputError
 
-HELP = "make the page of a run anew, or a folder that any web server serves"
+HELP = "write the page of a run again, or a folder that any web server can serve"
 EXAMPLES = (
     "view mug-sweep-001",
     "view mug-sweep-001 mug-sweep-002 --bundle site",

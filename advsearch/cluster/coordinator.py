@@ -108,7 +108,7 @@ class Coordinator:
         self._load_deaths = self._seen = 0
         self._counted_at = self._alone_since = self._looked_at = clock()
 
-    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
         """See `Executor.results`.
 
         Raises:
@@ -140,7 +140,7 @@ class Coordinator:
 
     # ---- giving out -------------------------------------------------------------------------------------------------
 
-    def _give_out(self, source: Iterator[range | None]) -> None:
+    def _give_out(self, source: Iterator[range]) -> None:
         while self._free:
             worker = self._free[0]
             if not self._is_there(worker):

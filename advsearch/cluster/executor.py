@@ -96,15 +96,14 @@ class Executor(Protocol):
     def facts(self) -> Workforce | None:
         """How the workers do; None where there are none."""
 
-    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
         """Carry out ranges, and yield what comes of them, in any order, each once.
 
         Only a few are taken from `ranges` before their results are asked for. Where nobody goes on asking, what is
         under way comes to nothing, and other ranges may follow.
 
         Args:
-            ranges: of numbers. None in their place says that what comes next waits for results; where none are under
-                way, it is the end.
+            ranges: of numbers.
             given: what each number stands for, where the work's settings do not say it; it may grow.
 
         Raises:
@@ -124,9 +123,7 @@ class InProcess:
     def __init__(self, call: Call) -> None:
         self._call = call
 
-    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
         """See `Executor.results`; they come in order."""
         for numbers in ranges:
-            if numbers is None:
-                return
             yield Done(numbers, self._call(numbers if given is None else given[numbers.start : numbers.stop]))

@@ -98,7 +98,7 @@ class AttackConfig(DerivativeConfig):
     object: str = setting_as_in(
         SceneConfig,
         "object",
-        description="what the model should recognise; several, separated by commas, are attacked one after the other",
+        description="the object that the model should recognise; several, separated by commas, are attacked in turn",
     )
     model: str = setting_as_in(
         SceneConfig,
@@ -109,21 +109,24 @@ class AttackConfig(DerivativeConfig):
     ensemble: Literal["mean", "worst"] | None = setting(
         None,
         "model",
-        "attack several models together with one answer: maximise the mean of their objectives, or the least of them",
+        "find one answer against several models together: maximise the mean of their objectives, or the lowest one",
         otherwise="each by itself",
     )
     measure: Literal["no", "quick", "full"] = setting(
         "quick",
         "search",
-        "measure which valid estimator of a derivative is best on this scene; full chooses step and samples too",
+        "measure which gradient estimator is best on this scene; full also measures step and samples",
     )
     policy: str | dict[str, JsonValue] = setting(
-        "auto", "search", "the rule that proposes configurations", "the name of a policy, or NAME={OPTION: VALUE}"
+        "auto",
+        "search",
+        "the search policy, which proposes configurations",
+        "the name of a policy, or NAME={OPTION: VALUE}",
     )
     steps: int | None = setting(
         None,
         "search",
-        "steps of the search, its budget in renders",
+        "number of search steps, each of which evaluates one configuration",
         otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} where pictures are predicted, "
         f"{OVER_RENDERED[0]} where they are rendered",
         ge=1,
@@ -132,7 +135,7 @@ class AttackConfig(DerivativeConfig):
     seconds: float | None = setting(
         None,
         "search",
-        "time after which the search stops; the random one beside it gets as many renders",
+        "stop the search after this time; the random search beside it gets as many renders",
         otherwise="no limit",
         unit="seconds",
         gt=0.0,
@@ -141,7 +144,7 @@ class AttackConfig(DerivativeConfig):
     step_size: float | None = setting(
         None,
         "search",
-        "first step of the policy as a share of epsilon",
+        "size of the first step, as a share of epsilon",
         otherwise="the policy's own",
         gt=0.0,
         le=2.0,
@@ -149,55 +152,61 @@ class AttackConfig(DerivativeConfig):
     target: str | None = setting(
         None,
         "search",
-        "the wrong answer that the model should give, or several",
+        "the wrong answer to aim for, or several",
         "names of classes or their numbers, separated by commas",
         otherwise="any wrong answer",
     )
     minimise: bool = setting(False, "search", "make the object easier to recognise, not harder")
-    smallest: bool = setting(False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon")
+    smallest: bool = setting(
+        False, "search", "find the smallest epsilon at which the model is wrong; --epsilon is the largest to try"
+    )
     printable: bool = setting(
         False,
         "search",
-        "prefer a texture or a patch that is smooth and of printable colours; a second search tells the cost in margin",
+        "prefer a smooth texture or patch in printable colours; a second search without this tells what it costs in "
+        "margin",
     )
     aov: str | None = setting_as_in(
         RenderConfig,
         "aov",
-        description="ground truth of each pixel, separated by commas, as layers of an EXR of the clean scene and the "
-        "answer",
+        description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for the clean "
+        "scene and the answer",
     )
     metrics: dict[str, str] = setting(
         dict,
         "run",
-        "numbers of your own for every picture, each a column of the rows",
+        "your own numbers for every picture, each a column of the rows; may be repeated",
         "NAME=package.module:function of image, output and truth",
         flag="--metric",
         metavar="NAME=FUNCTION",
         form="assignments",
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
-        None, "run", "what is told of every evaluation as it comes, through its own package", otherwise="nothing"
+        None,
+        "run",
+        "experiment tracker to which every evaluation is sent; its package has to be installed",
+        otherwise="none",
     )
     over: ControlsByName = setting_as_in(
         SceneConfig,
         "controls",
         default=dict,
-        description="controls that vary by chance: one answer has to hold for all of them",
+        description="controls that are drawn at random; one answer has to hold across the draws",
         flag="",
         min_length=None,
     )
     draws: int | None = setting(
         None,
         "search",
-        "conditions that a step of --over looks at",
-        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted, {OVER_RENDERED[1]} else",
+        "how many random conditions each step looks at, with --over",
+        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted, otherwise {OVER_RENDERED[1]}",
         ge=1,
         le=1000,
     )
     average: int = setting(
         0,
         "search",
-        "random configurations of the same space that say how often the model is wrong on average",
+        "also evaluate this many random configurations, to tell how often the model is wrong on average",
         unit="renders",
         ge=0,
         le=1_000_000,
@@ -207,14 +216,14 @@ class AttackConfig(DerivativeConfig):
         "search",
         "run a random search with as many renders beside it",
         flag="--no-baseline",
-        switched="without the random search that runs beside the search",
+        switched="skip the random search that runs beside the search as a baseline",
     )
 
     verify_spp: int | None = setting(
         None,
         "verification",
         "samples per pixel of the verification",
-        otherwise="raised until noise moves nothing",
+        otherwise="raised until the margin stands still",
         unit="samples",
         ge=1,
         le=65536,
@@ -222,7 +231,7 @@ class AttackConfig(DerivativeConfig):
     trials: int | None = setting(
         None,
         "verification",
-        "fresh renders that check the answer, and as many of the clean scene",
+        "fresh renders that verify the answer, and as many of the clean scene",
         f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be called found)",
         otherwise=f"{TRIALS}, or {TRIALS_OVER} with --over",
         unit="renders",
@@ -233,7 +242,7 @@ class AttackConfig(DerivativeConfig):
     workers: int | None = setting(
         None,
         "run",
-        "processes that share the attacks of several objects or models, or what does not wait in one attack",
+        "worker processes; they share the attacks of several objects or models, or the independent renders of one",
         otherwise="this one alone",
         unit="processes",
         ge=1,
@@ -242,10 +251,10 @@ class AttackConfig(DerivativeConfig):
     cluster: str | None = setting(
         None,
         "run",
-        "where these are",
+        "where the workers are",
         "the address of a Dask scheduler, local, or a .yaml file",
         metavar="PLACE",
-        otherwise="this machine, where there are `workers`",
+        otherwise="this machine, if there are `workers`",
         min_length=1,
     )
 

@@ -30,18 +30,18 @@ class DerivativeConfig(SceneConfig):
     epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
         None,
         "search",
-        "how far a control may go from where it starts, in its own unit (or CONTROL=NUMBER,...; in `attack` "
-        "also NUMBER,NUMBER,... for a curve)",
+        "how far a control may move from its start, in its own unit (for several controls CONTROL=NUMBER,...; in "
+        "`attack` also NUMBER,NUMBER,... for a curve)",
         f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
         otherwise="the control's own",
     )
     norm: Literal["linf", "l2"] | None = setting(
-        None, "search", "how that distance is measured", otherwise="the control's own"
+        None, "search", "norm in which epsilon is measured", otherwise="the control's own"
     )
     estimators: dict[str, str] = setting(
         dict,
         "search",
-        "force how derivatives are obtained",
+        "force a gradient estimator",
         "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
         alias="estimator",
         flag="--estimator",
@@ -49,14 +49,19 @@ class DerivativeConfig(SceneConfig):
         form="choices",
     )
     objective: str | None = setting(
-        None, "search", "what is maximised", "the name of an objective", otherwise="the task's own: margin"
+        None,
+        "search",
+        "the objective that the search maximises",
+        "the name of an objective",
+        otherwise="the task's own: margin",
     )
     specialise: bool = setting(
         True,
         "search",
         "leave out what the scene and the search don't need",
         flag="--no-specialise",
-        switched="compute what the scene and the search don't need too; `advsearch plan` shows what that is",
+        switched="compute everything, also what this search does not need; `advsearch plan` shows what is left out "
+        "otherwise",
     )
 
     @field_validator("epsilon", mode="before")

@@ -108,7 +108,7 @@ class HardenConfig(AttackConfig):
     trials: int | None = setting_as_in(AttackConfig, "trials", default=6)
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", default=32)
     workers: int | None = setting_as_in(
-        AttackConfig, "workers", description="processes that share the scenes that are drawn and attacked"
+        AttackConfig, "workers", description="worker processes that share the scenes that are drawn and attacked"
     )
     quick: bool = setting(False, "training", "minutes instead of an hour: fewer rounds, scenes and steps")
 

@@ -88,7 +88,9 @@ class PrecisionConfig(DerivativeConfig):
     steps: int = setting(32, "search", "renders of each search of a policy", ge=2, le=100_000)
     repeats: int = setting(5, "search", "searches of each policy, with other seeds", ge=1, le=1000)
     workers: int | None = setting_as_in(
-        AttackConfig, "workers", description="processes that share the references; what is timed stays in this one"
+        AttackConfig,
+        "workers",
+        description="worker processes that share the references; what is timed stays in this process",
     )
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN")

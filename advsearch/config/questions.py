@@ -22,7 +22,7 @@ class GapConfig(AttackConfig):
 
     model: str = setting_as_in(SceneConfig, "model")
     average: int = setting_as_in(AttackConfig, "average", default=200, ge=1)
-    workers: int | None = setting_as_in(AttackConfig, "workers", description="processes that share the attacks")
+    workers: int | None = setting_as_in(AttackConfig, "workers", description="worker processes that share the attacks")
 
 
 class RegionConfig(SceneConfig):

@@ -24,12 +24,15 @@ class RecipeConfig(Config):
     clashes: ClassVar[tuple[Clash, ...]] = SceneConfig.clashes
 
     recipe: str = setting(
-        ..., "recipe", "what is carried out", "the name of a recipe, which advsearch recipe list shows, or a YAML file"
+        ...,
+        "recipe",
+        "the experiment to run",
+        "the name of a recipe, which advsearch recipe list shows, or a YAML file",
     )
     quick: bool = setting(
         False,
         "recipe",
-        "small pictures and few of them, to see what comes out",
+        "few and small pictures, for a first look",
     )
     photographs: str | None = setting(
         None,
@@ -42,14 +45,14 @@ class RecipeConfig(Config):
         SceneConfig,
         "object",
         default=None,
-        description="what the model should recognise; several separated by commas",
+        description="the object that the model should recognise; several, separated by commas",
         expects=f"names of objects or {either(MESHES)} files",
         otherwise="what the recipe names",
     )
     environment: str | None = setting_as_in(
         SceneConfig,
         "environment",
-        description="what lights it; several separated by commas",
+        description="the environment map that lights the scene; several, separated by commas",
         expects="names of environments or .hdr or .exr files",
         otherwise="what the recipe names",
     )

@@ -51,7 +51,7 @@ class RenderConfig(SceneConfig):
     aov: str | None = setting(
         None,
         "picture",
-        "ground truth of each pixel, separated by commas, as layers of an EXR beside the picture",
+        "write ground truth of each pixel, names separated by commas, as layers of an EXR beside the picture",
         "names among mask, depth, normal, uv, id",
         otherwise="none",
         metavar="NAMES",

@@ -55,26 +55,26 @@ class SceneConfig(Config):
     object: str = setting(
         ...,
         "scene",
-        "what the model should recognise",
+        "the object that the model should recognise",
         f"the name of an object or a {either(MESHES)} file",
     )
     environment: str | None = setting(
         None,
         "scene",
-        "what lights it",
+        "the environment map that lights the scene",
         "the name of an environment, a .hdr or .exr file, or none",
         otherwise=DEFAULT_ENVIRONMENT,
     )
     up: Literal["y", "z"] | None = setting(
         None,
         "scene",
-        "axis of an imported object that points up",
+        "which axis of an imported object points up",
         otherwise="as the format says, or else the axis along which it stands best",
     )
     camera: str | None = setting(
         None,
         "scene",
-        "which camera of a scene file sees it",
+        "which camera of a scene file takes the picture",
         "a name that advsearch import lists, or orbit",
         metavar="NAME",
         otherwise="orbit, the one around the object that camera.* describes",
@@ -83,14 +83,16 @@ class SceneConfig(Config):
     set_: dict[str, float | str | tuple[float, ...]] = setting(
         dict,
         "scene",
-        "fix a parameter of the scene, such as camera.azimuth=130",
+        "fix a parameter of the scene, such as camera.azimuth=130; may be repeated",
         "PARAMETER=VALUE with a finite number, a name or a list of numbers",
         alias="set",
         flag="--set",
         metavar="PARAMETER=VALUE",
         form="assignments",
     )
-    exposure: float = setting(0.0, "scene", "brightness of the picture", unit="stops", ge=-10.0, le=10.0)
+    exposure: float = setting(
+        0.0, "scene", "brightness, relative to the metered exposure", unit="stops", ge=-10.0, le=10.0
+    )
     resolution: tuple[int, int] | None = setting(
         None,
         "scene",
@@ -119,8 +121,8 @@ class SceneConfig(Config):
     prompt: str | None = setting(
         None,
         "model",
-        "the text that a model is given beside a picture: what one such as CLIP compares it with, for each of labels, "
-        "or what one such as LLaVA is asked",
+        "text for a model that takes text beside the picture: for CLIP what a picture is compared with, one text for "
+        "each label; for a model such as LLaVA the question",
         "a text, for CLIP with {} where the name goes, or several with | between them",
         otherwise="a photo of a {}, or What is this?",
         metavar="TEXT",
@@ -128,13 +130,13 @@ class SceneConfig(Config):
     task: str | dict[str, JsonValue] = setting(
         "classification",
         "model",
-        "what the model is to do, and how it is judged; several with + between them, one for each of several models",
+        "what the model does, and how its answers are judged; for several models one task each, with + between them",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
     label: str | None = setting(
         None,
         "model",
-        "the right answers, separated by commas",
+        "the answers that count as right, separated by commas",
         'names of classes or their numbers, such as "coffee mug,cup" or #504',
         otherwise="the object's own",
     )
@@ -142,7 +144,7 @@ class SceneConfig(Config):
     controls: ControlsByName = setting(
         lambda: {"texture": {}},
         "search",
-        "what may change, separated by commas",
+        "what may change in the scene, separated by commas",
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
         flag="--control",
         metavar="NAME",
@@ -152,7 +154,7 @@ class SceneConfig(Config):
     texture_resolution: int | None = setting(
         None,
         "search",
-        "side of the searched texture",
+        "side length of the searched texture",
         unit="texels",
         otherwise="chosen from the object's own",
         ge=2,
@@ -161,8 +163,8 @@ class SceneConfig(Config):
     spp: int | Literal["auto"] | None = setting(
         None,
         "search",
-        "samples per pixel of a render of the search; auto takes half of the default, and looks again at the best ones "
-        "while it is close between them",
+        "samples per pixel of a render of the search; auto takes half of the default, and renders the best candidates "
+        "again while they are close",
         "a whole number from 1 to 65536, or auto",
         otherwise="8 with the denoiser, 16 without",
         unit="samples",
@@ -171,24 +173,24 @@ class SceneConfig(Config):
     pixel_sampler: Literal["independent", "multijitter"] = setting(
         "multijitter",
         "search",
-        "how samples are spread over a pixel, in search and verification; independent ones have more noise, but come "
-        "in any number: multijitter rounds up to products of two near numbers",
+        "how samples are spread over a pixel, in search and verification; multijitter has less noise and rounds the "
+        "number of samples up to a product of two near numbers",
     )
 
     seed: int = setting(
-        0, "run", "root of every random stream", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1
+        0, "run", "seed of all random numbers", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1
     )
-    threads: int | None = setting(None, "run", "processor threads", otherwise="all", ge=1, le=1024)
-    deterministic: bool = setting(False, "run", "the same numbers bit for bit, at some cost in time")
+    threads: int | None = setting(None, "run", "number of processor threads", otherwise="all", ge=1, le=1024)
+    deterministic: bool = setting(False, "run", "use one thread, so that a run repeats bit for bit; slower")
     run: str | None = setting(
         None,
         "run",
-        "where the run is kept",
+        "where the run is stored",
         "a name (kept in runs/) or the path of a folder",
         otherwise="runs/OBJECT-CONTROL-NNN",
         min_length=1,
     )
-    overwrite: bool = setting(False, "run", "replace a run that is there already")
+    overwrite: bool = setting(False, "run", "replace a run that is already there")
 
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneConfig:

@@ -40,24 +40,24 @@ class SweepConfig(SceneConfig):
     object: str = setting_as_in(
         SceneConfig,
         "object",
-        description="what the model should recognise; several separated by commas",
+        description="the object that the model should recognise; several, separated by commas",
         expects=f"names of objects or {either(MESHES)} files",
     )
     environment: str | None = setting_as_in(
         SceneConfig,
         "environment",
-        description="what lights it; several separated by commas",
+        description="the environment map that lights the scene; several, separated by commas",
         expects="names of environments or .hdr or .exr files",
     )
     model: str = setting_as_in(
         SceneConfig,
         "model",
-        description="the network under test; several separated by commas are shown the same pictures",
+        description="the network under test; several, separated by commas, are shown the same pictures",
     )
     grid: Grid = setting(
         dict,
         "sweep",
-        "an axis of the grid; may be repeated",
+        "one axis of the grid; may be repeated",
         "PARAMETER=FIRST:LAST:COUNT, or values separated by commas",
         metavar="PARAMETER=VALUES",
         form="axes",
@@ -67,14 +67,14 @@ class SweepConfig(SceneConfig):
         "controls",
         default=dict,
         group="sweep",
-        description="what is drawn by chance beside the grid, separated by commas",
+        description="controls that are drawn at random at each grid point, separated by commas",
         min_length=None,
     )
     answer_of: str | None = setting(
         None,
         "sweep",
-        "a run of attack whose answer is swept beside the clean scene, under the same draws; it brings scene and model "
-        "with it, and what its --over drew where nothing else varies",
+        "sweep the answer of this attack beside the clean scene, under the same draws; scene and model come from that "
+        "run, and so does what its --over drew if nothing else varies",
         "the name or the folder of a run",
         metavar="RUN",
         otherwise="none",
@@ -83,23 +83,23 @@ class SweepConfig(SceneConfig):
     samples: int | None = setting(
         None,
         "sweep",
-        "draws of the controls at each point of the grid",
+        "number of random draws at each grid point",
         otherwise="1, or 100 without a grid",
         ge=1,
         le=1_000_000_000,
     )
-    sampler: Literal["sobol", "random"] = setting("sobol", "sweep", "how the draws are made")
+    sampler: Literal["sobol", "random"] = setting(
+        "sobol", "sweep", "how the draws are made: evenly spread, or independent"
+    )
     batch: int = setting(
         16,
         "sweep",
-        "pictures that the model sees at once, and that are stored at once",
+        "pictures that are classified and stored together",
         unit="pictures",
         ge=1,
         le=1024,
     )
-    keep_pictures: Literal["all", "wrong", "none"] = setting(
-        "none", "sweep", "answers of which small pictures are kept, to look at"
-    )
+    keep_pictures: Literal["all", "wrong", "none"] = setting("none", "sweep", "keep small pictures of these answers")
     specialise: bool = setting_as_in(
         DerivativeConfig,
         "specialise",
@@ -111,29 +111,32 @@ class SweepConfig(SceneConfig):
         RenderConfig,
         "aov",
         group="sweep",
-        description="ground truth of each pixel, separated by commas, as layers of an EXR for every configuration",
+        description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for every "
+        "configuration",
     )
-    surface: bool = setting(False, "sweep", "map which parts of the object's surface, when seen, go with wrong answers")
+    surface: bool = setting(
+        False, "sweep", "map which parts of the object's surface, when visible, go with wrong answers"
+    )
     spp: int | None = setting_as_in(
-        SceneConfig, "spp", group="sweep", description="samples per pixel of a picture", expects="", ge=1, le=65536
+        SceneConfig, "spp", group="sweep", description="samples per pixel of each picture", expects="", ge=1, le=65536
     )
     trials: int = setting(
         20,
         "verification",
-        "fresh renders that check the worst configuration; 0 for none",
+        "fresh renders that verify the worst configuration; 0 for none",
         f"0, or a whole number from {FEWEST_TRIALS} to 100000",
         unit="renders",
         ge=0,
         le=100_000,
     )
-    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these")
+    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these trials")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
     metrics: dict[str, str] = setting_as_in(AttackConfig, "metrics")
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(AttackConfig, "log")
     workers: int | None = setting_as_in(
         AttackConfig,
         "workers",
-        description="processes that share the work, each on one thread unless `threads` says more",
+        description="worker processes that share the sweep, each with one thread unless `threads` says more",
     )
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
 

@@ -13,7 +13,6 @@ from advsearch.controls.base import NOTHING, BoundControl, Group, Value
 from advsearch.controls.clean import Moved
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
-from advsearch.scene.gradients.plan import WITH_BOUNDARY
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +49,9 @@ class Space:
     def groups(self) -> tuple[Group, ...]:
         """Every group of coordinates in the order of u, without an estimator yet.
 
-        Adjoints with boundary terms know neither a medium nor a backdrop nor a thin lens nor the edges of cut-outs, nor
-        where a normal of a normal map turns away from the camera, nor meshes that emit light, so that they are not
-        valid beside these.
+        The material form knows neither a medium nor a backdrop nor a thin lens nor the edges of cut-outs, nor where a
+        normal of a normal map turns away from the camera, nor meshes that emit light, so that it is not valid beside
+        these.
         """
         scene = self.scene
         unknown = scene is not None and (
@@ -66,7 +65,7 @@ class Space:
         found, begin = [], 0
         for control in self.controls:
             for group in control.groups:
-                valid = tuple(one for one in group.valid if not (unknown and one in WITH_BOUNDARY))
+                valid = tuple(one for one in group.valid if not (unknown and one == "material"))
                 found.append(replace(group, control=control.name, begin=begin, valid=valid))
                 begin += group.size
         return tuple(found)

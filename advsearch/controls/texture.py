@@ -123,7 +123,7 @@ class TextureControl(Control):
             0.0,
             "Strength of each wave in each colour channel (form waves).",
             search=(-1.0, 1.0),
-            estimators=("adjoint", "simultaneous"),
+            estimators=("adjoint",),
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
@@ -305,7 +305,7 @@ class Waved(Painter):
         self._across = torch.cos(math.pi * (torch.arange(width) + 0.5)[:, None] * number / width)
         self._reach = (WAVE_REACH / (1.0 + torch.hypot(number[:, None].float(), number[None, :].float())))[..., None]
         self.start = torch.full((count * count * 3,), 0.5)
-        self.group = Group("amplitudes", len(self.start), ("adjoint", "simultaneous"))
+        self.group = Group("amplitudes", len(self.start), ("adjoint",))
 
     def texels(self, u: Tensor) -> Tensor:
         original, where, reach, down, across = (

@@ -7,11 +7,14 @@ two step sizes, repeated with other seeds until its own noise is known and small
 
 from __future__ import annotations
 
+import base64
 import math
 import statistics
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,8 +40,6 @@ CONFIDENCE = 2.5
 """Standard errors within which two means agree."""
 TURNED = 0.0317
 """Share of a full turn by which periodic coordinates are off their start where gradients are measured."""
-EXPENSIVE = frozenset({"guided", "boundary"})
-"""Estimators that are measured only when asked for."""
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
 """Steps of differences that are tried in turn, as multiples of the plan's. A step that moves an outline by a pixel is
 as wide as a classifier's loss allows; a smooth loss allows more, and noise falls with the step. What moves no outline
@@ -194,12 +195,64 @@ def estimated(
 ) -> Tensor:
     """Return one gradient (d,) of the groups of these names by one estimator, its differences `factor` times as wide
     as planned; zero elsewhere."""
-    before = renderer.plan
-    renderer.plan = only(before.with_steps(factor), names, estimator)
+    return _by(renderer, loss, u, only(renderer.plan.with_steps(factor), names, estimator), seed, spp)
+
+
+def _by(renderer: Renderer, loss: Loss, u: Tensor, plan: GradientPlan, seed: int, spp: int) -> Tensor:
+    """One gradient (d,) by a plan of its own."""
+    before, renderer.plan = renderer.plan, plan
     try:
         return renderer.gradient(loss, u, seed, spp)[1]
     finally:
         renderer.plan = before
+
+
+Keep = Callable[[str, Callable[[], Any]], Any]
+"""From the name of a measurement, and what makes it, to a JSON value: one that is known already, or what it makes."""
+
+
+def measured_now(name: str, measure: Callable[[], Any]) -> Any:
+    """Return what a measurement makes: the `Keep` that keeps nothing."""
+    return measure()
+
+
+def gradients(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    plan: GradientPlan,
+    stream: str,
+    *,
+    seed: int,
+    spp: int,
+    repeats: int,
+    keep: Keep = measured_now,
+    place: str = "",
+    tick: Callable[[], None] = lambda: None,
+) -> tuple[Tensor, float]:
+    """Return gradients (repeats, d) at u by a plan, zero where it takes no derivative, and the median seconds of one.
+
+    Each has a seed of its own: a number in the `stream` of the root `seed`. `keep` is asked for each, as `place` and
+    its number; `tick` is called after each.
+    """
+    parts = [one.coordinates for one in plan.groups if one.estimator != "none"]
+
+    def timed(number: int) -> dict[str, Any]:
+        begun = time.perf_counter()
+        gradient = _by(renderer, loss, u, plan, seeds.stream(seed, stream, number), spp)
+        taken = torch.cat([gradient[part] for part in parts])
+        numbers = base64.b64encode(taken.to(torch.float32).numpy().tobytes()).decode("ascii")
+        return {"seconds": time.perf_counter() - begun, "numbers": numbers}
+
+    found, times = torch.zeros(repeats, len(u)), []
+    for number in range(repeats):
+        one = keep(f"{place} gradient {number}", partial(timed, number))
+        numbers = torch.frombuffer(bytearray(base64.b64decode(one["numbers"])), dtype=torch.float32)
+        for part, values in zip(parts, numbers.split([part.stop - part.start for part in parts]), strict=True):
+            found[number, part] = values
+        times.append(one["seconds"])
+        tick()
+    return found, statistics.median(times)
 
 
 def estimates(
@@ -215,20 +268,12 @@ def estimates(
     factor: float = 1.0,
 ) -> list[Estimate]:
     """Measure one estimator of one control's groups along some probes of them; `factor` as in `estimated`."""
-    values: list[list[float]] = [[] for _ in along]
-    seconds = []
-    names = {probe.group.name for probe in along}
-    for number in range(repeats):
-        begun = time.perf_counter()
-        noise = seeds.stream(seed, estimator if factor == 1.0 else f"{estimator} x {factor:g}", number)
-        gradient = estimated(renderer, loss, u, estimator, names, noise, spp, factor)
-        seconds.append(time.perf_counter() - begun)
-        for found, probe in zip(values, along, strict=True):
-            found.append(float(gradient @ probe.direction))
-    typical = statistics.median(seconds)
+    plan = only(renderer.plan.with_steps(factor), {probe.group.name for probe in along}, estimator)
+    stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
+    found, seconds = gradients(renderer, loss, u, plan, stream, seed=seed, spp=spp, repeats=repeats)
+    values = [[float(one @ probe.direction) for one in found] for probe in along]
     return [
-        Estimate(estimator, statistics.fmean(found), statistics.stdev(found), repeats, typical, factor)
-        for found in values
+        Estimate(estimator, statistics.fmean(each), statistics.stdev(each), repeats, seconds, factor) for each in values
     ]
 
 

@@ -65,9 +65,23 @@ MOST_NUMBERS = 4096
 
 
 def summarise(
-    config: AttackConfig, findings: Findings, journal: Journal, stages: Stages, warnings: Sequence[str]
+    config: AttackConfig,
+    objective: str | None,
+    findings: Findings,
+    journal: Journal,
+    stages: Stages,
+    warnings: Sequence[str],
 ) -> AttackResult:
-    """Put the result together and, if there is a run directory, write its files."""
+    """Put the result together and, if there is a run directory, write its files.
+
+    Args:
+        config: the settings.
+        objective: its name; None for the task's own.
+        findings: of the attack.
+        journal: of the run.
+        stages: how long each took.
+        warnings: on the way.
+    """
     problem, search = journal.problem, findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
@@ -86,7 +100,7 @@ def summarise(
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         write_answer(run.path, u.numpy())
-    summary = _summary(config, problem, findings, clean, adversarial)
+    summary = _summary(config, objective, problem, findings, clean, adversarial)
     kept = {"run": None if run is None else str(run.path), "warnings": warnings}
     shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
     summary = summary.model_copy(
@@ -113,7 +127,12 @@ def summarise(
 
 
 def _summary(
-    config: AttackConfig, problem: Problem, findings: Findings, clean: KeptPicture, adversarial: KeptPicture
+    config: AttackConfig,
+    objective: str | None,
+    problem: Problem,
+    findings: Findings,
+    clean: KeptPicture,
+    adversarial: KeptPicture,
 ) -> AttackSummary:
     """All but where it is kept, how long it took and what there is to say."""
     task, search, baseline = problem.task, findings.search, findings.baseline
@@ -129,7 +148,7 @@ def _summary(
         environment=problem.environment,
         controls=list(budgets),
         policy=config.policy_name,
-        objective=config.objective or task.objective,
+        objective=objective or task.objective,
         epsilon=_alone({name: budget.epsilon for name, budget in budgets.items()}),
         norm=_alone({name: budget.norm for name, budget in budgets.items()}),
         label_set=list(task.truth_names(problem.truth())),

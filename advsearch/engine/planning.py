@@ -8,24 +8,20 @@ to noise).
 
 from __future__ import annotations
 
-import base64
 import itertools
 import statistics
-import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.engine.gradients import EXPENSIVE, Loss, estimated, only
+from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
 from advsearch.runs.results.check import GradientStatus
 from advsearch.runs.results.plan import CosineRow
 from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, compared
 from advsearch.scene.renderer import Renderer
 
 GOAL = 0.9
@@ -37,10 +33,6 @@ COUNTS = (8, 16, 32, 64, 128)
 """Sample counts that are tried."""
 ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
-MANY = 16
-"""Coordinates of one control over which differences are not compared with an adjoint: one by one they take too many
-renders, and the error of random directions is which ones they skip, so that no number of samples brings them to the
-goal."""
 CONVERGED, AGAIN = 128, 4
 """Samples a pixel of a gradient that counts as converged, and times as many where these do not agree, or where a
 working gradient has more."""
@@ -50,14 +42,6 @@ TELLS = 0.5
 """Converged gradients of which two have a smaller cosine than this tell nothing: the cosine of the mean of three with
 the truth is then about sqrt(3 c / (1 + 2 c)) (Spearman and Brown), 0.87 and less. Above it the noise of the converged
 one, which is independent of the working one's, only makes the measured cosine smaller: what is called `ok` is so."""
-
-Keep = Callable[[str, Callable[[], Any]], Any]
-"""From the name of a measurement, and what makes it, to a JSON value: one that is known already, or what it makes."""
-
-
-def measured_now(name: str, measure: Callable[[], Any]) -> Any:
-    """Return what a measurement makes: the `Keep` that keeps nothing."""
-    return measure()
 
 
 def status_of(cosine: float, converged: float) -> GradientStatus:
@@ -75,8 +59,8 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
 
     Args:
         plan: the plan so far. What was forced is not contested.
-        every: compare all that are valid; otherwise only the adjoints and the first kind of differences, and only where
-            an adjoint is preferred so far: over poses, the model's loss is so rough that none has won.
+        every: compare wherever several are valid; otherwise only where the interior adjoint is preferred so far: over
+            poses, the model's loss is so rough that none has won, and over shapes the material form is the quietest.
     """
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in plan.groups:
@@ -85,14 +69,8 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
         sets.setdefault((group.control, group.valid), []).append(group)
     found = []
     for (_, valid), groups in sets.items():
-        usable = [one for one in valid if one not in EXPENSIVE]
-        by_differences = [one for one in usable if one in BY_DIFFERENCES]
-        size = sum(group.size for group in groups)
-        if size > MANY:
-            by_differences = []
-        adjoints = [one for one in usable if one in BY_ADJOINT]
-        candidates = tuple(adjoints + (by_differences if every else by_differences[:1]))
-        if len(candidates) > 1 and (every or valid[0] in BY_ADJOINT):
+        candidates = compared(valid, sum(group.size for group in groups))
+        if len(candidates) > 1 and (every or valid[0] == "adjoint"):
             found.append((tuple(groups), candidates))
     return found
 
@@ -135,8 +113,9 @@ def measured_plan(
         keep: asked for each gradient, by a name.
     """
     plan = renderer.plan
+    taken = partial(gradients, renderer, loss, u, seed=seed, spp=spp, keep=keep, tick=tick)
     for groups, candidates in contested(plan, every=every):
-        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats, counted, tick, keep)
+        scores = _scores(plan, groups, candidates, taken, repeats, counted)
         best = min(scores, key=lambda name: scores[name])
         time = "renders" if counted else "time"
         reason = f"least squared error x {time}, measured at {spp} samples"
@@ -157,51 +136,32 @@ def measured_plan(
 
 
 def _scores(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
+    plan: GradientPlan,
     groups: Sequence[Group],
     candidates: Sequence[str],
-    seed: int,
-    spp: int,
+    taken: Callable[..., tuple[Tensor, float]],
     repeats: int,
     counted: bool,
-    tick: Callable[[], None],
-    keep: Keep,
 ) -> dict[str, float]:
     """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
-    noise is taken off the others' errors. Random directions are no reference: where there are no other differences,
-    each has its own scatter for an error."""
-    names = {group.name for group in groups}
-    gradients: dict[str, Tensor] = {}
+    noise is taken off the others' errors."""
+    found: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
-
-    def timed(estimator: str, number: int) -> TimedGradient:
-        begun, noise = time.perf_counter(), seeds.stream(seed, "plan", number)
-        gradient = estimated(renderer, loss, u, estimator, names, noise, spp)
-        return {"seconds": time.perf_counter() - begun, "gradient": _packed(gradient, groups)}
-
     for estimator in candidates:
-        found, times = [], []
-        for number in range(repeats):
-            one = keep(f"{groups[0].name} by {estimator} {number}", partial(timed, estimator, number))
-            found.append(_unpacked(one["gradient"], groups, u))
-            times.append(one["seconds"])
-            tick()
-        cost = 1.0 + only(renderer.plan, names, estimator).renders
-        cost += ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
-        gradients[estimator], seconds[estimator] = torch.stack(found), cost if counted else statistics.median(times)
+        alone = only(plan, {group.name for group in groups}, estimator)
+        place = f"{groups[0].name} by {estimator}"
+        found[estimator], seconds[estimator] = taken(alone, "plan", repeats=repeats, place=place)
+        if counted:
+            seconds[estimator] = 1.0 + alone.renders + (ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0)
     own = {
-        estimator: float((found - found.mean(dim=0)).square().sum() / max(1, repeats - 1))
-        for estimator, found in gradients.items()
+        estimator: float((several - several.mean(dim=0)).square().sum() / max(1, repeats - 1))
+        for estimator, several in found.items()
     }
-    judge = next((one for one in candidates if one in BY_DIFFERENCES - {"simultaneous"}), None)
-    if judge is None:
-        return {estimator: own[estimator] * seconds[estimator] for estimator in gradients}
-    truth = gradients[judge].mean(dim=0)
+    judge = next(one for one in candidates if one in BY_DIFFERENCES)
+    truth = found[judge].mean(dim=0)
     scores = {}
-    for estimator, found_all in gradients.items():
-        error = float((found_all - truth).square().sum(dim=1).mean()) - own[judge] / repeats
+    for estimator, several in found.items():
+        error = float((several - truth).square().sum(dim=1).mean()) - own[judge] / repeats
         scores[estimator] = (own[judge] if estimator == judge else max(error, own[estimator])) * seconds[estimator]
     return scores
 
@@ -242,7 +202,7 @@ def cosines(
     `controls` only these are measured. `tick` is called after each gradient with the samples a pixel that it took;
     `cosine_samples` bounds their sum. `keep` is asked for each gradient, by a name.
     """
-    base = renderer.plan
+    base, taken = renderer.plan, partial(gradients, renderer, loss, u, seed=seed, keep=keep)
     for control in dict.fromkeys(group.control for group in base.groups):
         names = {one.name for one in base.groups if one.control == control and one.estimator != "none"}
         if not names or (controls is not None and control not in controls):
@@ -257,7 +217,7 @@ def cosines(
             if plan in tried:  # no step can be wider
                 continue
             tried.append(plan)
-            for row in _cosines_at(renderer, plan, loss, u, factor, seed, counts, repeats, tick, keep):
+            for row in _cosines_at(plan, taken, factor, counts, repeats, renderer.formation.denoiser, tick):
                 reached = reached or row.status == "ok"
                 yield row
 
@@ -270,45 +230,23 @@ def _silenced(plan: GradientPlan, names: set[str]) -> GradientPlan:
 
 
 def _cosines_at(
-    renderer: Renderer,
     plan: GradientPlan,
-    loss: Loss,
-    u: Tensor,
+    taken: Callable[..., tuple[Tensor, float]],
     factor: float,
-    seed: int,
     counts: Sequence[int],
     repeats: int,
+    denoiser: str,
     tick: Callable[[int], None],
-    keep: Keep,
 ) -> Iterator[CosineRow]:
     """The rows of the one control that a plan differentiates, at its step."""
-    groups = [one for one in plan.groups if one.estimator != "none"]
-    control = groups[0].control
+    control = next(one.control for one in plan.groups if one.estimator != "none")
     place = f"{control} x {factor:g}"
 
-    def gradient(stream: str, number: int, spp: int) -> Tensor:
-        before, renderer.plan = renderer.plan, plan
-        try:
-            return renderer.gradient(loss, u, seeds.stream(seed, stream, number), spp)[1]
-        finally:
-            renderer.plan = before
-
-    def witness(spp: int, number: int) -> str:
-        return _packed(gradient("converged", number, spp), groups)
-
     def converged(spp: int) -> tuple[Tensor, float]:
-        found = []
-        for k in range(WITNESSES):
-            kept = keep(f"{place} converged {spp} {k}", partial(witness, spp, k))
-            found.append(_unpacked(kept, groups, u))
-            tick(spp)
+        named = f"{place} converged {spp}"
+        found, _ = taken(plan, "converged", spp=spp, repeats=WITNESSES, place=named, tick=partial(tick, spp))
         agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(found, 2)])
-        return torch.stack(found).mean(dim=0), float(agreements.min())  # NaN if one is
-
-    def working(spp: int, number: int) -> TimedCosine:
-        begun = time.perf_counter()
-        found = gradient("working", number, spp)
-        return {"seconds": time.perf_counter() - begun, "cosine": _cosine(found, truth)}
+        return found.mean(dim=0), float(agreements.min())  # NaN if one is
 
     many = CONVERGED
     truth, agreement = converged(many)
@@ -316,52 +254,22 @@ def _cosines_at(
         if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
             many = AGAIN * CONVERGED
             truth, agreement = converged(many)
-        tried = []
-        for number in range(repeats):
-            tried.append(keep(f"{place} {spp} {number}", partial(working, spp, number)))
-            tick(spp)
-        mean = statistics.fmean(one["cosine"] for one in tried)
+        found, seconds = taken(
+            plan, "working", spp=spp, repeats=repeats, place=f"{place} {spp}", tick=partial(tick, spp)
+        )
+        mean = statistics.fmean(_cosine(one, truth) for one in found)
         yield CosineRow(
-            denoise=renderer.formation.denoiser,
+            denoise=denoiser,
             control=control,
             factor=factor,
             spp=spp,
             cosine=mean,
             converged=agreement,
-            seconds=statistics.median(one["seconds"] for one in tried),
+            seconds=seconds,
             status=status_of(mean, agreement),
         )
         if mean >= GOAL:
             break
-
-
-class TimedGradient(TypedDict):
-    """What is stored of one gradient: seconds, and its numbers; see `_packed`."""
-
-    seconds: float
-    gradient: str
-
-
-class TimedCosine(TypedDict):
-    """What is stored of one working gradient: seconds, and its cosine with the converged one."""
-
-    seconds: float
-    cosine: float
-
-
-def _packed(gradient: Tensor, groups: Sequence[Group]) -> str:
-    """The numbers of some groups as text: float32 in base 64."""
-    part = torch.cat([gradient[one.coordinates] for one in groups])
-    return base64.b64encode(part.to(torch.float32).numpy().tobytes()).decode("ascii")
-
-
-def _unpacked(text: str, groups: Sequence[Group], u: Tensor) -> Tensor:
-    """The gradient (d,) that `_packed` packed; zero elsewhere."""
-    part = torch.frombuffer(bytearray(base64.b64decode(text)), dtype=torch.float32)
-    gradient = torch.zeros_like(u)
-    for one, values in zip(groups, part.split([one.size for one in groups]), strict=True):
-        gradient[one.coordinates] = values
-    return gradient
 
 
 def _cosine(one: Tensor, other: Tensor) -> float:

@@ -285,8 +285,7 @@ class Transport(Predictor):
         return self._start
 
     def passed(self, query: Query) -> None:
-        if query.phase == "search":
-            self._compared(query)
+        self._compared(query)
 
     def evaluate(self, query: Query) -> Evaluation:
         renderer = self._compared(query)
@@ -313,7 +312,7 @@ class Transport(Predictor):
     def _compared(self, query: Query) -> PredictingRenderer | None:
         """The matrix to predict an evaluation with, compared and made anew where that is due; None gives up."""
         kind, number = query.kind, query.number
-        if number >= self._end(kind):
+        if query.phase != "search" or number >= self._end(kind):
             return None
         place = self._present.setdefault(kind, self._begin)
         if number and number % EVERY == 0 and kind.startswith("search"):

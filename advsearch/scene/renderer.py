@@ -29,7 +29,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import ImageFormation, levels_of
-from advsearch.scene.gradients.differences import central, one_sided, random_directions
+from advsearch.scene.gradients.differences import central
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.motion import Motion, steps_for
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, first_plan
@@ -312,7 +312,7 @@ class Renderer:
         noise = seeds.stream(self.root_seed, "gradient", seed)
         cotangent = self._finite(cotangent[..., :3])
         found, left = dict[str, Tensor](), list(inputs)
-        for estimator in ("material", "boundary", "guided", "adjoint"):  # what two reach goes to the more general one
+        for estimator in ("material", "adjoint"):  # what two reach goes to the more general one
             groups = [group for group in self.plan.groups if group.estimator == estimator]
             reached = set[str]().union(*(self.routes.get(group.name, ()) for group in groups))
             if estimator == "adjoint":
@@ -325,7 +325,7 @@ class Renderer:
                 meshes = sorted({name.rpartition(".")[0] for name in wrt})
                 gradients = self.scene.material_adjoint(inputs, cotangent, noise, spp, meshes=meshes)
             else:
-                method = {"adjoint": "hidden" if hide else "path"}.get(estimator, estimator)
+                method = "hidden" if hide else "path"
                 gradients = self.scene.adjoint(inputs, cotangent, noise, spp, wrt=wrt, method=method)
             self.gradients += 1
             for name, gradient in gradients.items():
@@ -359,10 +359,7 @@ class Renderer:
             return (cotangent * self._picture(at, noise, spp)).sum()
 
         for group in self._differenced():
-            if group.estimator in ("differences", "secant"):
-                central(value, group, u, found)
-        one_sided(value, self.plan.having("forward"), u, found)
-        random_directions(value, self.plan.having("simultaneous"), u, noise, found)
+            central(value, group, u, found)
         return self._finite(found)
 
     # ---- set-up -----------------------------------------------------------------------------------------------------

@@ -12,9 +12,9 @@ from functools import partial
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.parameters import Parameter
 
-GEOMETRIC = ("secant", "differences", "material", "simultaneous", "boundary")
+GEOMETRIC = ("secant", "differences", "material")
 """Valid estimators for what moves a mesh."""
-ORBIT = ("secant", "differences", "forward", "simultaneous")
+ORBIT = ("secant", "differences")
 """Mitsuba has no derivative of sensors, so a camera is differentiated by differences."""
 CHANNELS = ("red", "green", "blue")
 LIT = ("adjoint", "differences")

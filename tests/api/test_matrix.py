@@ -16,7 +16,7 @@ from torch import Tensor
 import advsearch
 from advsearch.api import parts
 from advsearch.api.attack import attack_from_config
-from advsearch.api.gap import answering_of
+from advsearch.api.gap import models_answering
 from advsearch.attacks import get_objective
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, GapConfig
@@ -95,13 +95,13 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"
 
 
-def test_workers_make_the_answering_of_the_trials(
+def test_workers_make_the_pictures_of_the_trials(
     whole: MatrixResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of three configurations six for each model, whose input sizes differ; the rows stay."""
     run = tmp_path / "run"
     config = AttackConfig(**{**SHORT, "model": BOTH, "run": str(run)})
-    ready = shared(monkeypatch, config.plain(), answering_of)
+    ready = shared(monkeypatch, config.plain(), models_answering)
     monkeypatch.setattr(parts, "executor_of", lambda work, **_: nullcontext(None))
     result = carried_out(run, workers=2)
     assert isinstance(result, MatrixResult) and len(ready.given) == 3 * 2 * 6

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Ending, Trials, verify
+from advsearch.attacks import Block, Domain, Ending, Evaluation, Trials, verify
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.tasks import Answer, Judgement
 
@@ -18,13 +17,8 @@ def trials(values: list[tuple[float, bool]]) -> list[Judgement]:
 
 
 def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
-    answers = iter(trials(found))
-
-    def render(u: Tensor, seed: int, spp: int) -> Judgement:
-        return next(answers)
-
     result = verify(
-        render,
+        lambda queries: map(Evaluation.of, trials(found)),
         DOMAIN,
         DOMAIN.start,
         claim=Ending.BUDGET_SPENT,

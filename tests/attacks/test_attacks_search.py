@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import pytest
@@ -13,23 +14,29 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import (
+    CMAES,
     NES,
     PGD,
     Block,
     Domain,
     Ending,
+    Evaluate,
     Evaluated,
     Evaluation,
     Policy,
     Proposal,
+    Query,
     Random,
+    Restarts,
     StepRecord,
     planned_renders,
     search,
 )
 from advsearch.attacks.candidates import Candidate, admit, best, contenders, with_last
+from advsearch.attacks.evaluation import MOST
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
+from advsearch.seeds import stream
 
 DOMAIN = Domain(torch.full((3,), 0.5), (Block(3, "linf", 0.2),))
 
@@ -40,6 +47,7 @@ class Script(Policy[int]):
 
     us: tuple[Any, ...]
     gradient: bool = False
+    at_once: int = 1
     name: ClassVar[str] = "script"
     uses_gradient: ClassVar[bool] = False
 
@@ -47,7 +55,8 @@ class Script(Policy[int]):
         return 0
 
     def propose(self, state: int, n: int) -> tuple[tuple[Proposal, ...], int]:
-        return tuple(Proposal(u, self.gradient) for u in self.us[state : state + 1]), state + 1
+        end = state + min(n, self.at_once)
+        return tuple(Proposal(u, self.gradient) for u in self.us[state:end]), end
 
     def update(self, state: int, evaluated: Evaluated) -> int:
         for _, evaluation in evaluated:
@@ -60,14 +69,18 @@ def at(value: float) -> Tensor:
     return torch.full((3,), 0.5 + value)
 
 
-def objective_is(value: Callable[[Tensor, int], float]) -> Callable[..., Evaluation]:
-    """An `evaluate` whose margin is a function of u and the seed index."""
+INDEX = {stream(0, "search", index): index for index in range(3000)}
+"""Which of a search's seeds one is."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        v = value(u, index)
-        return Evaluation(v, torch.ones_like(u) if gradient else None, v > 0)
 
-    return evaluate
+def objective_is(value: Callable[[Tensor, int], float]) -> Evaluate:
+    """An `evaluate` whose margin is a function of u and the index of the seed."""
+
+    def evaluate(query: Query) -> Evaluation:
+        v = value(query.u, INDEX[query.seed])
+        return Evaluation(v, torch.ones_like(query.u) if query.gradient else None, v > 0)
+
+    return partial(map, evaluate)
 
 
 RISE = objective_is(lambda u, index: float(u[0] - 0.5))
@@ -95,8 +108,10 @@ def test_without_a_success_the_ending_is_budget_spent() -> None:
 
 def test_every_evaluation_has_its_own_seed_and_ranking_shares_new_ones() -> None:
     result = search(RISE, DOMAIN, Script((at(-0.1), at(0.1), at(0.0))), steps=3, seed=0, candidates=2, repeats=3)
-    assert [r.index for r in result.history] == [0, 1, 2]
-    assert [r.index for r in result.ranking] == [3, 4, 5, 3, 4, 5]
+    assert [INDEX[r.seed] for r in result.history] == [0, 1, 2]
+    assert [INDEX[r.seed] for r in result.ranking] == [3, 4, 5, 3, 4, 5]
+    other = search(sampled([]), DOMAIN, Script((at(0.0),)), steps=1, seed=0, candidates=0, kind="baseline", noise=7)
+    assert [r.seed for r in other.history] == [stream(7, "baseline", 0)]
 
 
 def test_the_last_gradient_is_not_asked_for() -> None:
@@ -151,16 +166,16 @@ def test_ranking_takes_the_winners_curse_out() -> None:
 # ---- what an evaluation costs
 
 
-def priced(cost: int, log: list[tuple[int, bool | str]]) -> Callable[..., Evaluation]:
+def priced(cost: int, log: list[tuple[int, bool | str]]) -> Evaluate:
     """RISE with gradients that cost so many renders more; notes what was asked for."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        log.append((index, gradient))
-        derivative = torch.ones_like(u) if gradient else None
-        extra = cost if gradient is True else 0
-        return Evaluation(float(u[0] - 0.5), derivative, False, cost=1 + extra)
+    def evaluate(query: Query) -> Evaluation:
+        log.append((INDEX[query.seed], query.gradient))
+        derivative = torch.ones_like(query.u) if query.gradient else None
+        extra = cost if query.gradient is True else 0
+        return Evaluation(float(query.u[0] - 0.5), derivative, False, cost=1 + extra)
 
-    return evaluate
+    return partial(map, evaluate)
 
 
 @pytest.mark.parametrize(
@@ -207,11 +222,11 @@ def test_an_interrupt_counts_what_was_rendered() -> None:
 
 @pytest.mark.parametrize("cost", [0, 2])
 def test_an_evaluation_that_costs_what_nobody_said_is_a_bug(cost: int) -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(0.0, torch.ones_like(u) if gradient else None, False, cost=cost)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(0.0, torch.ones_like(query.u) if query.gradient else None, False, cost=cost)
 
     with pytest.raises(RuntimeError, match=f"evaluate took {cost} renders; expected 1 to 1"):
-        search(evaluate, DOMAIN, PGD(), steps=5, seed=0)
+        search(partial(map, evaluate), DOMAIN, PGD(), steps=5, seed=0)
 
 
 # ---- more samples
@@ -229,13 +244,13 @@ class Samples(Script):
         return (Proposal(self.us[state], self.gradient, samples=self.samples[state]),), state + 1
 
 
-def sampled(log: list[tuple[bool, int]], extra: int = 0) -> Callable[..., Evaluation]:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        log.append((bool(gradient), samples))
-        slope = torch.ones_like(u) if gradient else None
-        return Evaluation(float(u[0]), slope, False, cost=samples * (1 + extra * bool(gradient)))
+def sampled(log: list[tuple[bool, int]], extra: int = 0) -> Evaluate:
+    def evaluate(query: Query) -> Evaluation:
+        log.append((bool(query.gradient), query.samples))
+        slope = torch.ones_like(query.u) if query.gradient else None
+        return Evaluation(float(query.u[0]), slope, False, cost=query.samples * (1 + extra * bool(query.gradient)))
 
-    return evaluate
+    return partial(map, evaluate)
 
 
 def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
@@ -246,16 +261,6 @@ def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
     assert [r.samples for r in (*result.history, *result.ranking)] == [1, 4, 2, 5, 1, 1]
     assert [r.renders for r in result.history] == [1, 5, 7, 12]
     assert torch.equal(result.best_u, at(0.2))
-
-
-def test_samples_are_only_named_where_they_are_not_one() -> None:
-    def without_samples(u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
-        return Evaluation(0.0, None, False)
-
-    plain: Any = without_samples
-    assert search(plain, DOMAIN, Samples((at(0.0),), samples=(1,)), steps=1, seed=0).renders == 3
-    with pytest.raises(TypeError, match="samples"):
-        search(plain, DOMAIN, Samples((at(0.0),), samples=(2,)), steps=2, seed=0)
 
 
 def test_a_gradient_with_samples_is_asked_for_where_a_render_is_left_to_use_it() -> None:
@@ -269,13 +274,13 @@ def test_a_gradient_with_samples_is_asked_for_where_a_render_is_left_to_use_it()
 
 
 def test_an_evaluation_that_ignores_its_samples_is_a_bug() -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def evaluate(query: Query) -> Evaluation:
         return Evaluation(0.0, None, False)
 
     with pytest.raises(RuntimeError, match="evaluate took 1 renders; expected 4 to 4"):
-        search(evaluate, DOMAIN, Samples((at(0.0),), samples=(4,)), steps=5, seed=0)
+        search(partial(map, evaluate), DOMAIN, Samples((at(0.0),), samples=(4,)), steps=5, seed=0)
     with pytest.raises(RuntimeError, match="policy 'script' proposed 0 samples; expected at least 1"):
-        search(evaluate, DOMAIN, Samples((at(0.0),), samples=(0,)), steps=5, seed=0)
+        search(partial(map, evaluate), DOMAIN, Samples((at(0.0),), samples=(0,)), steps=5, seed=0)
 
 
 # ---- choices and distributions
@@ -304,11 +309,11 @@ def test_a_policy_that_knows_no_choices_never_sees_one() -> None:
     domain = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, options=3), Block(1), Block(1, options=2)))
     seen: list[tuple[int, int]] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        seen.append((int(u[0] * 3), int(u[2] * 2)))
-        return Evaluation(float(seen[-1] == (1, 0)) + float(u[1]), None, False)
+    def evaluate(query: Query) -> Evaluation:
+        seen.append((int(query.u[0] * 3), int(query.u[2] * 2)))
+        return Evaluation(float(seen[-1] == (1, 0)) + float(query.u[1]), None, False)
 
-    result = search(evaluate, domain, Steps(), steps=60, seed=0, candidates=0)
+    result = search(partial(map, evaluate), domain, Steps(), steps=60, seed=0, candidates=0)
     assert seen[0] == (0, 1)
     assert len(set(seen)) == 6
     assert seen.count((1, 0)) == max(seen.count(pair) for pair in set(seen)) > 25
@@ -339,15 +344,80 @@ def test_a_distribution_is_the_policys_answer() -> None:
 
 
 def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them() -> None:
-    def slow(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def slow(query: Query) -> Evaluation:
         time.sleep(0.02)
-        return Evaluation(float(u[0]), None, False)
+        return Evaluation(float(query.u[0]), None, False)
 
-    result = search(slow, DOMAIN, Random(), steps=10**6, seed=0, seconds=0.1, candidates=0)
+    result = search(partial(map, slow), DOMAIN, Random(), steps=100, seed=0, seconds=0.1, candidates=0)
     assert 2 <= len(result.history) <= 5
     assert result.stopped is Ending.BUDGET_SPENT
-    assert len(search(slow, DOMAIN, Random(), steps=9, seed=0, seconds=1e-9, candidates=0).history) == 1
-    assert len(search(slow, DOMAIN, Random(), steps=3, seed=0, seconds=60.0, candidates=0).history) == 3
+    assert len(search(partial(map, slow), DOMAIN, Random(), steps=9, seed=0, seconds=1e-9, candidates=0).history) == 1
+    assert len(search(partial(map, slow), DOMAIN, Random(), steps=3, seed=0, seconds=60.0, candidates=0).history) == 3
+
+
+# ---- batches
+
+
+@dataclass
+class Asked:
+    """RISE, with notes of what was asked together, and of how much of it was made."""
+
+    batches: list[list[Query]] = field(default_factory=list)
+    made: int = 0
+
+    def __call__(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        self.batches.append(list(queries))
+        for evaluation in RISE(queries):
+            self.made += 1
+            yield evaluation
+
+    @property
+    def sizes(self) -> list[int]:
+        return [len(batch) for batch in self.batches]
+
+
+def test_what_does_not_wait_is_asked_at_once() -> None:
+    asked = Asked()
+    search(asked, DOMAIN, CMAES(population=6), steps=20, seed=0, candidates=3, repeats=2)
+    assert asked.sizes == [6, 6, 6, 2, 6], "three populations, what can be paid of the fourth, and the ranking"
+    assert [query.number for batch in asked.batches for query in batch] == list(range(26))
+    assert [batch[0].phase for batch in asked.batches] == ["search"] * 4 + ["ranking"]
+    asked = Asked()
+    search(asked, DOMAIN, PGD(), steps=5, seed=0, candidates=0)
+    assert asked.sizes == [1] * 5
+
+
+def test_a_search_at_random_asks_for_all_that_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = Asked()
+    search(asked, DOMAIN, Random(), steps=MOST + 3, seed=0, candidates=0)
+    assert asked.sizes == [MOST, 3]
+    monkeypatch.setattr("advsearch.attacks.evaluation.MOST_NUMBERS", 4 * DOMAIN.dim + 2)
+    asked = Asked()
+    search(asked, DOMAIN, Random(), steps=9, seed=0, candidates=0)
+    assert asked.sizes == [4, 4, 1]
+
+
+ALL_AT_ONCE = (Random(), CMAES(population=6), Restarts(NES()))
+
+
+@pytest.mark.parametrize("policy", ALL_AT_ONCE, ids=lambda policy: policy.name)
+def test_rows_do_not_depend_on_when_answers_come(policy: Policy[Any]) -> None:
+    """One by one, or a whole batch before the first of it is looked at; what `late` cuts off included."""
+
+    def rows(evaluate: Evaluate, last: int) -> tuple[list[StepRecord], Tensor]:
+        found = search(evaluate, DOMAIN, policy, steps=30, seed=0, late=lambda done: done >= last)
+        return [replace(one, seconds=0.0) for one in (*found.history, *found.ranking)], found.best_u
+
+    for last in (30, 8):
+        lazy, eager = rows(RISE, last), rows(lambda queries: list(RISE(queries)), last)
+        assert repr(lazy[0]) == repr(eager[0]) and torch.equal(lazy[1], eager[1])
+        assert [one.step for one in lazy[0]] == list(range(last + 8))
+
+
+def test_what_is_too_late_is_not_made() -> None:
+    asked = Asked()
+    found = search(asked, DOMAIN, Random(), steps=50, seed=0, candidates=0, late=lambda done: done >= 7)
+    assert (asked.sizes, asked.made, len(found.history)) == ([50], 7, 7)
 
 
 # ---- non-finite numbers
@@ -391,12 +461,12 @@ def test_a_candidate_that_turns_nan_when_ranked_is_not_the_answer() -> None:
 def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
     gradients = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        value = torch.tensor([math.nan, 1.0, -math.inf]) if gradient else None
+    def evaluate(query: Query) -> Evaluation:
+        value = torch.tensor([math.nan, 1.0, -math.inf]) if query.gradient else None
         return Evaluation(0.5, value, True, non_finite=1)
 
     result = search(
-        evaluate,
+        partial(map, evaluate),
         DOMAIN,
         Script((at(0.0), at(0.1)), gradient=True),
         steps=2,
@@ -418,7 +488,7 @@ def no_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(INTERRUPTS, "count", 0)
 
 
-def interrupt_at(number: int, error: type[BaseException] = KeyboardInterrupt) -> Callable[..., Evaluation]:
+def interrupt_at(number: int, error: type[BaseException] = KeyboardInterrupt) -> Evaluate:
     def value(u: Tensor, index: int) -> float:
         calls.append(index)
         if len(calls) == number:
@@ -456,11 +526,11 @@ def test_an_interrupt_in_the_callback_keeps_that_very_step() -> None:
 
 
 def test_other_exceptions_pass_through() -> None:
-    def broken(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def broken(query: Query) -> Evaluation:
         raise ZeroDivisionError("in the renderer")
 
     with pytest.raises(ZeroDivisionError, match="in the renderer"):
-        search(broken, DOMAIN, PGD(), steps=2, seed=0)
+        search(partial(map, broken), DOMAIN, PGD(), steps=2, seed=0)
 
 
 # ---- bugs and bad input
@@ -471,7 +541,7 @@ def test_a_policy_that_proposes_more_than_it_was_asked_for_is_named() -> None:
         def propose(self, state: int, n: int) -> tuple[tuple[Proposal, ...], int]:
             return (Proposal(at(0.1)),) * (n + 1), state
 
-    with pytest.raises(RuntimeError, match="policy 'script' proposed 2 configurations; expected at most 1"):
+    with pytest.raises(RuntimeError, match="policy 'script' proposed 6 configurations; expected at most 5"):
         search(objective_is(lambda u, index: 0.0), DOMAIN, Eager(()), steps=5, seed=0)
 
 
@@ -496,11 +566,11 @@ def test_a_policy_that_leaves_the_domain_is_a_bug(u: Tensor, message: str) -> No
 def test_a_gradient_that_is_missing_or_misshapen_is_a_bug(gradient: Tensor | None, message: str) -> None:
     answer = gradient
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def evaluate(query: Query) -> Evaluation:
         return Evaluation(0.0, answer, False)
 
     with pytest.raises(RuntimeError, match=message):
-        search(evaluate, DOMAIN, PGD(), steps=2, seed=0)
+        search(partial(map, evaluate), DOMAIN, PGD(), steps=2, seed=0)
 
 
 @pytest.mark.parametrize(
@@ -571,7 +641,7 @@ def test_the_last_configuration_takes_the_place_of_the_worst_candidate() -> None
 
 
 def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> None:
-    def noisy(seed: int) -> Callable[..., Evaluation]:
+    def noisy(seed: int) -> Evaluate:
         noise = 0.1 * torch.randn(4, 100, generator=torch.Generator().manual_seed(seed))
         return objective_is(lambda u, index: float(u[0]) + float(noise[round(float(u[0]) * 100) % 4, index]) - 9.0)
 
@@ -587,4 +657,4 @@ def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> Non
     }
     assert right[20] > right[0] + 3 and right[20] >= 45
     found = search(noisy(3), DOMAIN, script, steps=2, seed=0, close=20)
-    assert found.renders <= planned_renders(2, close=20) and len({r.index for r in found.ranking}) >= 2
+    assert found.renders <= planned_renders(2, close=20) and len({r.seed for r in found.ranking}) >= 2

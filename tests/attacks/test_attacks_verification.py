@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from advsearch.attacks import (
     Block,
     Domain,
     Ending,
+    Evaluate,
     Evaluation,
+    Query,
     Random,
     Trials,
     choose_spp,
@@ -24,7 +27,7 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.region import GrownBox
-from advsearch.attacks.sample_count import most_samples
+from advsearch.attacks.sample_count import LOOKS, SEEDS, MarginsOf, most_samples
 from advsearch.attacks.trials import paired_difference
 from advsearch.attacks.verification import EASIER, LEAST_RATE, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.config import FEWEST_SAMPLES, FEWEST_TRIALS
@@ -36,20 +39,20 @@ DOMAIN = Domain(torch.full((4,), 0.5), (Block(4, "linf", 0.1),))
 WORST = DOMAIN.start + 0.1
 
 
-def judged(margin: float, label: str = "", right: bool | None = None) -> Judgement:
-    """A judgement of so large a margin, which is what is sought."""
-    return Judgement(margin, margin, margin <= 0.0 if right is None else right, Answer(label))
+def judged(margin: float) -> Evaluation:
+    """The answer with so large a margin, which is what is sought."""
+    return Evaluation(margin, None, margin > 0.0, judgement=Judgement(margin, margin, margin <= 0.0, Answer("")))
 
 
-def noisy(clean: float, adversarial: float, noise: float) -> Callable[[torch.Tensor, int, int], Judgement]:
+def noisy(clean: float, adversarial: float, noise: float) -> Evaluate:
     """Margins that move linearly from the start (`clean`) to WORST (`adversarial`), with gaussian noise."""
 
-    def render(u: torch.Tensor, seed: int, spp: int) -> Judgement:
-        way = float((u - DOMAIN.start).mean()) / 0.1
-        margin = clean + way * (adversarial - clean) + noise * float(np.random.default_rng(seed).normal())
+    def render(query: Query) -> Evaluation:
+        way = float((query.u - DOMAIN.start).mean()) / 0.1
+        margin = clean + way * (adversarial - clean) + noise * float(np.random.default_rng(query.seed).normal())
         return judged(margin)
 
-    return render
+    return partial(map, render)
 
 
 # ---- intervals
@@ -134,13 +137,13 @@ def test_the_interval_of_pairs_covers_the_difference(first: float, second: float
     assert 0.94 < covered / 2000 < 0.99
 
 
-def drifting(limit: float, bias: float, noise: float) -> Callable[[int, int], float]:
-    """A margin as Monte Carlo noise makes it: bias and variance fall with the sample count."""
+def drifting(limit: float, bias: float, noise: float) -> MarginsOf:
+    """Margins as Monte Carlo noise makes them: bias and variance fall with the sample count."""
 
     def margin_of(spp: int, seed: int) -> float:
         return limit - bias * 16 / spp + noise * math.sqrt(16 / spp) * float(np.random.default_rng(seed).normal())
 
-    return margin_of
+    return lambda spp, seeds: [margin_of(spp, seed) for seed in seeds]
 
 
 def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
@@ -164,15 +167,19 @@ def test_a_drifting_margin_climbs_until_it_stands(seed: int) -> None:
 
 def test_what_half_of_the_renders_do_not_settle_all_of_them_may() -> None:
     """Margins around 2 that scatter by 0.5: too wide an interval for four renders, not for eight."""
-    choice = choose_spp({"adversarial": lambda spp, seed: 2.0 + 0.5 * (-1.0) ** (seed % 2)}, seed=2, ladder=(4, 16, 64))
+
+    def margins(spp: int, seeds: Sequence[int]) -> list[float]:
+        return [2.0 + 0.5 * (-1.0) ** (seed % 2) for seed in seeds]
+
+    choice = choose_spp({"adversarial": margins}, seed=2, ladder=(4, 16, 64))
     assert (choice.spp, choice.converged, choice.renders) == (16, True, 16)
 
 
 def test_a_drift_beyond_the_bound_passes_in_one_case_of_twenty_at_most() -> None:
     """Margins whose mean moves by just more than may be: as often as the two looks together are wrong."""
 
-    def moved(spp: int, seed: int) -> float:
-        return 4.0 - 2.05 * (spp == 4) + 0.3 * float(np.random.default_rng(seed).normal())
+    def moved(spp: int, seeds: Sequence[int]) -> list[float]:
+        return [4.0 - 2.05 * (spp == 4) + 0.3 * float(np.random.default_rng(seed).normal()) for seed in seeds]
 
     passed = sum(choose_spp({"adversarial": moved}, seed=seed, ladder=(4, 16)).converged for seed in range(400))
     assert passed <= 0.05 * 400
@@ -194,8 +201,8 @@ def test_a_margin_at_zero_never_settles_and_says_so() -> None:
 def test_what_has_settled_is_not_rendered_with_more_samples(seed: int) -> None:
     spent: dict[str, list[int]] = {"adversarial": [], "clean": []}
 
-    def counted(name: str, margin: Callable[[int, int], float]) -> Callable[[int, int], float]:
-        return lambda spp, seed: spent[name].append(spp) or margin(spp, seed)  # type: ignore[func-returns-value]
+    def counted(name: str, margins: MarginsOf) -> MarginsOf:
+        return lambda spp, seeds: spent[name].extend([spp] * len(seeds)) or margins(spp, seeds)  # type: ignore[func-returns-value]
 
     margins = {"adversarial": drifting(3.0, 1.0, 0.3), "clean": drifting(-6.0, 0.0, 0.1)}
     choice = choose_spp({name: counted(name, margin) for name, margin in margins.items()}, seed=seed)
@@ -207,9 +214,9 @@ def test_a_decision_that_no_rung_can_settle_is_seldom_rendered_up_to_the_last() 
     """At the decision the noise of 256 samples would have to be far less than what that of 16 and 64 foretells."""
     spent: list[int] = []
 
-    def at_the_decision(spp: int, seed: int) -> float:
-        spent.append(spp)
-        return drifting(0.0, 0.0, 0.5)(spp, seed)
+    def at_the_decision(spp: int, seeds: Sequence[int]) -> Sequence[float]:
+        spent.extend([spp] * len(seeds))
+        return drifting(0.0, 0.0, 0.5)(spp, seeds)
 
     for seed in range(20):
         choice = choose_spp({"adversarial": at_the_decision, "clean": drifting(-6.0, 0.0, 0.1)}, seed=seed)
@@ -228,22 +235,23 @@ def test_a_margin_that_drifts_across_the_decision_is_followed_to_where_it_stands
 
 
 def test_every_render_of_a_sample_count_has_its_own_seed_and_both_groups_share_them() -> None:
-    seen: dict[str, list[int]] = {"a": [], "b": []}
+    seen: dict[str, list[tuple[int, ...]]] = {"a": [], "b": []}
 
-    def record(name: str) -> Callable[[int, int], float]:
-        def noted(spp: int, seed: int) -> float:
-            seen[name].append(seed)
-            return 0.0
+    def record(name: str) -> MarginsOf:
+        def noted(spp: int, seeds: Sequence[int]) -> list[float]:
+            seen[name].append(tuple(seeds))
+            return [1.0] * len(seeds)
 
         return noted
 
     choose_spp({name: record(name) for name in seen}, seed=3, ladder=(4, 8, 16), drift=0.5)
     assert seen["a"] == seen["b"]
-    assert len(set(seen["a"])) == len(seen["a"]) > 4
+    assert [len(asked) for asked in seen["a"]] == [SEEDS // LOOKS] * 2, "a look asks for all its renders at once"
+    assert len(set().union(*seen["a"])) == sum(map(len, seen["a"]))
 
 
 def test_a_nan_margin_never_settles() -> None:
-    choice = choose_spp({"adversarial": lambda spp, seed: math.nan}, seed=0, ladder=(4, 8))
+    choice = choose_spp({"adversarial": lambda spp, seeds: [math.nan] * len(seeds)}, seed=0, ladder=(4, 8))
     assert not choice.converged
 
 
@@ -287,12 +295,14 @@ def test_too_few_trials_find_nothing_even_if_all_succeed(trials: int) -> None:
 def test_conditions_under_which_the_clean_scene_is_seldom_right_leave_too_few_trials() -> None:
     """Right in 5 of 10: those 5 may all succeed, and say nothing yet."""
 
-    def render(u: torch.Tensor, seed: int, spp: int) -> Judgement:
+    def render(query: Query) -> Evaluation:
         order = [stream(0, "verification", number) for number in range(10)]
-        hard = order.index(seed) % 2 == 1
-        return judged(1.0 if hard or not torch.equal(u, DOMAIN.start) else -1.0)
+        hard = order.index(query.seed) % 2 == 1
+        return judged(1.0 if hard or not torch.equal(query.u, DOMAIN.start) else -1.0)
 
-    result = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=10, rule=OVER_CONDITIONS)
+    result = verify(
+        partial(map, render), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=10, rule=OVER_CONDITIONS
+    )
     assert (result.adversarial.successes, result.adversarial.trials) == (5, 5)
     assert result.ending is Ending.NOT_VERIFIED
 
@@ -351,12 +361,7 @@ def test_a_start_that_is_wrong_already_is_no_find() -> None:
 def test_a_lucky_claim_is_not_verified(seed: int) -> None:
     """The winner's curse: nothing in the budget beats margin -1, one logit of noise makes 60 renders look otherwise."""
     render = noisy(-1.2, -1.0, 1.0)
-
-    def evaluate(u: torch.Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        margin = render(u, 1_000_003 * (seed + 1) + index, 16).margin
-        return Evaluation(margin, None, margin > 0)
-
-    claim = search(evaluate, DOMAIN, Random(), steps=60, seed=seed)
+    claim = search(render, DOMAIN, Random(), steps=60, seed=seed, candidates=1, noise=seed)
     assert claim.claimed_objective > 0.2  # the raw claim: a success, 1.2 logits over anything there is
     result = verify(render, DOMAIN, claim.best_u, claim=Ending.FOUND, spp=64, seed=seed)
     assert result.ending is Ending.NOT_VERIFIED
@@ -373,28 +378,29 @@ def test_the_answer_is_projected_again() -> None:
 def test_both_groups_get_the_same_fresh_seeds_and_the_control_can_be_shared() -> None:
     seeds: list[int] = []
 
-    def render(u: torch.Tensor, seed: int, spp: int) -> Judgement:
-        seeds.append(seed)
-        return judged(-1.0 if torch.equal(u, DOMAIN.start) else 1.0)
+    def render(query: Query) -> Evaluation:
+        seeds.append(query.seed)
+        return judged(-1.0 if torch.equal(query.u, DOMAIN.start) else 1.0)
 
-    clean = run_trials(render, DOMAIN.start, spp=8, seed=5, trials=6, group="clean")
-    shared = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, trials=6, clean=clean)
+    evaluate = partial(map, render)
+    clean = run_trials(evaluate, DOMAIN.start, spp=8, seed=5, trials=6)
+    shared = verify(evaluate, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, trials=6, clean=clean)
     assert seeds[:6] == seeds[6:]
     assert len(set(seeds[:6])) == 6
     assert (shared.renders, shared.ending) == (6, Ending.FOUND)
     with pytest.raises(InputError, match="clean trials: expected 20, as many as `trials`, got 6"):
-        verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, clean=clean)
+        verify(evaluate, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, clean=clean)
 
 
-def scripted(successes: str) -> Callable[[torch.Tensor, int, int], Judgement]:
+def scripted(successes: str) -> Evaluate:
     """Trials of an answer that go as they are told, "1" a success; the clean one is right, but where "-" is told."""
     told = {stream(0, "verification", number): what for number, what in enumerate(successes)}
 
-    def render(u: torch.Tensor, seed: int, spp: int) -> Judgement:
-        clean = torch.equal(u, DOMAIN.start)
-        return judged(1.0 if told[seed] == ("-" if clean else "1") else -1.0)
+    def render(query: Query) -> Evaluation:
+        clean = torch.equal(query.u, DOMAIN.start)
+        return judged(1.0 if told[query.seed] == ("-" if clean else "1") else -1.0)
 
-    return render
+    return partial(map, render)
 
 
 @pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS])
@@ -415,7 +421,15 @@ def test_curtailed_trials_end_with_the_verdict_of_all(rule: Rule, seed: int) -> 
 
 
 def test_a_curtailed_answer_that_never_succeeds_is_tried_twice() -> None:
-    found = verify(scripted("0" * 20), DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
+    made: list[str] = []
+
+    def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
+        for query, answer in zip(queries, scripted("0" * 20)(queries), strict=True):
+            made.append(query.kind)
+            yield answer
+
+    found = verify(evaluate, DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
+    assert made == ["control"] * 20 + ["verification"] * 2, "what nobody asks for any more is not made"
     assert (found.adversarial.successes, found.adversarial.trials, found.ending) == (0, 2, Ending.BUDGET_SPENT)
 
 
@@ -434,23 +448,21 @@ def test_the_interval_of_curtailed_trials_covers_as_often_as_it_says(trials: int
         assert covered >= 0.95 - 1e-9, rate
 
 
-def test_trials_are_reported_as_they_come() -> None:
-    seen: list[tuple[str, int]] = []
-    verify(
-        noisy(-1.0, 1.0, 0.0),
-        DOMAIN,
-        WORST,
-        claim=Ending.FOUND,
-        spp=1,
-        seed=0,
-        trials=2,
-        on_trial=lambda group, number, trial: seen.append((group, number)),
-    )
-    assert seen == [("clean", 0), ("clean", 1), ("adversarial", 0), ("adversarial", 1)]
+def test_the_trials_of_a_group_are_asked_at_once() -> None:
+    asked: list[list[tuple[object, ...]]] = []
+
+    def evaluate(queries: Sequence[Query]) -> list[Evaluation]:
+        asked.append([(one.kind, one.number, one.spp, one.phase, one.keep) for one in queries])
+        return list(noisy(-1.0, 1.0, 0.0)(queries))
+
+    verify(evaluate, DOMAIN, WORST, claim=Ending.FOUND, spp=4, seed=0, trials=3, kind="baseline", keep=1)
+    control = [("control", number, 4, None, False) for number in range(3)]
+    assert asked == [control, [("baseline", number, 4, None, number == 0) for number in range(3)]]
 
 
 def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
-    result = verify(lambda u, seed, spp: judged(math.nan), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=4)
+    nothing = partial(map, lambda query: judged(math.nan))
+    result = verify(nothing, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=4)
     assert (result.clean.successes, result.adversarial.successes) == (0, 0)
     assert result.ending is not Ending.FOUND
 

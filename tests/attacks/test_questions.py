@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Literal
 
 import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
+from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.region import grow
 from advsearch.attacks.smallest import RATIO, Bracket, confirmed, scaled, shrunk, smallest
 from advsearch.errors import InputError
@@ -36,11 +37,11 @@ def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(
     def value(u: Tensor) -> float:
         return float((u - domain.start) @ weights) + bias
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(value(u), weights.clone(), value(u) > 0.0)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(value(query.u), weights.clone(), value(query.u) > 0.0)
 
     def found(inside: Domain, number: int) -> Tensor:
-        return search(evaluate, inside, make_policy("pgd"), steps=20, seed=number).best_u
+        return search(partial(map, evaluate), inside, make_policy("pgd"), steps=20, seed=number).best_u
 
     bracket = smallest(found, lambda u, _: value(u) > 0.0, domain)
     assert bracket.u is not None and bracket.closed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import importlib
 import io
 import json
 import os
@@ -104,6 +105,21 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
     assert (done.returncode, done.stderr) == (0, "[]\n")
     assert all(name in done.stdout for name in COMMANDS)
     assert min(seconds) < 0.5
+
+
+def test_help_has_four_groups_and_each_command_once_with_its_whole_help(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    assert main(["--help"]) == 0
+    listing = capsys.readouterr().out.partition("\nask: ")[2].partition("\n\nexamples:")[0]
+    assert max(map(len, listing.splitlines())) <= 60
+    groups = listing.split("\n\n")
+    assert [group.partition(": ")[0] for group in groups[1:]] == ["look", "trust", "files and runs"]
+    shown = re.findall(r"^  ([a-z0-9-]+) +(.+(?:\n {4,}.*)*)", listing, re.M)
+    assert [name for name, _ in shown] == list(COMMANDS)
+    for name, text in shown:
+        assert " ".join(text.split()) == importlib.import_module(COMMANDS[name]).HELP
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -337,7 +337,7 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (AttackConfig, {"minimise": True, "smallest": True}, "minimise: has no smallest change"),
     (AttackConfig, {"over": "camera", "controls": "camera.fov"}, "over: names a control that is searched already"),
     (AttackConfig, {"draws": 8}, "draws: is how many conditions of `over` a step looks at, and there are none"),
-    (AttackConfig, {"over": "camera", "estimators": {"camera.fov": "forward"}}, "estimators: names a control that"),
+    (AttackConfig, {"over": "camera", "estimators": {"camera.fov": "secant"}}, "estimators: names a control that"),
     (AttackConfig, {"average": 10, "epsilon": "0.1,0.2"}, "average: is not part of a curve"),
     (GapConfig, {"smallest": True}, "smallest: `advsearch gap` has no such setting; leave it out"),
     (RegionConfig, {"spp": 4}, "spp: `advsearch region` has no such setting; leave it out"),

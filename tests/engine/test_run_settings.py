@@ -231,7 +231,7 @@ def test_an_instance_says_its_own(setting: str) -> None:
     assert given_to(config, [PoseControl()])[0].name == "pose"
 
 
-@pytest.mark.parametrize("given", [{"estimators": {"*": "forward"}}, {"measure": "full"}])
+@pytest.mark.parametrize("given", [{"estimators": {"*": "secant"}}, {"measure": "full"}])
 def test_settings_of_derivatives_are_refused_beside_a_policy_that_takes_none(given: dict[str, Any]) -> None:
     config = AttackConfig(object="mug", policy="random", **given)
     with pytest.raises(InputError, match="policy random takes no derivatives; leave one of the two out"):

@@ -53,11 +53,10 @@ def test_extremes_are_finite(name: str) -> None:
     assert render.non_finite == 0
 
 
-@pytest.mark.parametrize("method", ["material", "boundary"])
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
-def test_adjoints_of_poses_are_finite_at_any_scale(method: str, scale: float) -> None:
+def test_adjoints_of_poses_are_finite_at_any_scale(scale: float) -> None:
     controls = {"pose": {"yaw": [0, 360], "scale": scale}}
-    render = load_scene("mug").renderer(controls, resolution=SIZE, denoise="none", estimators={"pose": method})
+    render = load_scene("mug").renderer(controls, resolution=SIZE, denoise="none", estimators={"pose": "material"})
     _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), render.start, 0, 2)
     assert bool(torch.isfinite(gradient).all())
 

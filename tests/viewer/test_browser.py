@@ -48,7 +48,7 @@ Open = Callable[..., Any]
 PLANNED: dict[str, Any] = {
     "control": "geometry", "parameter": "amplitudes", "size": 24, "estimator": "material", "valid": ["material"],
     "step": 0.05, "step_reason": "an outline moves, and the picture with it, so that it has to be wide",
-    "reason": "preferred among material, simultaneous, boundary; not measured", "variance_x_seconds": {},
+    "reason": "preferred among material, differences; not measured", "variance_x_seconds": {},
     "step_in_unit": 0.1, "unit": "object sizes",
 }  # fmt: skip
 """A parameter of a gradient plan that says much."""

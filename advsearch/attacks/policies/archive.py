@@ -36,6 +36,10 @@ ANEW = 0.1
 TOURNAMENT = 4
 """So many kept configurations are drawn, and the one with the largest objective is changed."""
 
+SIGMA, LINE = 0.1, 0.3
+"""Standard deviations of a step, in half of each number's range, and of one along the line through two configurations,
+in their distance."""
+
 WIDER = 4.0
 """How much larger steps are in the parameters that span the archive: that is where there are cells to fill."""
 
@@ -88,7 +92,7 @@ class MapElites(Policy[ArchiveState]):
     that are drawn, b one that is drawn, as by Vassiliades and Mouret 2018, "Discovering the elite hypervolume by
     leveraging interspecies correlation":
 
-        P(a + sigma s z + line (b - a) y),
+        P(a + 0.1 s z + 0.3 (b - a) y),
 
     z a vector and y a number, standard normal, s half of each number's range, four times that for the parameters of
     the archive: what makes the model fail in one cell is tried in others. A discrete choice is that of a, or, one in
@@ -104,8 +108,6 @@ class MapElites(Policy[ArchiveState]):
         over: the parameters that span the archive, at most 4, separated by commas, by name ("pose.yaw",
             "camera.target.0"); empty for the first two.
         cells: how many parts each number's range has in the archive, 2 to 1,000; a discrete choice has its options.
-        sigma: standard deviation of the steps in units of half of each number's range, over 0, at most 2.
-        line: of the step along the line through two configurations, in units of their distance, at least 0, at most 2.
         population: configurations a generation, at least 2.
 
     Raises:
@@ -115,8 +117,6 @@ class MapElites(Policy[ArchiveState]):
 
     over: str = ""
     cells: int = 10
-    sigma: float = 0.1
-    line: float = 0.3
     population: int = 10
 
     name: ClassVar[str] = "archive"
@@ -128,10 +128,6 @@ class MapElites(Policy[ArchiveState]):
             raise InputError("policy 'archive' needs ribs, which is not installed: pip install 'advsearch[archive]'")
         if not 2 <= self.cells <= 1000:
             raise InputError(f"cells: expected 2 to 1000 parts of each range, got {self.cells}")
-        if not 0.0 < self.sigma <= 2.0:
-            raise InputError(f"sigma: expected a number in (0, 2], a share of half the range, got {self.sigma}")
-        if not 0.0 <= self.line <= 2.0:
-            raise InputError(f"line: expected a number in [0, 2], a share of a distance, got {self.line}")
         if self.population < 2:
             raise InputError(f"population: expected at least 2, got {self.population}")
 
@@ -223,8 +219,8 @@ class MapElites(Policy[ArchiveState]):
         first, second = kept[1 + best, torch.arange(count)], kept[0]
         noise = torch.randn(count, dim, generator=rng)
         noise[:, state.spanned] *= WIDER
-        along = self.line * torch.randn(count, 1, generator=rng)
-        points: Tensor = first + self.sigma * state.half * noise + along * (second - first)
+        along = LINE * torch.randn(count, 1, generator=rng)
+        points: Tensor = first + SIGMA * state.half * noise + along * (second - first)
         anew = torch.rand(count, dim, generator=rng) < ANEW
         for block, part in state.domain.parts():
             if block.options:

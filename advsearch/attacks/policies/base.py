@@ -109,30 +109,24 @@ class Policy(ABC, Generic[State]):
 
         Args:
             state: after the latest `update`, or as `start` returned it.
-            n: how many can be evaluated at the same time, at least 1.
+            n: how many can be evaluated before the next `update`, at least 1.
 
         Returns:
             Up to n that do not wait for each other's evaluations: a sample of a population is one of many, a step
             along a gradient is alone. None at all if there is nothing more to propose (a grid that is done, a flat
-            objective). Asked with another n, a policy proposes the same configurations in the same order.
+            objective). Asked with another n, a policy proposes the same configurations in the same order, provided
+            that `update` is told of all of them.
         """
 
     @abstractmethod
     def update(self, state: State, evaluated: Evaluated) -> State:
-        """Return the state after what was proposed last was evaluated, all of it.
+        """Return the state after what was proposed last was evaluated, all of it, or the first of it where the budget
+        ends.
 
         Every evaluation is `usable`: its gradient (None where it was not asked for or could not be paid) is finite, and
         its objective is finite or -inf, which stands for "could not be evaluated". The objective is noisy: the same u
         with another seed gives another value, and a maximum over many is biased upwards.
         """
-
-    def turns(self, state: State) -> Sequence[tuple[State, int]]:
-        """Return the searches inside this one that come next and do not wait for each other, in their order.
-
-        Each is the state where it begins and its evaluations, provided that all before it take the renders that they
-        may. None at all where there is but one search.
-        """
-        return ()
 
     def counts(self, state: State) -> Counts:
         """Return what the policy did about the evaluations so far; nothing where it takes them as they come."""

@@ -14,7 +14,7 @@ from advsearch.attacks.domain import Block, Domain, centre_of_option
 from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
 from advsearch.attacks.policies.base import Counts, Evaluated, Policy, Proposal, draw_seed, seeded
-from advsearch.attacks.policies.racing import Race, Runner
+from advsearch.attacks.policies.racing import Race
 from advsearch.attacks.policies.stay import Stay
 
 ETA = 2
@@ -80,8 +80,8 @@ class Choices(Policy[ChoicesState]):
         limit = min(MOST, math.prod(counts), max(2, MOST_NUMBERS // domain.dim))
         most = racing.most_runners(steps, ETA, each, limit)
         combinations = _combinations(counts, domain.begin[choices], most, seeded(seed, 0))
-        runner = Runner(policy, _EMPTY if inner is None else inner)
-        race = racing.line_up((runner,) * len(combinations), steps, seed, eta=ETA)
+        search = (policy, _EMPTY if inner is None else inner)
+        race = racing.line_up([search] * len(combinations), steps, seed, eta=ETA)
         return ChoicesState(domain, numbers, choices, combinations, race)
 
     def propose(self, state: ChoicesState, n: int) -> tuple[tuple[Proposal, ...], ChoicesState]:
@@ -93,9 +93,6 @@ class Choices(Policy[ChoicesState]):
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
         inner = [(u[state.numbers], _part(evaluation, state.numbers)) for u, evaluation in evaluated]
         return replace(state, race=racing.update(state.race, inner))
-
-    def turns(self, state: ChoicesState) -> list[tuple[ChoicesState, int]]:
-        return [(replace(state, race=race), count) for race, count in racing.turns(state.race)]
 
     def counts(self, state: ChoicesState) -> Counts:
         return racing.counts(state.race)

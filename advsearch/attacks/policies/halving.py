@@ -9,9 +9,9 @@ import torch
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.policies import racing
-from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Policy, draw_seed, seeded
 from advsearch.attacks.policies.choices import with_choices
-from advsearch.attacks.policies.racing import Race, Raced, Runner
+from advsearch.attacks.policies.racing import MOST_SAMPLES, Race, Raced
 from advsearch.attacks.policies.stay import Stay
 from advsearch.errors import InputError
 
@@ -20,9 +20,6 @@ MOST_STARTS = 1024
 
 MOST_NUMBERS = 2**23
 """And no more, but two, than have so many numbers together: they are all kept."""
-
-MOST_SAMPLES = 64
-"""No evaluation has more than this many times the search's samples."""
 
 WORTH = 8
 """Evaluations that a search from each start should have in every round."""
@@ -72,21 +69,11 @@ class Halving(Raced):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
         seed = draw_seed(generator)
-        policy: Policy[Any] = Stay() if self.policy is None else with_choices(self.policy, domain)
+        policy: Policy[Any] = Stay(MOST_SAMPLES) if self.policy is None else with_choices(self.policy, domain)
         each = 1 if self.policy is None else WORTH * (1 + (domain.gradient_cost if policy.uses_gradient else 0))
         limit = self.starts or min(MOST_STARTS, max(2, MOST_NUMBERS // domain.dim))
         count = racing.most_runners(steps, self.eta, each, limit)
         others = (domain.sample(seeded(seed, number), extreme=bool(number % 2))[0] for number in range(1, count))
-        begins = (domain.begin, *others)
-        runners = tuple(Runner(policy, replace(domain, first=begin)) for begin in begins)
-        return racing.line_up(runners, steps, seed, eta=self.eta, fresh=True)
-
-    def propose(self, state: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
-        return racing.propose(state, n, self._samples)
-
-    def turns(self, state: Race) -> list[tuple[Race, int]]:
-        return racing.turns(state, self._samples)
-
-    def _samples(self, race: Race) -> int:
-        """Return all that is left of the turn, or what keeps the evaluations of a round as many as before."""
-        return min(MOST_SAMPLES, max(1, race.left) if self.policy is None else self.eta**race.round)
+        searches = [(policy, replace(domain, first=begin)) for begin in (domain.begin, *others)]
+        growth = 1 if self.policy is None else self.eta
+        return racing.line_up(searches, steps, seed, eta=self.eta, fresh=True, growth=growth)

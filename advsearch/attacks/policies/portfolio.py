@@ -13,7 +13,7 @@ from advsearch.attacks.policies.auto import Auto
 from advsearch.attacks.policies.base import Policy, draw_seed, seeded
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.policies.cmaes import CMAES
-from advsearch.attacks.policies.racing import Race, Raced, Runner
+from advsearch.attacks.policies.racing import Race, Raced
 from advsearch.errors import InputError
 
 
@@ -52,7 +52,7 @@ class Portfolio(Raced):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
         seed = draw_seed(generator)
-        runners, errors = [], []
+        searches, errors = [], []
         for policy in self.policies:
             whole = with_choices(policy, domain)
             try:
@@ -60,7 +60,7 @@ class Portfolio(Raced):
             except InputError as error:
                 errors.append(error)
             else:
-                runners.append(Runner(whole, domain))
-        if not runners:
+                searches.append((whole, domain))
+        if not searches:
             raise errors[0]
-        return racing.line_up(tuple(runners), steps, seed, eta=2)
+        return racing.line_up(searches, steps, seed, eta=2)

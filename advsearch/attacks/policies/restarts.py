@@ -11,13 +11,13 @@ from advsearch.attacks.domain import Domain
 from advsearch.attacks.policies import racing
 from advsearch.attacks.policies.base import Policy, draw_seed, seeded
 from advsearch.attacks.policies.pgd import PGD
-from advsearch.attacks.policies.racing import Race, Raced, Runner
+from advsearch.attacks.policies.racing import Race, Raced
 from advsearch.errors import InputError
 
 
 @dataclass(frozen=True)
 class Restarts(Raced):
-    """Lets a policy search `times` times, one search after the other, each with an equal share of the renders.
+    """Lets a policy search `times` times, each with an equal share of the renders; they take turns, step by step.
 
     The first begins where the policy would begin by itself, the others at samples of the domain (`Domain.sample`); the
     norm balls stay where they are. One that has nothing more to propose leaves its renders to the rest. For an
@@ -52,5 +52,4 @@ class Restarts(Raced):
         each = 1 + (domain.gradient_cost if self.policy.uses_gradient else 0)
         count = max(1, min(self.times, steps // each))
         begins = (domain.begin, *(domain.sample(seeded(seed, number))[0] for number in range(1, count)))
-        runners = tuple(Runner(self.policy, replace(domain, first=begin)) for begin in begins)
-        return racing.line_up(runners, steps, seed, eta=1)
+        return racing.line_up([(self.policy, replace(domain, first=begin)) for begin in begins], steps, seed, eta=1)

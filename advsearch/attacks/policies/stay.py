@@ -14,7 +14,13 @@ from advsearch.attacks.policies.base import Evaluated, Policy, Proposal
 
 @dataclass(frozen=True)
 class Stay(Policy[Tensor]):
-    """Proposes the configuration where it began, again and again; its state is that configuration. For wrappers."""
+    """Proposes the configuration where it began, again and again; its state is that configuration. For wrappers.
+
+    Attributes:
+        samples: as in `Proposal`.
+    """
+
+    samples: int = 1
 
     name: ClassVar[str] = "stay"
     uses_gradient: ClassVar[bool] = False
@@ -24,7 +30,7 @@ class Stay(Policy[Tensor]):
         return domain.begin
 
     def propose(self, state: Tensor, n: int) -> tuple[tuple[Proposal, ...], Tensor]:
-        return (Proposal(state),) * n, state
+        return (Proposal(state, samples=self.samples),) * n, state
 
     def update(self, state: Tensor, evaluated: Evaluated) -> Tensor:
         return state

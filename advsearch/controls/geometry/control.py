@@ -33,7 +33,7 @@ LARGEST_MODES = 200
 PUSH = 4.0
 """Factor on the pushes of form large-steps: pushes at their largest over a neighbourhood pass the bound on the length
 of d, so that it is reached without every vertex of the object agreeing."""
-ESTIMATORS = ("material", "simultaneous", "boundary")
+ESTIMATORS = ("material", "differences")
 
 
 @dataclass(frozen=True)

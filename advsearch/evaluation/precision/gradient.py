@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.gradients import EXPENSIVE, Loss, Probe, estimated, reference
+from advsearch.engine.gradients import Loss, Probe, estimated, reference
 from advsearch.evaluation.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.evaluation.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
 from advsearch.evaluation.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
 from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import BY_ADJOINT, DIRECTIONS
+from advsearch.scene.gradients.plan import BY_ADJOINT, compared
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.renderer import LinearRenderer, linear_inputs
 
@@ -83,8 +83,8 @@ def parts_of(groups: Sequence[Group], *, linear: bool, by_matrix: Collection[str
         names = ",".join(one.parameter for one in members)
         if len(names) > 28:
             names = f"{members[0].parameter},... ({len(members)})"
-        usable = [one for one in valid if one not in EXPENSIVE and not (linear and one == "secant")]
-        usable += [one for one in ("forward",) if "differences" in usable and one not in usable]
+        worth = compared(valid, sum(one.size for one in members))
+        usable = [one for one in worth if not (linear and one == "secant")]
         usable += [MATRIX] if all(one.name in by_matrix for one in members) else []
         found.append(
             GradientPart(f"{control}.{names}" if control in several else control, tuple(members), tuple(usable))
@@ -102,8 +102,8 @@ def matrix_groups(renderer: Renderer) -> frozenset[str]:
 def theory_of(estimator: str, sampler: str) -> Theory:
     """Return the slope that theory gives the error of an estimator against samples of a sampler.
 
-    The interior adjoint is an unbiased mean of samples. Differences have the bias of their step, and one sided ones
-    more of it; random directions have the noise of what they skip; the material form has its limits.
+    The interior adjoint is an unbiased mean of samples. Differences have the bias of their step; the material form has
+    its limits.
     """
     if estimator != "adjoint":
         return UNKNOWN
@@ -200,9 +200,8 @@ class GradientBench:
             return 1.0 + MATRIX_COST
         renders = sum(replace(group, estimator=estimator).renders for group in self.part.groups)
         if estimator in BY_ADJOINT:
-            return 1.0 + ADJOINT_COST.get(estimator, max(ADJOINT_COST.values()))
-        more = {"forward": 1, "simultaneous": 2 * DIRECTIONS}.get(estimator, 0)
-        return 1.0 + renders + more
+            return 1.0 + ADJOINT_COST[estimator]
+        return 1.0 + renders
 
     def _estimated(self, renderer: Renderer, estimator: str, seed: int, spp: int) -> Array:
         gradient = estimated(renderer, self._loss, self._u, estimator, self.part.names, seed, spp)

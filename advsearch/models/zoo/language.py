@@ -346,7 +346,7 @@ class _Named(nn.Module):
 
 
 class _Free(nn.Module):
-    """What is said of each picture, `advsearch.tasks.answers.Spoken`: the likeliest token after the other."""
+    """What is said of each picture, `advsearch.tasks.answers.Utterance`: the likeliest token after the other."""
 
     def __init__(self, reader: _Reader, tokenizer: Any, ends: frozenset[int], most: int) -> None:
         super().__init__()

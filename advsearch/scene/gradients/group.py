@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-BY_DIFFERENCES = frozenset({"differences", "secant", "forward", "simultaneous"})
+BY_DIFFERENCES = frozenset({"differences", "secant"})
 """Estimators that take primal renders."""
 
 
@@ -86,7 +86,5 @@ class Group:
 
     @property
     def renders(self) -> int:
-        """Primal renders that one gradient of this group takes, beside those shared by all groups."""
-        if self.estimator in ("differences", "secant"):
-            return 2 * self.size
-        return self.size if self.estimator == "forward" else 0
+        """Primal renders that one gradient of this group takes."""
+        return 2 * self.size if self.estimator in BY_DIFFERENCES else 0

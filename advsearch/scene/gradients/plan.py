@@ -16,29 +16,24 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.gradients.differences import DIRECTIONS as DIRECTIONS
 from advsearch.scene.gradients.group import BY_DIFFERENCES as BY_DIFFERENCES
 from advsearch.scene.gradients.group import Group
 
 ESTIMATORS: Mapping[str, str] = {
     "adjoint": "interior adjoint (path replay); right for what moves no outline: textures, colours, lights' power",
     "material": "adjoint in material form: follows the moving surface, with boundary terms; any number of coordinates",
-    "boundary": "Mitsuba's projective adjoint without guiding; boundary terms for moving meshes",
-    "guided": "Mitsuba's projective adjoint as it comes, with octree guiding; slow, for comparison",
     "differences": "central differences of the picture with common random numbers; two renders for each coordinate",
     "secant": "central differences of the loss itself; as many renders, and smooths a rough loss over the step",
-    "forward": "one-sided differences of the picture; one render for each coordinate and one for all",
-    "simultaneous": "central differences along random directions; two renders for each direction",
     "image": "torch autograd on the picture; no render",
     "none": "no derivative: a discrete choice, or switched off",
 }
 """Every estimator by the name that forces it."""
 
-BY_ADJOINT = frozenset({"adjoint", "material", "boundary", "guided"})
-WITH_BOUNDARY = frozenset({"material", "boundary", "guided"})
-"""Adjoints that know of moving outlines."""
-ALWAYS_VALID = ("differences", "secant", "forward", "simultaneous", "none")
+BY_ADJOINT = frozenset({"adjoint", "material"})
+ALWAYS_VALID = ("differences", "secant", "none")
 """Estimators that need nothing but renders, so they can be forced on any continuous coordinate."""
+MANY = 16
+"""Coordinates over which differences are not compared with an adjoint: one by one they take too many renders."""
 
 DEFAULT_STEP, TURN_STEP = 0.05, 0.005
 """Half of a difference's width in u, for coordinates that move nothing in the picture: of a range, of a full turn."""
@@ -96,8 +91,7 @@ class GradientPlan:
     @property
     def renders(self) -> int:
         """Primal renders of one gradient, adjoints not counted."""
-        shared = int(bool(self.having("forward"))) + 2 * DIRECTIONS * int(bool(self.having("simultaneous")))
-        return shared + sum(group.renders for group in self.groups)
+        return sum(group.renders for group in self.groups)
 
     def through_inputs(self, dimension: int) -> Tensor:
         """Return (d,) float32: 1 for coordinates whose derivative runs back through scene inputs or the picture."""
@@ -160,6 +154,12 @@ class GradientPlan:
                 for one in self.groups
             ],
         }
+
+
+def compared(valid: Sequence[str], size: int) -> tuple[str, ...]:
+    """Return which of the estimators that are valid for `size` coordinates are worth a measurement."""
+    adjoints = tuple(one for one in valid if one in BY_ADJOINT)
+    return adjoints if adjoints and size > MANY else tuple(valid)
 
 
 def first_plan(

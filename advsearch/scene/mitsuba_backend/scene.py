@@ -264,8 +264,8 @@ class MitsubaScene:
             spp: independent samples a pixel.
             wrt: the inputs whose gradients are wanted; None means all that are named.
             method: "path", the interior adjoint (path replay backpropagation, Vicini et al. 2021), unbiased for inputs
-                that do not move silhouettes; "hidden", the same without the visible environment; "boundary", Mitsuba's
-                projective integrator without guiding (Zhang et al. 2023), for vertices too.
+                that do not move silhouettes; "hidden", the same without the visible environment. Where boundary terms
+                are not left out, Mitsuba's projective integrator (Zhang et al. 2023) takes the place of "path".
 
         Returns:
             For each of `wrt` a float32 tensor of the input's shape.
@@ -432,7 +432,6 @@ class MitsubaScene:
                     "rr_depth": NO_ROULETTE,
                     "guiding": "none",
                 },
-                "guided": {"type": "prb_projective", "max_depth": self._depth, "rr_depth": NO_ROULETTE},
             }
             self._integrators[key] = mi.load_dict(recipes[method])
             population.changes += 1

@@ -6,6 +6,7 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Random, SearchResult, search
+from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
 from advsearch.attacks.policies.auto import LOW, make_plan
 from advsearch.attacks.policies.base import Policy, one_thread, seeded
 from advsearch.attacks.policies.coordinates import box_coordinates
@@ -34,9 +35,9 @@ DOMAINS = {
 }
 
 
-def domain_of(blocks: tuple[Block, ...], cost: int = 0, partial: bool = False) -> Domain:
+def domain_of(blocks: tuple[Block, ...], cost: int = 0, free: bool = False) -> Domain:
     size = sum(block.size for block in blocks)
-    return Domain(0.3 + 0.4 * torch.rand(size, generator=seeded(1, size)), blocks, cost, partial)
+    return Domain(0.3 + 0.4 * torch.rand(size, generator=seeded(1, size)), blocks, cost, free)
 
 
 @dataclass
@@ -57,12 +58,13 @@ class Smooth:
     def value(self, u: Tensor) -> float:
         return float(np.cos(self.frequency @ u.double().numpy() + self.phase).sum()) / math.sqrt(10)
 
-    def __call__(self, u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def __call__(self, query: Query) -> Evaluation:
+        u, gradient = query.u, query.gradient
         assert self.domain.contains(u)
         assert u.dtype == torch.float32
         self.asked.append(gradient)
         self.seen.append(u.clone())
-        rng = np.random.default_rng([self.seed, index, zlib.crc32(u.numpy().tobytes())])
+        rng = np.random.default_rng([self.seed, query.number, zlib.crc32(u.numpy().tobytes())])
         value = self.value(u) + self.noise * rng.normal()
         slope = None
         if gradient:
@@ -74,7 +76,7 @@ class Smooth:
 
 def played(domain: Domain, policy: Policy[Any], steps: int, seed: int = 0) -> tuple[SearchResult, Smooth]:
     problem = Smooth(domain)
-    return search(problem, domain, policy, steps=steps, seed=seed), problem
+    return search(partial(map, problem), domain, policy, steps=steps, seed=seed), problem
 
 
 # ---- rules
@@ -100,17 +102,17 @@ def test_without_noise_it_is_pgd_with_more_momentum() -> None:
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 7, 40])
-@pytest.mark.parametrize(("cost", "partial"), [(0, False), (12, False), (12, True)])
+@pytest.mark.parametrize(("cost", "free"), [(0, False), (12, False), (12, True)])
 @pytest.mark.parametrize("name", DOMAINS)
-def test_it_stays_inside_and_spends_its_budget_exactly(name: str, cost: int, partial: bool, steps: int) -> None:
+def test_it_stays_inside_and_spends_its_budget_exactly(name: str, cost: int, free: bool, steps: int) -> None:
     """`Smooth` itself checks that every configuration lies in the domain."""
-    result, problem = played(domain_of(DOMAINS[name], cost, partial), Auto(), steps)
+    result, problem = played(domain_of(DOMAINS[name], cost, free), Auto(), steps)
     assert result.stopped is Ending.BUDGET_SPENT
     assert result.history[-1].renders == steps
     assert torch.equal(problem.seen[0], problem.domain.start)
     if cost == 12:
         ball = "ball" in name or "texture" in name
-        assert set(problem.asked) <= {False, "free" if ball and partial else True}
+        assert set(problem.asked) <= {False, "free" if ball and free else True}
 
 
 @pytest.mark.parametrize("name", DOMAINS)
@@ -130,7 +132,7 @@ def test_old_states_replay_the_same_future() -> None:
         for k in range(index, index + steps):
             (proposal,), state = policy.propose(state, 1)  # type: ignore[arg-type]
             seen.append(proposal.u)
-            evaluation = problem(proposal.u, index=k, gradient=proposal.gradient)
+            evaluation = problem(Query(proposal.u, k, number=k, gradient=proposal.gradient))
             state = policy.update(state, [(proposal.u, evaluation)])
         return state, seen
 
@@ -145,12 +147,12 @@ def test_old_states_replay_the_same_future() -> None:
 def test_an_interrupt_keeps_the_best_so_far(number: int) -> None:
     problem = Smooth(domain_of(POSE), noise=0.0)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def evaluate(query: Query) -> Evaluation:
         if len(problem.seen) == number:
             raise KeyboardInterrupt
-        return problem(u, index=index, gradient=gradient)
+        return problem(query)
 
-    result = search(evaluate, problem.domain, Auto(), steps=40, seed=0)
+    result = search(partial(map, evaluate), problem.domain, Auto(), steps=40, seed=0)
     assert result.ending is Ending.INTERRUPTED
     assert problem.value(result.best_u) == pytest.approx(max(problem.value(u) for u in problem.seen))
 
@@ -160,12 +162,12 @@ def test_values_that_are_not_finite_are_the_worst(blocks: tuple[Block, ...]) -> 
     """Half of the box cannot be evaluated."""
     problem = Smooth(domain_of(blocks))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        evaluation = problem(u, index=index, gradient=gradient)
-        bad = index % 3 != 0 and float(u[-1]) > 0.6
+    def evaluate(query: Query) -> Evaluation:
+        evaluation = problem(query)
+        bad = query.number % 3 != 0 and float(query.u[-1]) > 0.6
         return Evaluation(math.nan, evaluation.gradient, False) if bad else evaluation
 
-    result = search(evaluate, problem.domain, Auto(), steps=40, seed=0)
+    result = search(partial(map, evaluate), problem.domain, Auto(), steps=40, seed=0)
     assert result.stopped is Ending.BUDGET_SPENT
     assert 0 < result.non_finite_objectives < 25
 
@@ -191,8 +193,8 @@ def test_free_gradients_end_a_search_and_lead_one_in_many_dimensions() -> None:
 
 
 def test_a_texture_beside_a_pose_takes_free_gradients_where_there_are_some() -> None:
-    for cost, partial, wanted in ((12, True, "free"), (12, False, True), (0, True, True)):
-        domain = domain_of((BALL, *POSE), cost, partial)
+    for cost, free, wanted in ((12, True, "free"), (12, False, True), (0, True, True)):
+        domain = domain_of((BALL, *POSE), cost, free)
         plan = make_plan(domain, box_coordinates(domain), 40)
         assert (plan.screen, plan.until, plan.gradient) == (10, 20, wanted)
     result, problem = played(domain_of((BALL, *POSE), 12, True), Auto(), 40)
@@ -221,11 +223,11 @@ def test_an_angle_is_searched_across_its_seam() -> None:
     sides, reached = set(), []
     for seed in range(4):
 
-        def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-            sides.add(float(u[0]) < 0.5) if value(u) > 0.9 else None
-            return Evaluation(value(u), None, False)
+        def evaluate(query: Query) -> Evaluation:
+            sides.add(float(query.u[0]) < 0.5) if value(query.u) > 0.9 else None
+            return Evaluation(value(query.u), None, False)
 
-        reached.append(value(search(evaluate, domain, Auto(), steps=40, seed=seed).best_u))
+        reached.append(value(search(partial(map, evaluate), domain, Auto(), steps=40, seed=seed).best_u))
     assert min(reached) > 0.97
     assert sides == {True, False}
 
@@ -306,12 +308,12 @@ def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:
     domain = Domain(torch.full((d,), 0.45), (Block(d),), gradient_cost=2 * d)
 
     def reached(policy: Policy[Any]) -> float:
-        def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-            rng = np.random.default_rng([seed, index, zlib.crc32(u.numpy().tobytes())])
-            value = function(u.double().numpy()) + noise * rng.normal()
+        def evaluate(query: Query) -> Evaluation:
+            rng = np.random.default_rng([seed, query.number, zlib.crc32(query.u.numpy().tobytes())])
+            value = function(query.u.double().numpy()) + noise * rng.normal()
             return Evaluation(value, None, value > 0)
 
-        return function(search(evaluate, domain, policy, steps=40, seed=seed).best_u.double().numpy())
+        return function(search(partial(map, evaluate), domain, policy, steps=40, seed=seed).best_u.double().numpy())
 
     return reached(Auto()) - reached(Random())
 

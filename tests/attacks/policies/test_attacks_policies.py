@@ -6,6 +6,7 @@ import math
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -21,10 +22,12 @@ from advsearch.attacks import (
     Block,
     Domain,
     Ending,
+    Evaluate,
     Evaluated,
     Evaluation,
     Policy,
     Proposal,
+    Query,
     Random,
     StepRecord,
     get_objective,
@@ -51,18 +54,18 @@ class Problem:
     gradient: Callable[[Tensor], Tensor]
     optimum: float
 
-    def evaluator(self, seed: int = 0, noise: float = 0.0) -> Callable[..., Evaluation]:
+    def evaluator(self, seed: int = 0, noise: float = 0.0) -> Evaluate:
         """Evaluate with gaussian noise: on the value, of `noise` x 5 % of the optimum; on every gradient element, of
         `noise` x the gradient's root mean square (so with noise 1 half of the gradient's energy is noise)."""
 
-        def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-            rng = seeded(seed, index)
-            exact = self.gradient(u)
+        def evaluate(query: Query) -> Evaluation:
+            rng = seeded(seed, query.number)
+            exact = self.gradient(query.u)
             rough = exact + noise * exact.square().mean().sqrt() * torch.randn(exact.shape, generator=rng)
-            value = self.value(u) + noise * 0.05 * self.optimum * float(torch.randn(1, generator=rng))
-            return Evaluation(value, rough if gradient else None, value > 0)
+            value = self.value(query.u) + noise * 0.05 * self.optimum * float(torch.randn(1, generator=rng))
+            return Evaluation(value, rough if query.gradient else None, value > 0)
 
-        return evaluate
+        return partial(map, evaluate)
 
 
 def domain_of(start: Tensor, norm: str) -> Domain:
@@ -175,11 +178,11 @@ def test_random_tries_every_option_of_a_discrete_choice() -> None:
     domain = Domain(torch.tensor([0.1, 0.5]), (Block(1, options=5), Block(1)))
     seen: list[float] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        seen.append(float(u[0]))
+    def evaluate(query: Query) -> Evaluation:
+        seen.append(float(query.u[0]))
         return Evaluation(0.0, None, False)
 
-    search(evaluate, domain, Random(), steps=60, seed=0, candidates=0)
+    search(partial(map, evaluate), domain, Random(), steps=60, seed=0, candidates=0)
     assert sorted(set(seen)) == pytest.approx([0.1, 0.3, 0.5, 0.7, 0.9])
 
 
@@ -227,10 +230,10 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
     assert sizes[-1] <= sizes[0] / 8
     climbing = Domain(torch.zeros(4), (Block(4),))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(float(index), torch.ones(4), False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(float(query.number), torch.ones(4), False)
 
-    assert search(evaluate, climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
+    assert search(partial(map, evaluate), climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
 
 
 def test_without_noise_the_step_of_pgd_falls_in_a_line_and_nothing_is_clipped() -> None:
@@ -238,16 +241,16 @@ def test_without_noise_the_step_of_pgd_falls_in_a_line_and_nothing_is_clipped() 
     slope = torch.ones(20)
     slope[0] = 1000.0
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(float(index), slope, False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(float(query.number), slope, False)
 
     domain = Domain(torch.full((20,), 0.5), (Block(20, "linf", 0.1),), exact=True)
-    result = search(evaluate, domain, PGD(step_size=0.4), steps=STEPS, seed=0, candidates=0)
+    result = search(partial(map, evaluate), domain, PGD(step_size=0.4), steps=STEPS, seed=0, candidates=0)
     sizes = [record.step_size for record in result.history]
     assert sizes[:3] == pytest.approx([0.4, 0.4 * (1 - 1 / STEPS), 0.4 * (1 - 2 / STEPS)])
     assert sizes[-1] == pytest.approx(0.4 * 0.05)
     assert result.counts.cut == 0
-    noisy = search(evaluate, replace(domain, exact=False), PGD(), steps=STEPS, seed=0, candidates=0)
+    noisy = search(partial(map, evaluate), replace(domain, exact=False), PGD(), steps=STEPS, seed=0, candidates=0)
     assert noisy.counts.cut > 0
 
 
@@ -256,18 +259,20 @@ def test_over_drawn_conditions_the_step_of_pgd_falls_in_a_line_whatever_they_wer
     conditions were drawn; and the last configuration is the answer, not the raw best, which had easy ones."""
     ranking: list[Tensor] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        if not gradient and index >= STEPS:
-            ranking.append(u)
-            return Evaluation(float(u[0]), None, False)
-        return Evaluation(-float(index), torch.ones(2), False)
+    def evaluate(query: Query) -> Evaluation:
+        if not query.gradient and query.number >= STEPS:
+            ranking.append(query.u)
+            return Evaluation(float(query.u[0]), None, False)
+        return Evaluation(-float(query.number), torch.ones(2), False)
 
     domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),), drawn=True)
-    result = search(evaluate, domain, PGD(step_size=0.02), steps=STEPS, seed=0, candidates=3)
+    result = search(partial(map, evaluate), domain, PGD(step_size=0.02), steps=STEPS, seed=0, candidates=3)
     sizes = [record.step_size for record in result.history]
     assert sizes == pytest.approx([0.02 * max(0.05, 1 - number / STEPS) for number in range(STEPS)])
     assert float(result.best_u[0]) == max(float(u[0]) for u in ranking) > 0.55
-    usual = search(evaluate, replace(domain, drawn=False), PGD(step_size=0.02), steps=STEPS, seed=0, candidates=3)
+    usual = search(
+        partial(map, evaluate), replace(domain, drawn=False), PGD(step_size=0.02), steps=STEPS, seed=0, candidates=3
+    )
     assert float(usual.best_u[0]) < 0.55
 
 
@@ -286,23 +291,23 @@ def test_without_noise_pgd_stops_at_the_optimum(kind: str, norm: str) -> None:
 def test_without_noise_pgd_goes_on_while_it_gains_a_little() -> None:
     """Slower and slower, but by more than a thousandth of all in every window."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(float(index) ** 0.5, torch.ones(2), False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(float(query.number) ** 0.5, torch.ones(2), False)
 
     domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.1),), exact=True)
-    assert len(search(evaluate, domain, PGD(), steps=300, seed=0, candidates=0).history) == 300
+    assert len(search(partial(map, evaluate), domain, PGD(), steps=300, seed=0, candidates=0).history) == 300
 
 
 def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
     """A peak that only the first steps see; then the gradient leads away from it, downhill."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(5.0 if index == 2 else -0.1 * index, torch.ones(2), False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(5.0 if query.number == 2 else -0.1 * query.number, torch.ones(2), False)
 
     seen: list[Tensor] = []
     domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
     search(
-        evaluate,
+        partial(map, evaluate),
         domain,
         PGD(step_size=0.125, momentum=0.0),
         steps=40,
@@ -324,23 +329,23 @@ def test_a_window_goes_back_only_for_more_than_noise() -> None:
 def test_a_non_finite_objective_sends_pgd_back_with_half_the_step() -> None:
     wall = 0.55
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        value = float(u[0]) if float(u[0]) < wall else math.nan
-        return Evaluation(value, torch.ones(1) if gradient else None, False)
+    def evaluate(query: Query) -> Evaluation:
+        value = float(query.u[0]) if float(query.u[0]) < wall else math.nan
+        return Evaluation(value, torch.ones(1) if query.gradient else None, False)
 
     domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
-    result = search(evaluate, domain, PGD(step_size=1.0, momentum=0.0), steps=STEPS, seed=0)
+    result = search(partial(map, evaluate), domain, PGD(step_size=1.0, momentum=0.0), steps=STEPS, seed=0)
     assert result.stopped is Ending.BUDGET_SPENT
     assert 0 < result.non_finite_objectives < STEPS / 2
     assert float(result.best_u[0]) > 0.54
 
 
 def test_pgd_without_any_gradient_stalls() -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(-1.0, torch.zeros_like(u), False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(-1.0, torch.zeros_like(query.u), False)
 
     domain = Domain(torch.full((5,), 0.5), (Block(5, "linf", 0.1),))
-    result = search(evaluate, domain, PGD(), steps=STEPS, seed=0)
+    result = search(partial(map, evaluate), domain, PGD(), steps=STEPS, seed=0)
     assert result.ending is Ending.STALLED
     assert len(result.history) == 5
 
@@ -350,11 +355,11 @@ def test_pgd_goes_on_along_its_momentum_when_a_gradient_cannot_be_paid() -> None
     domain = Domain(torch.full((2,), 0.1), (Block(2, "linf", 0.9),), gradient_cost=3)
     seen: list[float] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        seen.append(float(u[0]))
-        return Evaluation(seen[-1], torch.ones(2) if gradient else None, False, cost=1 + 3 * bool(gradient))
+    def evaluate(query: Query) -> Evaluation:
+        seen.append(float(query.u[0]))
+        return Evaluation(seen[-1], torch.ones(2) if query.gradient else None, False, cost=1 + 3 * bool(query.gradient))
 
-    result = search(evaluate, domain, PGD(step_size=0.125), steps=10, seed=0, candidates=0)
+    result = search(partial(map, evaluate), domain, PGD(step_size=0.125), steps=10, seed=0, candidates=0)
     assert (result.gradients, result.renders, len(seen)) == (2, 10, 4)
     assert seen == pytest.approx([0.1, 0.2125, 0.325, 0.38125])  # the step was halved at a checkpoint, the way kept
 
@@ -363,11 +368,11 @@ def test_pgd_leaves_a_flat_start_at_random() -> None:
     """The gradient is zero at the start only, as under a saturated softmax."""
     problem = linear(20, "linf", seed=0)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        evaluation = problem.evaluator()(u, index=index, gradient=gradient)
-        return Evaluation(0.0, torch.zeros(20), False) if index == 0 else evaluation
+    def evaluate(query: Query) -> Evaluation:
+        (evaluation,) = problem.evaluator()([query])
+        return Evaluation(0.0, torch.zeros(20), False) if query.number == 0 else evaluation
 
-    result = search(evaluate, problem.domain, PGD(), steps=STEPS, seed=0)
+    result = search(partial(map, evaluate), problem.domain, PGD(), steps=STEPS, seed=0)
     assert problem.value(result.best_u) >= problem.optimum / RATIO
 
 
@@ -397,7 +402,7 @@ CHOOSY = Domain(
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "adam": {"step_size": 1.0, "beta1": 0.0, "beta2": 0.99},
-    "archive": {"cells": 4, "population": 4, "sigma": 0.3, "line": 0.0},
+    "archive": {"cells": 4, "population": 4},
     "auto": {},
     "cmaes": {"sigma": 1.0, "population": 4},
     "grid": {"points": 2},
@@ -430,28 +435,28 @@ def domain_for(policy: Policy[Any]) -> Domain:
     return FEW if policy.name == "grid" else MIXED
 
 
-def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1, cost: int = 0) -> Callable[..., Evaluation]:
+def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1, cost: int = 0) -> Evaluate:
     """A small random network of u with four classes, seen through noise, as an `evaluate`."""
     rng = seeded(1, 1)
     first, second = torch.randn(d, 12, generator=rng), torch.randn(12, 4, generator=rng)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        x = u.clone().requires_grad_(bool(gradient))
-        noise = 0.01 / math.sqrt(samples) * torch.randn(d, generator=seeded(7, index))
+    def evaluate(query: Query) -> Evaluation:
+        x = query.u.clone().requires_grad_(bool(query.gradient))
+        noise = 0.01 / math.sqrt(query.samples) * torch.randn(d, generator=seeded(7, query.number))
         logits = (((x + noise) @ first).tanh() @ second)[None]
         value = get_objective(objective)(logits, torch.zeros(1, 1, 1, 3), (0, 2))[0]
-        slope = torch.autograd.grad(value, x)[0] if gradient else None
-        if slope is not None and index % 3 == 1:
-            slope[index % d] = math.nan
-        number = math.nan if index == nan_at else float(value.detach())
-        price = samples * (1 + cost * (gradient is True))
+        slope = torch.autograd.grad(value, x)[0] if query.gradient else None
+        if slope is not None and query.number % 3 == 1:
+            slope[query.number % d] = math.nan
+        number = math.nan if query.number == nan_at else float(value.detach())
+        price = query.samples * (1 + cost * (query.gradient is True))
         return Evaluation(number, slope, bool(logits.argmax() % 2), cost=price)
 
-    return evaluate
+    return partial(map, evaluate)
 
 
-def constant(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-    return Evaluation(0.5, torch.zeros_like(u) if gradient else None, False, cost=samples)
+def constant(query: Query) -> Evaluation:
+    return Evaluation(0.5, torch.zeros_like(query.u) if query.gradient else None, False, cost=query.samples)
 
 
 @pytest.mark.parametrize("objective", sorted(OBJECTIVES))
@@ -539,7 +544,7 @@ class Sampled(Policy[Any]):
 
 @battery
 def test_a_constant_objective_breaks_nothing(policy: Policy[Any]) -> None:
-    result = search(constant, domain_for(policy), policy, steps=60, seed=0)
+    result = search(partial(map, constant), domain_for(policy), policy, steps=60, seed=0)
     assert result.best_objective == 0.5
     assert result.stopped is Ending.BUDGET_SPENT or policy.uses_gradient or policy.name == "grid"
 
@@ -550,12 +555,13 @@ def test_half_of_the_domain_cannot_be_evaluated(policy: Policy[Any], bad: float)
     domain = domain_for(policy)
     inner = classifier(domain.dim)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        evaluation = inner(u, index=index, gradient=gradient, samples=samples)
-        lost = float(u[-1]) > float(domain.start[-1]) + 1e-3 and index % 3
-        return replace(evaluation, objective=bad, gradient=u * math.nan if gradient else None) if lost else evaluation
+    def evaluate(query: Query) -> Evaluation:
+        (evaluation,) = inner([query])
+        if float(query.u[-1]) <= float(domain.start[-1]) + 1e-3 or query.number % 3 == 0:
+            return evaluation
+        return replace(evaluation, objective=bad, gradient=query.u * math.nan if query.gradient else None)
 
-    result = search(evaluate, domain, policy, steps=40, seed=1, candidates=0)
+    result = search(partial(map, evaluate), domain, policy, steps=40, seed=1, candidates=0)
     assert result.stopped in (Ending.BUDGET_SPENT, Ending.STALLED)
     assert result.non_finite_objectives < 30
     assert math.isfinite(result.best_objective)
@@ -566,16 +572,17 @@ def test_choices_and_angles_are_searched_by_every_policy(policy: Policy[Any]) ->
     """The best option of two choices is worth more than the numbers; angles are met on both sides of their seam."""
     seen: list[Tensor] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+    def evaluate(query: Query) -> Evaluation:
+        u = query.u
         assert CHOOSY.contains(u)
         seen.append(u)
         first, second = min(2, int(u[0] * 3)), min(1, int(u[4] * 2))
         value = 2.0 * (first == 2) + (second == 0) + 0.2 * math.sin(2.0 * math.pi * float(u[1])) + 0.2 * float(u[2])
         slope = torch.tensor([0.0, 0.4 * math.pi * math.cos(2.0 * math.pi * float(u[1])), 0.2, 0.0, 0.0])
-        cost = samples * (3 if gradient else 1)
-        return Evaluation(value, slope if gradient else None, False, cost=cost)
+        cost = query.samples * (3 if query.gradient else 1)
+        return Evaluation(value, slope if query.gradient else None, False, cost=cost)
 
-    result = search(evaluate, CHOOSY, policy, steps=120, seed=0, candidates=0)
+    result = search(partial(map, evaluate), CHOOSY, policy, steps=144, seed=0, candidates=0)
     assert (int(result.best_u[0] * 3), int(result.best_u[4] * 2)) == (2, 0)
     assert {(int(u[0] * 3), int(u[4] * 2)) for u in seen} == {(a, b) for a in range(3) for b in range(2)}
     assert result.best_objective > 3.1
@@ -585,10 +592,11 @@ def test_choices_and_angles_are_searched_by_every_policy(policy: Policy[Any]) ->
 def test_one_number_is_enough(policy: Policy[Any]) -> None:
     domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(-abs(float(u[0]) - 0.57), torch.ones(1) if gradient else None, False, 0, samples)
+    def evaluate(query: Query) -> Evaluation:
+        slope = torch.ones(1) if query.gradient else None
+        return Evaluation(-abs(float(query.u[0]) - 0.57), slope, False, cost=query.samples)
 
-    result = search(evaluate, domain, policy, steps=40, seed=0, candidates=0)
+    result = search(partial(map, evaluate), domain, policy, steps=40, seed=0, candidates=0)
     assert float(result.best_u[0]) == pytest.approx(0.57, abs=0.04)
 
 
@@ -604,7 +612,8 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
         for k in range(index, index + steps):
             (proposal,), state = policy.propose(state, 1)
             seen.append(proposal.u)
-            evaluation = evaluate(proposal.u, index=3 * k, gradient=proposal.gradient, samples=proposal.samples)
+            query = Query(proposal.u, k, number=3 * k, gradient=proposal.gradient, samples=proposal.samples)
+            (evaluation,) = evaluate([query])
             state = policy.update(state, [(proposal.u, evaluation)])
         return state, torch.stack(seen)
 
@@ -709,11 +718,11 @@ def test_options_out_of_range_are_refused(options: dict[str, float], message: st
 
 
 def told(policy: Policy[Any], objective: Callable[[int, Tensor], Evaluation], domain: Domain, steps: int) -> Any:
-    def evaluate(u: Tensor, *, index: int, gradient: Any, samples: int = 1) -> Evaluation:
-        found = objective(index, u)
-        return found if gradient else replace(found, gradient=None)
+    def evaluate(query: Query) -> Evaluation:
+        found = objective(query.number, query.u)
+        return found if query.gradient else replace(found, gradient=None)
 
-    return search(evaluate, domain, policy, steps=steps, seed=1, candidates=0)
+    return search(partial(map, evaluate), domain, policy, steps=steps, seed=1, candidates=0)
 
 
 @pytest.mark.parametrize("name", ["pgd", "adam", "auto", "restarts", "portfolio"])

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Adam, Block, Domain, Ending, Evaluation, search
+from advsearch.attacks import Adam, Block, Domain, Ending, Evaluation, Query, search
 from advsearch.attacks.policies.scaling import half_widths
 
 
 def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor]:
     seen: list[Tensor] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(float(u @ slope), slope.clone() if gradient else None, False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(float(query.u @ slope), slope.clone() if query.gradient else None, False)
 
     search(
-        evaluate,
+        partial(map, evaluate),
         domain,
         policy,
         steps=steps,
@@ -55,36 +56,38 @@ def test_half_widths_are_the_units() -> None:
 def test_the_rate_falls_in_a_line() -> None:
     domain = Domain(torch.full((2,), 0.5), (Block(2),))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(0.0, torch.ones(2) if gradient else None, False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(0.0, torch.ones(2) if query.gradient else None, False)
 
-    history = search(evaluate, domain, Adam(step_size=0.4), steps=10, seed=0, candidates=0).history
+    history = search(partial(map, evaluate), domain, Adam(step_size=0.4), steps=10, seed=0, candidates=0).history
     assert [r.step_size for r in history] == pytest.approx([0.4 * (1 - k / 10) for k in range(10)])
 
 
 def test_without_any_gradient_it_stalls_and_leaves_a_flat_start_at_random() -> None:
     domain = Domain(torch.full((5,), 0.5), (Block(5, "linf", 0.1),))
 
-    def never(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(-1.0, torch.zeros_like(u), False)
+    def never(query: Query) -> Evaluation:
+        return Evaluation(-1.0, torch.zeros_like(query.u), False)
 
-    def later(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        slope = torch.ones_like(u) if index > 1 else torch.zeros_like(u)
-        return Evaluation(float(u.sum()), slope if gradient else None, False)
+    def later(query: Query) -> Evaluation:
+        slope = torch.ones_like(query.u) if query.number > 1 else torch.zeros_like(query.u)
+        return Evaluation(float(query.u.sum()), slope if query.gradient else None, False)
 
-    flat = search(never, domain, Adam(), steps=60, seed=0)
+    flat = search(partial(map, never), domain, Adam(), steps=60, seed=0)
     assert flat.ending is Ending.STALLED
     assert len(flat.history) == 5
-    assert search(later, domain, Adam(), steps=40, seed=0, candidates=0).best_objective == pytest.approx(3.0, abs=0.01)
+    assert search(partial(map, later), domain, Adam(), steps=40, seed=0, candidates=0).best_objective == pytest.approx(
+        3.0, abs=0.01
+    )
 
 
 def test_a_non_finite_objective_sends_it_back_with_half_the_rate() -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        value = float(u[0]) if float(u[0]) < 0.55 else math.nan
-        return Evaluation(value, torch.ones(1) if gradient else None, False)
+    def evaluate(query: Query) -> Evaluation:
+        value = float(query.u[0]) if float(query.u[0]) < 0.55 else math.nan
+        return Evaluation(value, torch.ones(1) if query.gradient else None, False)
 
     domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
-    result = search(evaluate, domain, Adam(step_size=1.0), steps=60, seed=0, candidates=0)
+    result = search(partial(map, evaluate), domain, Adam(step_size=1.0), steps=60, seed=0, candidates=0)
     assert result.stopped is Ending.BUDGET_SPENT
     assert 0 < result.non_finite_objectives < 30
     assert float(result.best_u[0]) > 0.545

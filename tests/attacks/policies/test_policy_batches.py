@@ -1,4 +1,5 @@
-"""Batches: what a policy proposes does not depend on how many proposals it is asked for at once."""
+"""Batches: what a policy proposes does not depend on how many proposals it is asked for at once; a last batch may be
+cut."""
 
 from __future__ import annotations
 
@@ -21,16 +22,21 @@ FORMS: dict[str, Policy[Any]] = {
     "halving of cmaes": make_policy("halving", policy="cmaes", starts=3),
     "halving of pgd": make_policy("halving", policy="pgd", starts=3),
     "restarts of nes": make_policy("restarts", policy="nes"),
+    "restarts of auto": make_policy("restarts", policy="auto", times=3),
+    "halving of restarts": make_policy("halving", policy={"name": "restarts", "times": 2}, starts=3),
+    "restarts of halving": make_policy("restarts", policy={"name": "halving", "policy": "pgd", "starts": 2}, times=3),
     "portfolio of halvings": make_policy("portfolio", policies=["halving", "sobol", {"name": "halving", "eta": 2}]),
 }
 STEPS = 40
 
 
 def worth(u: Tensor, gradient: object, samples: int, cost: int) -> Evaluation:
-    """A function of u alone, so that the order of evaluations does not matter."""
+    """A function of u alone, so that the order of evaluations does not matter; half of all gradients take fewer renders
+    than they may."""
     slope = torch.cos(5.0 * u) * 5.0 if gradient else None
-    price = samples * (1 + (cost if gradient is True else 0))
-    return Evaluation(float(torch.sin(5.0 * u).sum()), slope, False, cost=price)
+    value = float(torch.sin(5.0 * u).sum())
+    price = samples * (1 + (cost - int(100 * value) % 2 * (cost // 2) if gradient is True else 0))
+    return Evaluation(value, slope, value > 1.0, cost=price)
 
 
 def proposed(policy: Policy[Any], domain: Domain, n: int) -> tuple[list[tuple[Any, ...]], list[int]]:
@@ -55,15 +61,46 @@ def proposed(policy: Policy[Any], domain: Domain, n: int) -> tuple[list[tuple[An
 @pytest.mark.parametrize("policy", FORMS)
 def test_a_batch_has_what_would_have_come_one_by_one(policy: str, domain: str) -> None:
     alone, _ = proposed(FORMS[policy], DOMAINS[domain], 1)
-    for n in (2, 5, 1000):
+    for n in (2, 3, 16, 1000):
         together, sizes = proposed(FORMS[policy], DOMAINS[domain], n)
         assert together[: len(alone)] == alone, n  # the last batch may go beyond the renders
         assert max(sizes) <= n
 
 
+@pytest.mark.parametrize("policy", FORMS)
+def test_of_a_batch_that_is_cut_the_first_count(policy: str) -> None:
+    """What a policy knows after a whole batch and the first half of another is what it knows where these came one by
+    one; and it can be asked for more."""
+
+    def known(n: int, most: int) -> tuple[Any, ...]:
+        one = with_choices(FORMS[policy], CHOICES)
+        state, told = one.start(CHOICES, torch.Generator().manual_seed(3), STEPS), 0
+        while told < most:
+            proposals, state = one.propose(state, n)
+            first = proposals[: most - told]
+            state = one.update(state, [(p.u, worth(p.u, p.gradient, p.samples, 0)) for p in first])
+            told += len(first)
+        answer, failures = one.answer(state), one.failures(state)
+        assert len(one.propose(state, n)[0]) <= n
+        return (
+            one.counts(state),
+            answer and (answer.mean.tolist(), answer.deviation.tolist()),
+            failures and (failures.found, failures.seen, [failure.objective for failure in failures.listed]),
+        )
+
+    assert known(8, 11) == known(1, 11)
+
+
 @pytest.mark.parametrize("policy", ["cmaes", "halving", "nes", "random", "sobol", "portfolio of halvings"])
 def test_a_population_fills_a_batch(policy: str) -> None:
     assert max(proposed(FORMS[policy], NUMBERS, 4)[1]) == 4
+
+
+def test_restarts_step_together_along_their_gradients() -> None:
+    """Four at a time, and with a whole gradient by differences for each."""
+    assert proposed(FORMS["restarts"], NUMBERS, 1000)[1] == [4] * 10
+    assert proposed(FORMS["restarts"], COSTLY, 1000)[1][:2] == [4, 4]
+    assert proposed(FORMS["restarts"], NUMBERS, 3)[1][:4] == [3, 3, 3, 3]
 
 
 def test_the_whole_screen_of_auto_is_one_batch_and_then_every_point_waits_for_the_one_before() -> None:

@@ -7,15 +7,15 @@ import math
 import re
 import sys
 from dataclasses import MISSING, fields
+from functools import partial
 from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
 from conftest import ROOT
-from torch import Tensor
 
-from advsearch.attacks import POLICIES, Block, Domain, Ending, Evaluation, Policy, make_policy, search
+from advsearch.attacks import POLICIES, Block, Domain, Ending, Evaluation, Policy, Query, make_policy, search
 
 PAGE = (ROOT / "docs" / "policies" / "README.md").read_text("utf-8")
 
@@ -78,7 +78,9 @@ def test_an_optimum_is_the_largest_value(objective: str) -> None:
         problem = closed_form.OBJECTIVES[objective](d, 5)
         assert problem.value(problem.domain.start) < 0.8 * problem.optimum
         for name in ("random", "pgd"):
-            result = search(problem.evaluate, problem.domain, make_policy(name), steps=200, seed=0, candidates=0)
+            result = search(
+                partial(map, problem.evaluate), problem.domain, make_policy(name), steps=200, seed=0, candidates=0
+            )
             assert problem.value(result.best_u) <= problem.optimum * (1 + 1e-4)
         u = problem.domain.start.clone().requires_grad_(True)
         step = 1e-3 * torch.randn(d, generator=torch.Generator().manual_seed(1))
@@ -119,21 +121,21 @@ def users_class() -> Any:
 def test_the_policy_of_the_page_works() -> None:
     walk: Policy[Any] = users_class()()
     problem = closed_form.OBJECTIVES["quadratic, box"](6, 0)
-    result = search(problem.evaluate, problem.domain, walk, steps=400, seed=0, candidates=0)
+    result = search(partial(map, problem.evaluate), problem.domain, walk, steps=400, seed=0, candidates=0)
     assert problem.value(result.best_u) > 0.9 * problem.optimum
     assert result.stopped is Ending.BUDGET_SPENT
     beside = make_policy("portfolio", policies=[walk, "auto"])
-    assert search(problem.evaluate, problem.domain, beside, steps=40, seed=0).best_objective > 0.0
+    assert search(partial(map, problem.evaluate), problem.domain, beside, steps=40, seed=0).best_objective > 0.0
 
 
 def test_the_policy_of_the_page_stays_in_a_ball_and_gets_choices_for_free() -> None:
     domain = Domain(torch.tensor([0.5, 0.5, 0.5, 0.1]), (Block(3, "l2", 0.1), Block(1, options=4)))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        assert domain.contains(u)
-        value = float(u[0] - u[1]) + (int(u[3] * 4) == 2) if index % 7 else math.nan
+    def evaluate(query: Query) -> Evaluation:
+        assert domain.contains(query.u)
+        value = float(query.u[0] - query.u[1]) + (int(query.u[3] * 4) == 2) if query.number % 7 else math.nan
         return Evaluation(value, None, False)
 
-    result = search(evaluate, domain, users_class()(), steps=100, seed=0, candidates=0)
+    result = search(partial(map, evaluate), domain, users_class()(), steps=100, seed=0, candidates=0)
     assert int(result.best_u[3] * 4) == 2
     assert result.best_objective > 1.1

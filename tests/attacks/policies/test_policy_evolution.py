@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,19 +13,33 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import CMAES, NES, Block, Domain, Ending, Evaluation, Policy, Random, make_policy, search, seeded
+from advsearch.attacks import (
+    CMAES,
+    NES,
+    Block,
+    Domain,
+    Ending,
+    Evaluate,
+    Evaluation,
+    Policy,
+    Query,
+    Random,
+    make_policy,
+    search,
+    seeded,
+)
 from advsearch.attacks.policies.nes import WIDEST, utilities
 from advsearch.errors import InputError
 
 both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: policy.name)
 
 
-def evaluator(value: Callable[[Tensor], float], noise: float = 0.0) -> Callable[..., Evaluation]:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        error = noise * float(torch.randn(1, generator=seeded(5, index)))
-        return Evaluation(value(u) + error, None, False)
+def evaluator(value: Callable[[Tensor], float], noise: float = 0.0) -> Evaluate:
+    def evaluate(query: Query) -> Evaluation:
+        error = noise * float(torch.randn(1, generator=seeded(5, query.number)))
+        return Evaluation(value(query.u) + error, None, False)
 
-    return evaluate
+    return partial(map, evaluate)
 
 
 def bowl(centre: float) -> Callable[[Tensor], float]:

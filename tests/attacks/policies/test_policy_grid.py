@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Ending, Evaluation, Grid, Policy, SearchResult, Sobol, search, seeded
+from advsearch.attacks import (
+    Block,
+    Domain,
+    Ending,
+    Evaluation,
+    Grid,
+    Policy,
+    Query,
+    SearchResult,
+    Sobol,
+    search,
+    seeded,
+)
 from advsearch.errors import InputError
 
 
-def flat(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+def flat(query: Query) -> Evaluation:
     return Evaluation(0.0, None, False)
 
 
 def points(policy: Policy[Any], domain: Domain, steps: int, seed: int = 0) -> tuple[Tensor, SearchResult]:
     seen: list[Tensor] = []
     result = search(
-        flat,
+        partial(map, flat),
         domain,
         policy,
         steps=steps,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
+from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.failure_share import FailureShare, failure_share
 from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import one_thread
@@ -45,12 +46,12 @@ def two(u: Tensor) -> Tensor:
 
 
 def learnt(margin: Margin, seed: int, renders: int = 400) -> Failures:
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        value = float(margin(u))
+    def evaluate(query: Query) -> Evaluation:
+        value = float(margin(query.u))
         return Evaluation(value, None, value > 0.0)
 
     policy = make_policy("mixture")
-    found = search(evaluate, BOX, policy, steps=renders, seed=seed, candidates=0).failures
+    found = search(partial(map, evaluate), BOX, policy, steps=renders, seed=seed, candidates=0).failures
     assert found is not None
     return found
 
@@ -127,8 +128,8 @@ def test_options_that_no_search_can_have_are_refused() -> None:
 def test_no_share_is_told_of_a_ball_whose_draws_are_projected() -> None:
     domain = Domain(torch.full((2,), 0.5), (Block(2, "l2", 0.1),))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(float(u[0]), None, bool(u[0] > 0.55))
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(float(query.u[0]), None, bool(query.u[0] > 0.55))
 
-    known = search(evaluate, domain, make_policy("mixture"), steps=60, seed=0, candidates=0).failures
+    known = search(partial(map, evaluate), domain, make_policy("mixture"), steps=60, seed=0, candidates=0).failures
     assert known is not None and known.share is None and known.found > 0

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import pytest
@@ -27,6 +28,7 @@ from advsearch.attacks import (
     Policy,
     Portfolio,
     Proposal,
+    Query,
     Random,
     Restarts,
     SearchResult,
@@ -46,12 +48,14 @@ BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))
 
 @dataclass(frozen=True)
 class Still(Policy[tuple[Tensor, int]]):
-    """Proposes u = (value, where it begins), `times` times; notes what it was promised in `plans`."""
+    """Proposes u = (value, where it begins), `times` times; notes what it was promised in `plans`, and what evaluations
+    cost in `costs`."""
 
     value: float
     times: int = 10**6
     gradient: bool = False
     plans: tuple[list[int], ...] = ()
+    costs: tuple[list[int], ...] = ()
     name: ClassVar[str] = "still"
     handles_choices: ClassVar[bool] = True
 
@@ -71,6 +75,8 @@ class Still(Policy[tuple[Tensor, int]]):
 
     def update(self, state: tuple[Tensor, int], evaluated: Evaluated) -> tuple[Tensor, int]:
         assert all(torch.equal(u, state[0]) for u, _ in evaluated)
+        for costs in self.costs:
+            costs += [evaluation.cost for _, evaluation in evaluated]
         return state
 
 
@@ -79,13 +85,13 @@ def played(
 ) -> tuple[SearchResult, list[Tensor]]:
     seen: list[Tensor] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        seen.append(u.clone())
-        slope = torch.ones_like(u) if gradient else None
-        cost = samples * (1 + domain.gradient_cost * (gradient is True))
-        return Evaluation(value(u), slope, False, cost=cost)
+    def evaluate(query: Query) -> Evaluation:
+        seen.append(query.u.clone())
+        slope = torch.ones_like(query.u) if query.gradient else None
+        cost = query.samples * (1 + domain.gradient_cost * (query.gradient is True))
+        return Evaluation(value(query.u), slope, False, cost=cost)
 
-    return search(evaluate, domain, policy, steps=steps, seed=0, candidates=0), seen
+    return search(partial(map, evaluate), domain, policy, steps=steps, seed=0, candidates=0), seen
 
 
 def first(u: Tensor) -> float:
@@ -109,11 +115,12 @@ def test_as_many_run_as_can_have_a_whole_evaluation_in_every_round(steps: int, e
 
 
 def test_who_reached_more_goes_on_with_an_equal_share_of_every_round() -> None:
-    """Four policies, 48 renders, three rounds of 16: 4 each, then 8 for the better two, then 16 for the best."""
+    """Four policies, 48 renders, three rounds of 16: 4 each, then 8 for the better two, then 16 for the best. Those of
+    a round take turns."""
     policy = Portfolio(tuple(Still(value) for value in (0.2, 0.8, 0.4, 0.6)))
     result, seen = played(policy, 48, first)
     order = [round(float(u[0]), 1) for u in seen]
-    assert order == [0.2] * 4 + [0.8] * 4 + [0.4] * 4 + [0.6] * 4 + [0.8] * 8 + [0.6] * 8 + [0.8] * 16
+    assert order == [0.2, 0.8, 0.4, 0.6] * 4 + [0.8, 0.6] * 8 + [0.8] * 16
     assert result.stopped is Ending.BUDGET_SPENT
 
 
@@ -133,18 +140,33 @@ def test_renders_that_one_leaves_go_to_the_others() -> None:
     assert (stalled.stopped, stalled.renders) == (Ending.STALLED, 5)
 
 
-def test_a_costly_gradient_does_not_overdraw_a_turn() -> None:
-    """Ten renders a turn, four a gradient: two of them and two renders without."""
+def test_a_costly_gradient_does_not_overdraw_a_share() -> None:
+    """Ten renders each, four a gradient: two of them and two renders without."""
     domain = replace(BOX, gradient_cost=3)
     asked: list[bool] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        asked.append(bool(gradient))
-        slope = torch.ones_like(u) if gradient else None
-        return Evaluation(float(u[0]), slope, False, cost=1 + 3 * bool(gradient))
+    def evaluate(query: Query) -> Evaluation:
+        asked.append(bool(query.gradient))
+        slope = torch.ones_like(query.u) if query.gradient else None
+        return Evaluation(float(query.u[0]), slope, False, cost=1 + 3 * bool(query.gradient))
 
-    search(evaluate, domain, Restarts(Still(0.5, gradient=True), 2), steps=20, seed=0, candidates=0)
-    assert asked == [True, True, False, False] * 2
+    search(partial(map, evaluate), domain, Restarts(Still(0.5, gradient=True), 2), steps=20, seed=0, candidates=0)
+    assert asked == [True] * 4 + [False] * 4
+
+
+def test_renders_that_gradients_did_not_take_are_for_the_rounds_to_come() -> None:
+    """Two searches, 40 renders, two rounds of 20: gradients that may take four renders, and take two."""
+    domain = replace(BOX, gradient_cost=3)
+    seen: list[float] = []
+
+    def evaluate(query: Query) -> Evaluation:
+        seen.append(round(float(query.u[0]), 1))
+        slope = torch.ones_like(query.u) if query.gradient else None
+        return Evaluation(float(query.u[0]), slope, False, cost=2 if query.gradient else 1)
+
+    policy = Portfolio((Still(0.5, gradient=True), Still(0.9, gradient=True)))
+    assert search(partial(map, evaluate), domain, policy, steps=40, seed=0, candidates=0).renders == 40
+    assert seen[:8] == [0.5, 0.9] * 4 and set(seen[8:]) == {0.9}
 
 
 def test_what_is_affordable() -> None:
@@ -165,10 +187,10 @@ def test_what_is_affordable() -> None:
 
 
 def test_restarts_share_the_renders_and_begin_elsewhere() -> None:
+    """Thirty-two renders are ten for each of three, by turns, and two more for the best of them."""
     _, seen = played(Restarts(Still(0.5), times=3), 32, first)
     begins = [float(u[1]) for u in seen]
-    runs = [begins[:10], begins[10:21], begins[21:]]
-    assert all(len(set(run)) == 1 for run in runs)
+    assert begins == begins[:3] * 10 + begins[:1] * 2
     assert begins[0] == pytest.approx(0.6)
     assert len(set(begins)) == 3
 
@@ -177,7 +199,7 @@ def test_restarts_do_not_move_the_ball() -> None:
     domain = Domain(torch.full((8,), 0.5), (Block(8, "linf", 0.1),))
     _, seen = played(Restarts(PGD(), times=4), 40, lambda u: float(u.sum()), domain)
     assert all(domain.contains(u) for u in seen)
-    assert len({tuple(seen[k].tolist()) for k in (0, 10, 20, 30)}) == 4
+    assert len({tuple(seen[k].tolist()) for k in range(4)}) == 4
 
 
 def test_fewer_restarts_where_renders_are_few() -> None:
@@ -195,12 +217,14 @@ def test_restarts_find_the_higher_of_two_hills() -> None:
         low, high = ((math.exp(-20 * float((u - c).square().sum())), c) for c in (0.2, 0.85))
         return -40 * (low[0] * (u - low[1]) + 2 * high[0] * (u - high[1]))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(value(u), slope(u) if gradient else None, False)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(value(query.u), slope(query.u) if query.gradient else None, False)
 
     domain = Domain(torch.tensor([0.25, 0.15]), (Block(2),))
-    alone = search(evaluate, domain, PGD(step_size=0.1), steps=80, seed=0, candidates=0)
-    several = search(evaluate, domain, Restarts(PGD(step_size=0.1), times=8), steps=80, seed=0, candidates=0)
+    alone = search(partial(map, evaluate), domain, PGD(step_size=0.1), steps=80, seed=0, candidates=0)
+    several = search(
+        partial(map, evaluate), domain, Restarts(PGD(step_size=0.1), times=8), steps=80, seed=0, candidates=0
+    )
     assert value(alone.best_u) < 1.1
     assert value(several.best_u) > 1.9
 
@@ -229,11 +253,11 @@ def test_a_portfolio_answers_with_its_leaders_distribution() -> None:
 def halved(policy: Halving, steps: int, value: Callable[[Tensor], float]) -> list[tuple[StepRecord, tuple[float, ...]]]:
     told: list[tuple[StepRecord, tuple[float, ...]]] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        return Evaluation(value(u), None, False, cost=samples)
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(value(query.u), None, False, cost=query.samples)
 
     search(
-        evaluate,
+        partial(map, evaluate),
         BOX,
         policy,
         steps=steps,
@@ -274,6 +298,16 @@ def test_no_evaluation_has_too_many_samples() -> None:
     assert told[-1][0].renders == 1000
 
 
+def test_a_policy_in_halving_counts_renders_as_if_its_samples_never_grew() -> None:
+    """Of 64 renders 16 for each of two searches, then 32 for one of them with two samples each: it plans for 32, and
+    has as many."""
+    plans, costs = list[int](), list[int]()
+    policy = Still(0.5, plans=(plans,), costs=(costs,))
+    _, seen = played(Halving(policy, eta=2, starts=2), 64, first)
+    assert plans == [32, 32]
+    assert (len(seen), set(costs)) == (48, {1})
+
+
 def test_halving_with_a_policy_goes_on_from_each_start() -> None:
     policy = Halving(policy=NES(population=4), eta=2, starts=4)
     result, seen = played(policy, 200, lambda u: -float((u - 0.9).square().sum()))
@@ -311,13 +345,13 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
     )
     w = torch.tensor([1.0, 0.0, -1.0, 1.0])
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
-        bonus = 0.3 * (int(u[1] * 3) == 1)
-        return Evaluation(float(w @ u) + bonus, w.clone() if gradient else None, False)
+    def evaluate(query: Query) -> Evaluation:
+        bonus = 0.3 * (int(query.u[1] * 3) == 1)
+        return Evaluation(float(w @ query.u) + bonus, w.clone() if query.gradient else None, False)
 
-    best = search(evaluate, domain, PGD(), steps=60, seed=0, candidates=0)
+    best = search(partial(map, evaluate), domain, PGD(), steps=60, seed=0, candidates=0)
     assert best.best_u.tolist() == pytest.approx([0.6, 0.5, 0.5 - 0.02**0.5, 0.5 + 0.02**0.5], abs=1e-3)
-    spread = search(evaluate, domain, NES(), steps=200, seed=0, candidates=0).distribution
+    spread = search(partial(map, evaluate), domain, NES(), steps=200, seed=0, candidates=0).distribution
     assert spread is not None
     assert (float(spread.mean[1]), float(spread.deviation[1])) == (0.5, 0.0)
     drawn = spread.sample(seeded(0, 0), 5, domain)
