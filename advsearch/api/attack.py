@@ -496,7 +496,6 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
         next_count(config.pixel_sampler, config.search_spp),
         config.seed,
         searched=len(job.controls),
-        printable=config.printable,
         aovs=aovs_of(config.aov),
         metrics=job.metrics,
     )
