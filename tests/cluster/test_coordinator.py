@@ -259,3 +259,19 @@ def test_runs_that_share_a_worker_all_get_on(monkeypatch: pytest.MonkeyPatch) ->
         assert isinstance(unknown, Failure) and unknown.forgotten
     finally:
         threads.configure()
+
+
+def test_results_that_are_given_up_do_not_answer_what_is_asked_next() -> None:
+    """Though their ranges are still under way, and though nobody has closed them."""
+    pool = Simulated()
+    pool.add(2)
+    shared = coordinator(pool)
+    first = shared.results(ranges(400))
+    for _ in range(3):
+        next(first)
+    numbers = sorted(
+        number for done in shared.results(iter([range(900, 901), range(901, 902)])) for number in done.numbers
+    )
+    assert numbers == [900, 901]
+    with pytest.raises(RuntimeError, match="given up when others were asked for"):
+        next(first)
