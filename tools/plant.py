@@ -382,7 +382,7 @@ def answer(root: Path, tests: Sequence[str]) -> Answer:
     Raises:
         RuntimeError: none of them ran.
     """
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", "--tb=no", *tests]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "--tb=no", *tests]
     begun = time.perf_counter()
     try:
         ran = subprocess.run(
