@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import pytest
-from plant import FAULTS, ROOT, Fault, rooms, write
+import plant
+from plant import FAULTS, ROOT, Answer, Fault, found_by, rooms, write
 
 EVERY_ROOM = {
     *("attacks", "cli", "cluster", "config", "controls", "engine", "explanations", "exporting", "hardening"),
@@ -39,3 +41,21 @@ def test_what_was_compiled_of_a_module_goes(tmp_path: Path) -> None:
     compiled.write_bytes(b"")
     write(tmp_path / "a.py", "x = 1\n")
     assert not compiled.exists() and (tmp_path / "a.py").read_text() == "x = 1\n"
+
+
+@pytest.mark.parametrize(("finds", "words"), [(True, "t.py::test_b[1] (2 s)"), (False, None)])
+def test_a_test_that_fails_without_the_fault_finds_nothing(
+    finds: bool, words: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, failing = tmp_path / "a.py", set[str]()
+    file.write_text("x = 1\n")
+
+    def answered(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> Answer:
+        fault = file.read_text() == "x = 2\n"
+        fails = ["t.py::test_a[0]"] if "t.py::test_a" not in without else []
+        fails += ["t.py::test_b[1]"] if fault and finds else []
+        return Answer(next((one for one in fails if one.startswith(tuple(tests))), None), 2.0)
+
+    monkeypatch.setattr(plant, "answer", answered)
+    assert found_by(tmp_path, Fault("scene: x", "a.py", "1", "2", ("t.py",)), failing) == words
+    assert failing == {"t.py::test_a"} and file.read_text() == "x = 1\n"
