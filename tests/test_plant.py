@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-import pytest
 import plant
+import pytest
 from plant import FAULTS, ROOT, Answer, Fault, found_by, rooms, write
 
 EVERY_ROOM = {
