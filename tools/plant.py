@@ -334,7 +334,7 @@ FAULTS = (
     Fault(
         "hardening: plain pictures may be lost",
         "advsearch/engine/hardening/rounds.py",
-        "return clean >= self.done[0].clean - self.clean_loss - 1e-9",
+        "return clean >= self.done[0].clean - self.course.config.clean_loss - 1e-9",
         "return True",
         ("tests/engine/test_hardening.py", "tests/api/test_harden.py"),
     ),

@@ -281,9 +281,8 @@ def test_the_weights_that_are_kept_lose_no_more_plain_pictures_than_they_may(cle
     done = [TrainingRound(lessons=1, part=1.0, clean=clean, robust=robust, kept=False) for clean, robust in scores]
     noted = json.dumps([one.model_dump() for one in done])
     run: Any = SimpleNamespace(store=SimpleNamespace(note=lambda key: noted))
-    unused: Any = None
-    rounds = TrainingRounds(run, unused, unused, each=1, views=1, clean_loss=clean_loss, progress=NullProgress())
-    assert rounds.best == best
+    course: Any = SimpleNamespace(config=SimpleNamespace(clean_loss=clean_loss))
+    assert TrainingRounds(run, course, lambda *_: [], NullProgress()).best == best
 
 
 def test_the_given_model_is_asked_about_scenes_as_they_are_alone() -> None:
