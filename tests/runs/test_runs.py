@@ -231,6 +231,7 @@ def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> Non
         ]
         assert store.count() == 4
         assert list(store.missing("sweep", 8)) == [range(2, 4), range(5, 8)]
+        assert list(store.missing("sweep", 6)) == [range(2, 4), range(5, 6)]
         assert list(store.missing("sweep", 5)) == [range(2, 4)] and list(store.missing("none", 2)) == [range(2)]
 
 
