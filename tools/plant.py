@@ -238,7 +238,7 @@ FAULTS = (
         "advsearch/runs/export.py",
         "return [*OWN, *metrics, *seen, *AFTER]",
         "return [*OWN, *seen, *AFTER]",
-        ("tests/runs/test_export.py",),
+        ("tests/runs/test_runs.py",),
     ),
     Fault(
         "report: a page escapes nothing",
@@ -269,10 +269,10 @@ FAULTS = (
         ("tests/viewer/test_columns.py",),
     ),
     Fault(
-        "cluster: a worker may take for ever",
+        "cluster: a worker may take a hundred times as long",
         "advsearch/cluster/coordinator.py",
         "if now - worker.since > deadline:",
-        "if now - worker.since > 1e9:",
+        "if now - worker.since > 100.0 * deadline:",
         ("tests/cluster/test_coordinator.py",),
     ),
     Fault(
