@@ -136,6 +136,12 @@ def test_another_version_is_refused_with_both_versions() -> None:
     assert told == ["w0 is given nothing: it has advsearch 2, and 1 asks; install the same on both"]
 
 
+def test_a_worker_does_nothing_for_another_version() -> None:
+    found = prepare("key", Work("nowhere:work", {}), Files({}, {}), "0.0.0")
+    text = f"it has advsearch {version()}, and 0.0.0 asks; install the same on both"
+    assert found == Failure(text, unfit=True)
+
+
 def test_workers_none_of_which_can_do_it_end_the_run_with_the_reason() -> None:
     without = Failure("no libLLVM is found; apt install libllvm19", unfit=True)
     pool = Simulated(answers={"w0": without, "w1": without})
