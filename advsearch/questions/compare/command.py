@@ -1,0 +1,72 @@
+"""`advsearch compare`: two models, objects or answers beside each other, on the same pictures."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from advsearch.cli.output import aligned, as_notes
+from advsearch.cli.question import Positional, QuestionCommand
+
+if TYPE_CHECKING:
+    from advsearch.questions.compare.answer import ComparedPair, CompareResult
+
+HELP = "compare models, objects or answers on the same pictures, pair by pair"
+EXAMPLES = (
+    "compare mug-sweep-001",
+    "compare mug-sweep-001 mug-sweep-002 --json",
+    "compare reference hardened.pt2 --object mug --control pose,camera --samples 200",
+)
+
+
+class _Compare(QuestionCommand):
+    """The command, which is about stored sweeps unless it is said what models are shown."""
+
+    def file(self, args: argparse.Namespace) -> Path | None:
+        """Return the settings of the first sweep, if it is about stored ones."""
+        return None if {"object", "scene"} & vars(args).keys() else super().file(args)
+
+
+def answer(result: CompareResult) -> str:
+    """Return each side's accuracy, the pairs, where one is worse and the cost."""
+    from advsearch.questions.compare.words import SIDE_HEADS, side_rows
+    from advsearch.report import wording
+    from advsearch.runs.directory import REPORT
+
+    parts = [part for pair in result.pairs for part in _pair(pair)]
+    if result.sides:
+        parts.insert(1, aligned([list(SIDE_HEADS), *side_rows(result)]))
+    facts = [
+        ["renders", str(result.renders)],
+        ["time", wording.seconds_text(result.seconds["total"])],
+        ["page", f"{result.run}/{REPORT}"],
+    ]
+    parts.append(aligned(facts))
+    parts += ["Interrupted."] if result.goes_on else []
+    return "\n\n".join(parts) + as_notes(result.warnings)
+
+
+def _pair(pair: ComparedPair) -> list[str]:
+    from advsearch.questions.compare.words import (
+        paired_rows,
+        part_heads,
+        part_rows,
+        parts_of,
+        picture_text,
+        rules_texts,
+        verdict,
+    )
+
+    parts = [verdict(pair), aligned(paired_rows(pair)), *rules_texts(pair)]
+    parts += [aligned([part_heads(pair, name), *part_rows(rows)]) for name, rows in parts_of(pair).items()]
+    shown = [f"  {picture_text(one, pair)}" + "".join(f"\n    {name}" for name in one.pictures) for one in pair.shown]
+    return [*parts, "\n".join(["What only one gets right:", *shown])] if shown else parts
+
+
+COMMAND = _Compare(
+    "compare",
+    answer,
+    about="compared",
+    place=Positional("WHAT", "the run of a sweep, or models and what they are shown", several=True),
+)
