@@ -22,7 +22,7 @@ from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult, PairPicture
 from advsearch.questions.compare.pairs import compared, far_apart
 from advsearch.questions.compare.settings import CompareConfig
-from advsearch.questions.compare.sides import Side, differing, read_sides
+from advsearch.questions.compare.sides import Side, differing, read_sides, varying
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED
@@ -200,7 +200,7 @@ class _Pictures:
             most: pictures of each.
             pair: number of the two.
         """
-        numbers = far_apart(first, second, most)
+        numbers, columns = far_apart(first, second, most), varying(first.columns)
         together = first.folder == second.folder and bool((first.numbers == second.numbers).all())
         sides = [first] if together else [first, second]
         with suppress(KeyboardInterrupt), interruptible():
@@ -209,7 +209,7 @@ class _Pictures:
             names = [name for place in range(len(sides)) if self._file(name := _name(pair, number, place)).is_file()]
             yield PairPicture(
                 number=number,
-                values={one.name: _value(one, number) for one in first.columns},
+                values={one.name: _value(one, number) for one in columns},
                 right=(first if first.right[number] else second).name,
                 answers=(str(first.answers[number]), str(second.answers[number])),
                 pictures=names if len(names) == len(sides) else [],

@@ -49,16 +49,17 @@ def answer(result: CompareResult) -> str:
 
 def _pair(pair: ComparedPair) -> list[str]:
     from advsearch.questions.compare.words import (
+        alone_text,
+        headline,
         paired_rows,
         part_heads,
         part_rows,
         parts_of,
         picture_text,
         rules_texts,
-        verdict,
     )
 
-    parts = [verdict(pair), aligned(paired_rows(pair)), *rules_texts(pair)]
+    parts = [f"{headline(pair)} {alone_text(pair)}", aligned(paired_rows(pair)), *rules_texts(pair)]
     parts += [aligned([part_heads(pair, name), *part_rows(rows)]) for name, rows in parts_of(pair).items()]
     shown = [f"  {picture_text(one, pair)}" + "".join(f"\n    {name}" for name in one.pictures) for one in pair.shown]
     return [*parts, "\n".join(["What only one gets right:", *shown])] if shown else parts

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from advsearch.questions.compare.answer import ComparedPair, CompareResult, PairPicture
+from advsearch.questions.compare.answer import ComparedPair, CompareResult
 from advsearch.questions.compare.words import (
     SIDE_HEADS,
+    alone_text,
+    headline,
     paired_rows,
     part_heads,
     part_rows,
@@ -14,7 +16,6 @@ from advsearch.questions.compare.words import (
     rules_texts,
     side_rows,
     values_text,
-    verdict,
 )
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
@@ -23,7 +24,8 @@ from advsearch.viewer.study_page import again, facts_table, heading, study_table
 
 NOTE = (
     "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
-    "(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares Clopper-Pearson's."
+    "(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares "
+    "Clopper-Pearson's, each for its row by itself."
 )
 
 
@@ -47,7 +49,7 @@ def page(run: Path, result: CompareResult) -> str:
         facts_table(facts),
         again(result.command_line),
     )
-    said = " ".join(verdict(one) for one in result.pairs[:1]) or "Interrupted before anything was compared."
+    said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
     eyebrow = join_html("compare; ", subject_html(("", result.object), ("", result.model)))
     return document(
         f"{run.name}, compared",
@@ -59,42 +61,47 @@ def page(run: Path, result: CompareResult) -> str:
 
 def _pair(run: Path, pair: ComparedPair, *, several: bool) -> Html:
     head, *rows = paired_rows(pair)
-    rules = rules_texts(pair)
-    parts = [
-        join_html(element("h3", name), study_table(part_heads(pair, name), part_rows(parts)))
-        for name, parts in parts_of(pair).items()
-    ]
-    figures = [_figure(run, one, pair) for one in pair.shown]
+    rules, tables = rules_texts(pair), parts_of(pair)
     return join_html(
         element("h2", f"{pair.first} and {pair.second}, pair by pair"),
-        element("p", verdict(pair)) if several else None,
+        element("p", headline(pair)) if several else None,
+        element("p", alone_text(pair)),
         study_table(head, rows),
         join_html(element("h2", "Where one is worse"), *(element("p", text) for text in rules)) if rules else None,
-        join_html(element("h2", "By each parameter"), *parts) if parts else None,
-        join_html(element("h2", "What only one gets right"), *figures) if figures else None,
+        join_html(element("h2", "What only one gets right"), _figures(run, pair)) if pair.shown else None,
+        element("h2", "By each parameter") if tables else None,
+        *(
+            join_html(element("h3", name), study_table(part_heads(pair, ""), part_rows(parts)))
+            for name, parts in tables.items()
+        ),
     )
 
 
-def _figure(run: Path, one: PairPicture, pair: ComparedPair) -> Html:
-    """A pair: its pictures with what was said of each; of one picture, both answers below it."""
-    names = (pair.first, pair.second)
-    said = [
-        f"{name}: {text}{' (right)' if name == one.right else ''}"
-        for name, text in zip(names, one.answers, strict=True)
-    ]
-    captions = said if len(one.pictures) == len(said) else ["; ".join(said)]
-    files = [file for name in one.pictures if (file := _kept(run, name)) is not None]
-    if len(files) != len(captions):
-        return element("p", f"{'; '.join(said)}. {values_text(one)}.")
-    figures = [
-        element(
-            "figure",
-            element("img", src=data_url(file.read_bytes(), "image/jpeg"), alt=text),
-            element("figcaption", text),
-        )
-        for file, text in zip(files, captions, strict=True)
-    ]
-    return join_html(element("div", *figures, class_="pictures pair"), element("p", values_text(one), class_="soft"))
+def _figures(run: Path, pair: ComparedPair) -> Html:
+    """The pairs that are shown: a picture each where both sides were shown the same, or else two beside each other."""
+    figures, names = [], (pair.first, pair.second)
+    for one in pair.shown:
+        values = values_text(one)
+        said = [
+            f"{name}: {text}{' (right)' if name == one.right else ''}"
+            for name, text in zip(names, one.answers, strict=True)
+        ]
+        files = [file for name in one.pictures if (file := _kept(run, name)) is not None]
+        if len(files) == 2:
+            captions = zip(files, said, (values, ""), strict=True)
+            figures.append(element("div", *(_figure(*each) for each in captions), class_="pictures pair"))
+        elif files:
+            figures.append(_figure(files[0], "; ".join(said), values))
+        else:
+            figures.append(element("p", f"{'; '.join(said)}. {values}."))
+    together = all(len(one.pictures) == 1 for one in pair.shown)
+    return element("div", *figures, class_="pictures") if together else join_html(*figures)
+
+
+def _figure(file: Path, said: str, values: str) -> Html:
+    """A picture with what is said of it, and its values."""
+    image = element("img", src=data_url(file.read_bytes(), "image/jpeg"), alt=said)
+    return element("figure", image, element("figcaption", element("strong", said), f" {values}"))
 
 
 def _kept(run: Path, name: str) -> Path | None:

@@ -105,11 +105,12 @@ def differing(sides: Sequence[Side]) -> list[str]:
 def shared_columns(first: Side, second: Side) -> list[Column]:
     """Return the parameters in which both sides have the same values, and that vary."""
     others = {one.name: one for one in second.columns}
-    return [
-        one
-        for one in first.columns
-        if one.name in others and _same(one, others[one.name]) and len(np.unique(_values(one))) > 1
-    ]
+    return [one for one in varying(first.columns) if one.name in others and _same(one, others[one.name])]
+
+
+def varying(columns: Sequence[Column]) -> list[Column]:
+    """Return those of some columns that have more than one value."""
+    return [one for one in columns if len(np.unique(_values(one))) > 1]
 
 
 def observations(columns: Sequence[Column], right: Mask) -> Observations | None:

@@ -35,41 +35,48 @@ def side_rows(result: CompareResult) -> list[list[str]]:
             f"{one.correct} of {one.configurations}",
             percent(one.accuracy),
             wording.interval_text(one.interval),
-            wording.seconds_text(one.seconds),
+            cost_text(one.seconds),
         ]
         for one in result.sides
     ]
 
 
-def verdict(pair: ComparedPair) -> str:
-    """Return the first thing that a reader should know of two sides, in two sentences."""
+def cost_text(seconds: float) -> str:
+    """Return what an answer took: ``31 ms``; empty where that is not known."""
+    if seconds != seconds:
+        return ""
+    return f"{1000.0 * seconds:.2g} ms" if seconds < 0.1 else wording.seconds_text(seconds)
+
+
+def headline(pair: ComparedPair) -> str:
+    """Return the first thing that a reader should know of two sides, in a sentence."""
     n, (before, after) = pair.pairs, pair.right
-    both = (
-        f"{pair.first} is right in {before} of {n} ({percent(before / n)}), {pair.second} in {after} of {n} "
-        f"({percent(after / n)})"
-    )
-    if not pair.first_only and not pair.second_only:
-        return f"{both}: they are right about the same pictures."
-    sign = "more" if pair.difference > 0 else "fewer"
-    points = (
-        "as many" if not pair.difference else f"{percent_number(abs(pair.difference)).removesuffix('.0')} points {sign}"
-    )
-    shown = "" if pair.p <= LEVEL else "; that there is a difference is not shown"
     return (
-        f"{both}: {points} (95 % interval of pairs {points_text(pair.interval)} points, p = {p_text(pair.p)}){shown}. "
-        f"{pair.first} alone is right in {pair.first_only}, {pair.second} alone in {pair.second_only}."
+        f"{pair.first} is right in {percent(before / n)} and {pair.second} in {percent(after / n)} of the same "
+        f"{wording.count(n, 'picture')}: a difference of {100.0 * pair.difference:+.1f} points "
+        f"(95 % interval {points_text(pair.interval)})."
+    )
+
+
+def alone_text(pair: ComparedPair) -> str:
+    """Return what the pairs say that one side alone gets right, in a sentence."""
+    if not pair.first_only and not pair.second_only:
+        return "Both are right about the same pictures."
+    shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
+    return (
+        f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
+        f"(exact McNemar test, p {p_text(pair.p)}){shown}."
     )
 
 
 def points_text(interval: Interval) -> str:
-    """Return an interval of a difference in points: ``-25.2 to -8.1``."""
-    low, high = (f"{100.0 * end:+.1f}" for end in interval)
-    return f"{low} to {high}"
+    """Return an interval of a difference: ``-25.2 to -8.1``."""
+    return " to ".join(f"{100.0 * end:+.1f}" for end in interval)
 
 
 def p_text(p: float) -> str:
-    """Return a p-value with two digits."""
-    return f"{p:.2g}"
+    """Return a p-value: ``= 0.012``, or ``< 0.0001``."""
+    return f"= {p:.2g}" if p >= 0.0001 else "< 0.0001"
 
 
 def paired_rows(pair: ComparedPair) -> list[list[str]]:
@@ -84,8 +91,12 @@ def paired_rows(pair: ComparedPair) -> list[list[str]]:
 def rules_texts(pair: ComparedPair) -> list[str]:
     """Return where each side alone is right, in sentences; none where it was not looked for."""
     found = []
-    for rules, alone, other in ((pair.worse, pair.first, pair.second), (pair.better, pair.second, pair.first)):
-        if rules is None:
+    ways = (
+        (pair.worse, pair.first_only, pair.first, pair.second),
+        (pair.better, pair.second_only, pair.second, pair.first),
+    )
+    for rules, alone_right, alone, other in ways:
+        if rules is None or not alone_right:
             continue
         if not rules:
             found.append(f"Where {other} is worse than {alone}: no values are told from chance.")
@@ -116,7 +127,15 @@ def parts_of(pair: ComparedPair) -> dict[str, list[PairPart]]:
 
 def part_heads(pair: ComparedPair, name: str) -> list[str]:
     """Return the heads of the table of one parameter."""
-    return [name, "pairs", pair.first, pair.second, "difference, points", f"{pair.first} alone", f"{pair.second} alone"]
+    return [
+        name,
+        "pairs",
+        pair.first,
+        pair.second,
+        "difference, points (95 % interval)",
+        f"{pair.first} alone",
+        f"{pair.second} alone",
+    ]
 
 
 def part_rows(parts: Sequence[PairPart]) -> list[list[str]]:
@@ -151,11 +170,7 @@ def values_text(one: PairPicture) -> str:
 def claims(result: CompareResult) -> Iterator[Claim]:
     """Yield what the run stands for: what was counted of each pair of sides."""
     for pair in result.pairs:
-        alone = pair.first_only + pair.second_only
-        text = (
-            f"On the same {pair.pairs} pictures, {verdict(pair)} Of the pairs that one alone gets right, chance alone "
-            f"would split so many so unevenly with a probability of {p_text(pair.p)} (exact McNemar test)."
-        )
+        text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is Newcombe's, of pairs."
         side = next(one for one in result.sides if one.name == pair.second)
         extent = Extent(
             what=f"configurations in which {pair.second} is right",
@@ -163,4 +178,4 @@ def claims(result: CompareResult) -> Iterator[Claim]:
             total=side.configurations,
             interval=side.interval or (0.0, 1.0),
         )
-        yield Claim(kind="measured", statement=text if alone else verdict(pair), extent=extent)
+        yield Claim(kind="measured", statement=text, extent=extent)
