@@ -19,6 +19,9 @@ EXAMPLES = (
     "compare reference hardened.pt2 --object mug --control pose,camera --samples 200",
 )
 
+MOST_TABLES, MOST_PICTURES = 4, 3
+"""Parameters, and pictures of what one side alone gets right, that a terminal shows; the page has all."""
+
 
 class _Compare(QuestionCommand):
     """The command, which is about stored sweeps unless it is said what models are shown."""
@@ -57,12 +60,20 @@ def _pair(pair: ComparedPair) -> list[str]:
         parts_of,
         picture_text,
         rules_texts,
+        telling,
     )
 
     parts = [f"{headline(pair)} {alone_text(pair)}", aligned(paired_rows(pair)), *rules_texts(pair)]
-    parts += [aligned([part_heads(pair, name), *part_rows(rows)]) for name, rows in parts_of(pair).items()]
-    shown = [f"  {picture_text(one, pair)}" + "".join(f"\n    {name}" for name in one.pictures) for one in pair.shown]
-    return [*parts, "\n".join(["What only one gets right:", *shown])] if shown else parts
+    tables = parts_of(pair)
+    shown = telling(tables, MOST_TABLES)
+    parts += [aligned([part_heads(pair, name), *part_rows(rows)]) for name, rows in shown.items()]
+    if len(shown) < len(tables):
+        parts.append(f"The difference varies most over these; the page has all {len(tables)} parameters.")
+    for name in (pair.first, pair.second):
+        listed = [one for one in pair.shown if one.right == name][:MOST_PICTURES]
+        lines = [f"  {picture_text(one, pair)}" + "".join(f"\n    {file}" for file in one.pictures) for one in listed]
+        parts += ["\n".join([f"Only {name} gets right:", *lines])] if lines else []
+    return parts
 
 
 COMMAND = _Compare(

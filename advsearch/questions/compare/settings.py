@@ -39,7 +39,12 @@ class CompareConfig(SweepConfig):
         ge=0,
         le=1000,
     )
-    object: str = setting_as_in(SweepConfig, "object", default="")
+    object: str = setting_as_in(
+        SweepConfig,
+        "object",
+        default="",
+        description="the object that models are shown, where models are compared; several, separated by commas",
+    )
     keep_pictures: Literal["all", "wrong", "none"] = setting_as_in(SweepConfig, "keep_pictures", default="wrong")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/WHAT-compare-NNN")
 

@@ -99,7 +99,7 @@ def rules_texts(pair: ComparedPair) -> list[str]:
         if rules is None or not alone_right:
             continue
         if not rules:
-            found.append(f"Where {other} is worse than {alone}: no values are told from chance.")
+            found.append(f"Where {other} is worse than {alone}: no values stand out from chance.")
         found += [f"Where {other} is worse than {alone}: {_rule_text(one, n)}" for n, one in enumerate(rules)]
     return found
 
@@ -123,6 +123,17 @@ def parts_of(pair: ComparedPair) -> dict[str, list[PairPart]]:
         unit = f", {one.unit}" if one.unit not in ("", "1", "name") else ""
         found.setdefault(f"{one.parameter}{unit}", []).append(one)
     return found
+
+
+def telling(tables: dict[str, list[PairPart]], most: int) -> dict[str, list[PairPart]]:
+    """Return so many of the parameters, those whose differences are farthest apart, in the order in which they come."""
+
+    def spread(name: str) -> float:
+        differences = [one.difference for one in tables[name]]
+        return max(differences) - min(differences)
+
+    chosen = sorted(tables, key=spread, reverse=True)[:most]
+    return {name: parts for name, parts in tables.items() if name in chosen}
 
 
 def part_heads(pair: ComparedPair, name: str) -> list[str]:
@@ -164,7 +175,9 @@ def picture_text(one: PairPicture, pair: ComparedPair) -> str:
 
 def values_text(one: PairPicture) -> str:
     """Return the values of a pair on one line."""
-    return ", ".join(f"{name} {value_text(value)}" for name, value in one.values.items())
+    return ", ".join(
+        f"{name} {value if isinstance(value, str) else format(value, '.3g')}" for name, value in one.values.items()
+    )
 
 
 def claims(result: CompareResult) -> Iterator[Claim]:
