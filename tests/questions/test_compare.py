@@ -283,7 +283,7 @@ def test_models_are_shown_the_same_pictures_from_the_command_line(
         assert all((tmp_path / "run" / name).is_file() for name in one["pictures"]) and len(one["pictures"]) == 1
     assert main(["show", str(tmp_path / "run")]) == 0
     text = capsys.readouterr().out
-    assert "of the same 12 pictures" in text and "Only easy gets right:" in text
+    assert "of the same 12 pictures" in text and "Only hard gets right:" in text
 
 
 def test_stored_runs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
