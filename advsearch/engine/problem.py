@@ -74,7 +74,6 @@ class Problem:
         draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
-        printable: whether searches prefer colours that can be printed; see `print_terms`.
         metrics: numbers of every picture that rows have beside what the task says.
         aovs: layers of ground truth that are kept of the clean scene and the answer (`scene.surfaces.AOVS`).
         domain: where a search may look: the searched controls.
@@ -93,7 +92,6 @@ class Problem:
     steps: int = 0
     draws: int = 1
     search_depth: int | None = None
-    printable: bool = False
     aovs: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
     domain: Domain = field(init=False)
