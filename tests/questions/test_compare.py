@@ -20,10 +20,12 @@ from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.errors import FileFormatError, InputError
+from advsearch.questions.compare import carry_out
 from advsearch.questions.compare.answer import ComparedPair, CompareResult
 from advsearch.questions.compare.settings import CompareConfig
 from advsearch.report.evidence import claims_of
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.runs.summary import read_result
 from advsearch.viewer import thumbnails
@@ -284,6 +286,27 @@ def test_models_are_shown_the_same_pictures_from_the_command_line(
     assert main(["show", str(tmp_path / "run")]) == 0
     text = capsys.readouterr().out
     assert "of the same 12 pictures" in text and "Only hard gets right:" in text
+
+
+def test_a_comparison_that_was_stopped_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts: list[str] = []
+
+    def swept(path: Path, config: SweepConfig, progress: object) -> SweepSummary:
+        parts.append(config.model)
+        if len(parts) == 1:
+            return sweep(ending="interrupted")
+        stored(path, {"a": good, "b": low})
+        return sweep(ending="finished")
+
+    monkeypatch.setattr(carry_out, "carry_out_part", swept)
+    line = ["compare", "a", "b", "--object", "mug", "--control", "camera", "--pictures", "0"]
+    assert main([*line, "--run", str(tmp_path / "run")]) == 130
+    assert f"Go on with: advsearch resume {tmp_path / 'run'}" in capsys.readouterr().out
+    assert main(["resume", str(tmp_path / "run"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["ending"] == "done" and said["pairs"][0]["first_only"] > 0 and parts == ["a,b", "a,b"]
 
 
 def test_stored_runs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

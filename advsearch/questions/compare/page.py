@@ -88,8 +88,9 @@ def _figures(run: Path, pair: ComparedPair) -> Html:
         ]
         files = [file for name in one.pictures if (file := _kept(run, name)) is not None]
         if len(files) == 2:
-            captions = zip(files, said, (values, ""), strict=True)
+            captions = zip(files, said, ("", ""), strict=True)
             figures.append(element("div", *(_figure(*each) for each in captions), class_="pictures pair"))
+            figures.append(element("p", values, class_="soft"))
         elif files:
             figures.append(_figure(files[0], "; ".join(said), values))
         else:
