@@ -67,6 +67,7 @@ from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
+from advsearch.questions.compare.settings import CompareConfig
 from advsearch.recipes.description import read_recipe
 from advsearch.recipes.description import recipe_names as recipes
 from advsearch.recipes.parts import planned
@@ -383,6 +384,9 @@ def check_names(config: Config) -> None:
     """Look up every name in a configuration, as its command would; nothing is loaded."""
     if isinstance(config, StabilityConfig):
         chosen(config.cases, config.groups)
+        return
+    if isinstance(config, CompareConfig) and not config.object:
+        assert config.pictures >= 0
         return
     if isinstance(config, ExplainConfig):
         assert config.confirm >= 0

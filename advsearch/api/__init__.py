@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from advsearch import rooms
 from advsearch import threads as threads  # before torch: it sets how OpenMP waits
 
 if TYPE_CHECKING:
@@ -36,8 +37,9 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
 
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
-        module = import_module(f"advsearch.api.{config.command}")
-        answer = getattr(module, f"{config.command}_from_config")(
+        name = f"{config.command}_from_config"
+        own = rooms.in_room(config.command, "carry_out", name)
+        answer = (own or getattr(import_module(f"advsearch.api.{config.command}"), name))(
             config, progress=progress, **({} if folder is None else {"resumed": folder})
         )
     result: Result = answer if isinstance(answer, Result) else answer.summary

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from advsearch import rooms
 from advsearch.runs.directory import REPORT
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary
@@ -53,5 +54,5 @@ def write_page(run: Path, result: Result) -> Path:
         case RecipeResult():
             text = recipe_page(run, result)
         case _:
-            text = result_page(run, result)
+            text = (rooms.in_room(result.command, "page", "page") or result_page)(run, result)
     return write_text(run / REPORT, text, durable=False)

@@ -399,7 +399,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         (
             "object: mug\ncommand: atack\n",
             [],
-            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, explain, gap, harden, plan, ",
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, compare, explain, gap, harden, ",
         ),
         ("object: mug\n", ["steps"], "change 'steps': expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),
