@@ -37,6 +37,7 @@ from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.runs import directory, export, store
 from advsearch.runs.results import KEPT
+from advsearch.runs.results.base import Result
 from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.render import RenderResult
@@ -180,7 +181,8 @@ PLAIN = set(
 
 def results() -> Iterator[str]:
     """Fields of results say what they hold; columns and files of a run are in the page about runs."""
-    for kind in (*KEPT, CurveResult, MatrixResult, RenderResult):
+    kinds: list[type[Result]] = [*KEPT, CurveResult, MatrixResult, RenderResult]
+    for kind in kinds:
         silent = {name for name, field in kind.model_fields.items() if not script("make_figures")._field(field)}
         if not (kind.__doc__ and kind.command) or silent - PLAIN:
             yield f"{kind.__name__}: expected a docstring, a command and descriptions of {sorted(silent - PLAIN)}"
