@@ -45,8 +45,8 @@ from advsearch.config import (
     SweepConfig,
 )
 from advsearch.config.hardening import ALL
+from advsearch.engine import run_settings
 from advsearch.engine.loading import as_controls
-from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.files import MESHES
@@ -144,10 +144,8 @@ def check_names(config: Config) -> None:
         assert config.recipe in ("list", "mine.yaml") or planned(read_recipe(config.recipe), config)
         return
     assert isinstance(config, SceneConfig)
-    over = getattr(config, "over", {})
-    shared = RunSettings(getattr(config, "epsilon", None), getattr(config, "norm", None), config.texture_resolution)
-    shared.check(config.controls, over)
-    shared.given_to(config.controls)
+    run_settings.check(config)
+    run_settings.given_to(config, config.controls)
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:

@@ -99,7 +99,7 @@ def region_from_config(
     varied = _varied(problem, config)
     centre = _centre(problem, config)
     with RunDirectory.of(config, resumed) as run:
-        verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config.pixel_sampler, config.verify_spp), stages)
+        verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config), stages)
         try:
             with interruptible():
                 answer, ending = _answer(verifier, config, varied, centre, run), "done"

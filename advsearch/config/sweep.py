@@ -89,7 +89,7 @@ class SweepConfig(SceneConfig):
         le=1_000_000_000,
     )
     sampler: Literal["sobol", "random"] = setting(
-        "sobol", "sweep", "how the draws are made: evenly spread, or independent"
+        "sobol", "sweep", "how the draws are made, evenly spread or independent"
     )
     batch: int = setting(
         16,

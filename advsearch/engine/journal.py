@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Evaluate, Evaluation
-from advsearch.attacks.evaluation import Query, usable
+from advsearch.attacks.evaluation import Query
 from advsearch.engine.going_on import same
 from advsearch.engine.machines import Machines
 from advsearch.engine.problem import Problem
@@ -54,6 +54,7 @@ class Journal:
     _trials: dict[tuple[str, int], Evaluation] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.problem: Problem = self.traced.problem
         self.machines = Machines(self.run)
         if self._counts is not None:  # that of another problem of the same run
             return
@@ -63,10 +64,6 @@ class Journal:
             if not is_search(kind):
                 rows = (row for row in self.run.store.rows(kind) if row.correct is not None)  # old ones don't say it
                 self._trials |= {(kind, row.step): Evaluation.of(judgement_of(row)) for row in rows}
-
-    @property
-    def problem(self) -> Problem:
-        return self.traced.problem
 
     # ---- queries ----------------------------------------------------------------------------------------------------
 
@@ -92,7 +89,7 @@ class Journal:
         for query, known in zip(queries, stored, strict=True):
             begun = time.perf_counter()
             if known is None:
-                known = usable(next(asked))
+                known = next(asked)
                 self._write(query, known, time.perf_counter() - begun)
             elif query.phase is not None:
                 passed(query)
@@ -131,7 +128,8 @@ class Journal:
         """Keep an answer as a row, and what a search was told beside it."""
         problem, told = self.problem, None
         self.lost += answer.lost
-        self.machines.meet(answer.machine, self.traced.facts)
+        if answer.machine is not None:
+            self.machines.meet(answer.machine, self.traced.facts)
         if query.phase is None:
             self._trials[query.kind, query.number] = replace(answer, picture=None)
             values = problem.describe(query.u, query.seed) if query.described else {}
@@ -146,8 +144,8 @@ class Journal:
                 step=query.number,
                 seed=query.seed,
                 spp=problem.spp * query.samples,
-                objective=answer.objective if answer.finite else math.nan,
-                success=answer.success,
+                objective=answer.objective if (finite := answer.finite) else math.nan,
+                success=answer.success and finite,
                 values=problem.describe(query.u),
                 seconds=seconds,
                 renders=answer.cost * problem.draws,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -73,7 +74,6 @@ class Problem:
         draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
-        printable: whether searches prefer colours that can be printed; see `print_terms`.
         metrics: numbers of every picture that rows have beside what the task says.
         aovs: layers of ground truth that are kept of the clean scene and the answer (`scene.surfaces.AOVS`).
         domain: where a search may look: the searched controls.
@@ -92,7 +92,6 @@ class Problem:
     steps: int = 0
     draws: int = 1
     search_depth: int | None = None
-    printable: bool = False
     aovs: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
     domain: Domain = field(init=False)
@@ -296,7 +295,8 @@ class Problem:
             return value
 
         spp, derivative = self.spp * samples, None
-        with renderer.scene.shorter(self.search_depth):
+        depth = self.search_depth
+        with nullcontext() if depth is None else renderer.scene.shorter(depth):
             if gradient:
                 value, derivative = renderer.gradient(loss, whole, seed, spp, free=gradient == "free")
                 derivative = derivative + slope if asked.used else derivative

@@ -59,7 +59,7 @@ class Attack:
     def __post_init__(self) -> None:
         self.problem = self.journal.problem
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
-        ladder = ladder_of(self.config.pixel_sampler, self.config.verify_spp)
+        ladder = ladder_of(self.config)
         self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, self.config.trial_count)
         kept = (self.stages, self.findings, self.clean)
         self._searches = Searches(self.journal, self.config, self.policy, *kept)

@@ -13,6 +13,7 @@ from advsearch.attacks import Evaluation, SearchResult, Verification, choose_spp
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.product import batches
 from advsearch.attacks.sample_count import LADDER, most_samples
+from advsearch.config import AttackConfig, RegionConfig, SweepConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages
@@ -24,10 +25,10 @@ MANY = 64
 """Of a configuration with more numbers than this, a trial's row does not hold the values."""
 
 
-def ladder_of(sampler: str, asked: int | None) -> Sequence[int]:
-    """Return the samples a pixel that a verification climbs, as a sampler has them; the only count, if one was asked
+def ladder_of(config: AttackConfig | RegionConfig | SweepConfig) -> Sequence[int]:
+    """Return the samples a pixel that a verification climbs, as the sampler has them; the only count, if one was asked
     for."""
-    return LADDER if asked is None else (next_count(sampler, asked),)
+    return LADDER if config.verify_spp is None else (next_count(config.pixel_sampler, config.verify_spp),)
 
 
 @dataclass
@@ -50,10 +51,8 @@ class Verifier:
     _clean_spp: int = 0
     _asked: set[tuple[str, int]] = field(default_factory=set)
 
-    @property
-    def problem(self) -> Problem:
-        """What is tried."""
-        return self.journal.problem
+    def __post_init__(self) -> None:
+        self.problem: Problem = self.journal.problem
 
     def answers(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Answer trials, keep their pictures, and count each once."""

@@ -17,8 +17,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from covering import only
 from conftest import ROOT
+from covering import only
 
 from advsearch.cluster.dask_pool import scheduler_gone
 from advsearch.cluster.executor import Executor, Work

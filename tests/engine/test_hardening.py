@@ -123,8 +123,8 @@ def test_lessons_of_textures_let_go_of_their_scene() -> None:
     assert scene() is None and isinstance(lesson, TextureLesson)
     harder([lesson], model, 2)
     assert lesson.worst.shape == (16, 16, 3) and not torch.equal(lesson.worst, lesson.plain)
-    for looks, steps in ((1, 2), (3, 2), (6, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and so many of this
-        assert Course(student(), model, 0.1, 2, 0, looks).steps([lesson, *plain * 20]) == steps
+    for views, steps in ((6, 2), (2, 2), (1, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and 6 / views of this
+        assert Course(student(), model, HardenConfig(epochs=2, views=views)).steps([lesson, *plain * 20]) == steps
 
 
 def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
@@ -256,7 +256,7 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     made, lessons = student(), pupils()
     before = score(made.model, lessons)
     ticks: list[int] = []
-    course = Course(made, student().model, 0.04, 12, seed=3)
+    course = Course(made, student().model, HardenConfig(rate=0.04, epochs=12))
     course.round(1, lessons, lambda: ticks.append(1))
     after = score(made.model, lessons)
     assert len(ticks) == course.steps(lessons) == 12
@@ -287,7 +287,7 @@ def test_a_round_comes_to_the_same_whatever_the_number_of_threads() -> None:
         made = student()
         torch.set_num_threads(count)
         try:
-            Course(made, student().model, 0.04, 2, seed=3).round(1, pupils())
+            Course(made, student().model, HardenConfig(rate=0.04, epochs=2)).round(1, pupils())
             assert torch.get_num_threads() == count
         finally:
             torch.set_num_threads(before)
@@ -342,7 +342,7 @@ def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
         return torch.optim.SGD(parameters, 0.5)  # type: ignore[arg-type]
 
     further = [(torch.stack([coloured(2, 0.4, n) for n in range(8)]), torch.full((8,), 9))]
-    Course(made, student().model, 1.0, 10, 3, 1, optimiser, further).round(1, pupils())
+    Course(made, student().model, HardenConfig(epochs=10), optimiser, further).round(1, pupils())
     assert asked == [1]
     assert (made.model(further[0][0]).argmax(dim=1) == 9).float().mean() > 0.5  # only the batches beside say 9
 

@@ -1,0 +1,88 @@
+"""One way to answer: queries by workers, the journal, and the page that names the functions on the way."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import ROOT
+from stand_ins import StandInProblem, StandInWorkers
+
+from advsearch.attacks import Query
+from advsearch.cluster.executor import InProcess
+from advsearch.engine.journal import Journal
+from advsearch.engine.sharing import Shared, answering, lost
+from advsearch.errors import ClusterError
+from advsearch.runs.directory import RunDirectory
+
+
+def queries(count: int, **more: Any) -> list[Query]:
+    return [Query(torch.full((6,), 0.1 * number), number, "average", number, **more) for number in range(count)]
+
+
+def test_answers_come_in_the_order_of_the_queries_whoever_gives_them() -> None:
+    here, there = StandInProblem(), StandInProblem()
+    here.prepared, here.renderer = None, RendererCount()  # type: ignore[attr-defined]
+    problem: Any = here
+    workers: Any = StandInWorkers(InProcess(answering(lambda name: there)))  # type: ignore[arg-type,return-value]
+    alone, shared = (list(Shared(problem, executor)(queries(5))) for executor in (None, workers))
+    assert [one.said for one in alone] == [one.said for one in shared] and len(workers.given) == 5
+    assert [one.machine for one in shared] == [*["ab12"] * 4, None], "the last was answered first"
+    assert len(list(Shared(problem, workers)(queries(1)))) == 1 and len(workers.given) == 5, "one alone is done here"
+
+
+class RendererCount:
+    """Counts what was not finite."""
+
+    non_finite = 0
+
+
+def test_what_nobody_could_answer_says_so_or_ends_the_run() -> None:
+    (query,) = queries(1)
+    answer = lost(query, "they died")
+    assert answer.lost and not answer.success and answer.said.payload == {"lost": "they died"}
+    for wanted in ("picture", "light"):
+        with pytest.raises(ClusterError, match="they died; `advsearch resume RUN workers=null`"):
+            lost(Query(query.u, 0, wanted=wanted), "they died")
+
+
+def test_what_is_in_the_journal_is_not_asked_again(tmp_path: Path) -> None:
+    problem: Any = StandInProblem()
+    asked = list[int]()
+
+    def evaluate(some: Sequence[Query]) -> Iterator[Any]:
+        for one in some:
+            asked.append(one.number)
+            yield problem.evaluate(one)
+
+    with RunDirectory.create(tmp_path / "run") as run:
+        first = list(Journal(run, Shared(problem)).answers(queries(3), evaluate))
+        journal = Journal(run, Shared(problem))
+        again = list(journal.answers(queries(5), evaluate))
+        assert asked == [0, 1, 2, 3, 4] and [one.said for one in again[:3]] == [one.said for one in first]
+        stopped = journal.answers(queries(8), evaluate)
+        for _ in range(6):
+            next(stopped)
+        assert run.store.count("average") == 6, "a row is kept before its answer is seen, and no more is asked for"
+
+
+def test_the_page_names_the_functions_on_the_way() -> None:
+    page = (ROOT / "docs" / "one-question.md").read_text("utf-8")
+    rows = re.findall(r"^\| `([a-z_/.]+)` \| (.*?) \|", page, re.MULTILINE)
+    assert len(rows) > 10
+    for place, functions in rows:
+        folder = ROOT / "advsearch" / place
+        files = sorted(folder.rglob("*.py")) if folder.is_dir() else [folder]
+        defined = {
+            one.name
+            for file in files
+            for one in ast.walk(ast.parse(file.read_text("utf-8")))
+            if isinstance(one, (ast.FunctionDef, ast.ClassDef))
+        }
+        for name in re.findall(r"`([\w.]+)`", functions):
+            assert set(name.split(".")) <= defined, f"{place} has no {name}"
