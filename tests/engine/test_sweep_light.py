@@ -16,7 +16,7 @@ from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.transport import Deviation
 from advsearch.runs.results.attack import LinearTransport, PredictionError
 
-SMALL: dict[str, Any] = {"resolution": 32, "trials": 0}
+SMALL: dict[str, Any] = {"resolution": 48, "trials": 0}
 GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}
 
 
