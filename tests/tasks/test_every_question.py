@@ -200,6 +200,7 @@ def test_the_smallest_change(asked: list[str], capsys: pytest.CaptureFixture[str
     assert found["ending"] == "found" and 0.0 < found["smallest"]["epsilon"]["texture"] < 0.3
 
 
+@ALSO_SLOWLY
 def test_an_answer_that_holds_for_many_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
