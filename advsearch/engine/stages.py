@@ -155,7 +155,7 @@ class Attack:
 
     def worth_attacking(self) -> bool:
         """Look at the clean configuration; one that is wrong in every look goes through the full trials at once, as
-        does one whose smallest change is config."""
+        does one whose smallest change is wanted."""
         problem, config, findings = self.problem, self.config, self.findings
         seed, start = seeds.stream(problem.seed, "first look"), problem.domain.start
         self.stages.begin(

@@ -162,8 +162,6 @@ class Verifier:
     def average(self, count: int) -> None:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
         problem, found = self.problem, list[Judgement]()
-        if self.findings.sample_count is None:
-            self.choose_spp({"clean": problem.domain.start})
         self.begin("trying random configurations", count, name="average", flags="`average`")
         for numbers in batches(0, count, most_at_once(problem.domain.dim)):
             generators = [torch.Generator().manual_seed(seeds.stream(problem.seed, "draw", one)) for one in numbers]

@@ -9,6 +9,7 @@ import tarfile
 import weakref
 from importlib import resources
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -33,6 +34,7 @@ from advsearch.engine.hardening.lessons import (
     tried,
 )
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
+from advsearch.engine.hardening.rounds import TrainingRounds
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, check_unmeasured, fingerprint
 from advsearch.engine.hardening.training import Course, Score, score
 from advsearch.engine.hardening.variation import white_light_changed
@@ -40,6 +42,8 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.trainable import Trainable, trainable
+from advsearch.progress import NullProgress
+from advsearch.runs.results.harden import TrainingRound
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
 
@@ -263,6 +267,23 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
     assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
+
+
+def test_to_judge_a_model_leaves_the_lessons_as_they_are() -> None:
+    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3)]))
+    lesson = RenderedLesson.of((1,), pictures[0], pictures)
+    score(student().model, [lesson])
+    assert bool(lesson.losses.isinf().all())
+
+
+@pytest.mark.parametrize(("clean_loss", "best"), [(0.0, 0), (0.02, 2), (0.1, 1)])
+def test_the_weights_that_are_kept_lose_no_more_plain_pictures_than_they_may(clean_loss: float, best: int) -> None:
+    scores = ((0.9, 0.1), (0.82, 0.9), (0.89, 0.5))
+    done = [TrainingRound(lessons=1, part=1.0, clean=clean, robust=robust, kept=False) for clean, robust in scores]
+    noted = json.dumps([one.model_dump() for one in done])
+    run: Any = SimpleNamespace(store=SimpleNamespace(note=lambda key: noted))
+    course: Any = SimpleNamespace(config=SimpleNamespace(clean_loss=clean_loss))
+    assert TrainingRounds(run, course, lambda *_: [], NullProgress()).best == best
 
 
 def test_the_given_model_is_asked_about_scenes_as_they_are_alone() -> None:

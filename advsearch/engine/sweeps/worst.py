@@ -74,11 +74,12 @@ def check_worst(
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
         nonlocal number
+        first, number = number, number + len(seeds)
+        asked = enumerate(seeds, first)
+        queries = [Query(u, seed, PROBES, place, spp=spp, drawn=False, sought=False) for place, seed in asked]
         found = []
-        for seed in seeds:
-            (answer,) = journal.answers([Query(u, seed, PROBES, number, spp=spp, drawn=False, sought=False)])
+        for answer in journal.answers(queries):
             found.append(answer.said.score)
-            number += 1
             stages.progress.advance(spp)
         return found
 
