@@ -37,7 +37,7 @@ test: $(STAMP) ## run the tests; ARGS="-k name" picks some
 test-quick: $(STAMP) ## run the quick tests of every room
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not medium" $(ARGS)
 
-test-slow: $(STAMP) ## run the tests that take minutes
+test-slow: $(STAMP) ## run the tests that take minutes; ARGS="--one-in 10" runs a tenth, others every day
 	@$(BIN)/python -m pytest -m slow $(ARGS)
 
 test-zoo: $(STAMP) ## run the tests of torchvision's, timm's and transformers' networks with these, in build/zoo
@@ -48,9 +48,10 @@ fuzz: $(STAMP) ## load 400 hostile files, each in bounds of time and memory; ARG
 
 check: lint typecheck test ## everything that has to pass before a commit
 
-lint: $(STAMP) ## look for mistakes and for code that is not formatted
+lint: $(STAMP) ## look for mistakes, for code that is not formatted and for pages that are not true of the code
 	@$(BIN)/ruff check $(SOURCES)
 	@$(BIN)/ruff format --check --quiet $(SOURCES) || { echo "not formatted: run make format"; exit 1; }
+	@$(BIN)/python tools/check_docs.py
 
 format: $(STAMP) ## format the code and mend what can be mended
 	@$(BIN)/ruff format $(SOURCES)

@@ -2,14 +2,18 @@
 
 `pytest --measure` counts the CPU seconds of each test, which other work on the machine does not change, and keeps the
 names of those that are not quick in tests/medium.txt.
+
+`pytest -m slow --one-in 10` runs a tenth of the slow tests, another one every day.
 """
 
 from __future__ import annotations
 
 import gc
 import resource
+import zlib
 from collections import defaultdict
 from collections.abc import Generator
+from datetime import date
 from pathlib import Path
 
 import pytest
@@ -85,6 +89,8 @@ class Measured:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--measure", action="store_true", help="count CPU seconds and renew tests/medium.txt")
+    parser.addoption("--one-in", type=int, default=1, help="of the slow tests run one in so many, others every day")
+    parser.addoption("--day", type=date.fromisoformat, default=date.today(), help="which day's; as 2030-12-31")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -92,13 +98,21 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(Measured())
 
 
+def of_the_day(name: str, day: int, parts: int) -> bool:
+    """Whether a slow test is one of those of a day: in as many days as there are parts, each is once."""
+    return (zlib.crc32(name.encode()) + day) % parts == 0
+
+
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that are not quick."""
-    known = medium()
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests that are not quick, and leave out slow ones that are not of the day."""
+    known, parts, day = medium(), config.getoption("--one-in"), config.getoption("--day").toordinal()
     for item in items:
         if item.nodeid in known:
             item.add_marker("medium")
+    kept = [one for one in items if not one.get_closest_marker("slow") or of_the_day(one.nodeid, day, parts)]
+    config.hook.pytest_deselected(items=[*set(items).difference(kept)])
+    items[:] = kept
 
 
 def pytest_collection_finish() -> None:

@@ -1,34 +1,29 @@
-"""`make test-quick` covers every room, and the list of what it leaves out names tests that there are."""
+"""Which tests are left out of `make test-quick`, and which slow ones are of the day."""
 
 from __future__ import annotations
 
-import ast
+from itertools import product
 
 import pytest
-from conftest import MEDIUM, ROOT, is_there, medium
-
-WHOLE_RUNS = {"tests/test_real_data.py"}
-"""Nothing in them is quick."""
-FILES = [path.relative_to(ROOT).as_posix() for path in sorted(MEDIUM.parent.rglob("test_*.py"))]
-
-
-def functions_of(file: str) -> dict[str, bool]:
-    """Return the tests of a file by name, and whether each is slow whatever its parameters are."""
-    tree = ast.parse((ROOT / file).read_text("utf-8"))
-    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
-    return {one.name: "pytest.mark.slow" in map(ast.unparse, one.decorator_list) for one in functions}
-
-
-@pytest.mark.parametrize("file", [file for file in FILES if file not in WHOLE_RUNS])
-def test_every_file_has_quick_tests(file: str) -> None:
-    """Of a test with parameters some are: `--measure` never takes the quickest of a file."""
-    assert [name for name, slow in functions_of(file).items() if not slow and f"{file}::{name}" not in medium()]
-
-
-def test_what_is_left_out_is_there() -> None:
-    assert not [name for name in medium() if not is_there(name)], "pytest --measure tests/test_quick.py takes it out"
+from conftest import medium, of_the_day
+from covering import covering
 
 
 def test_what_is_left_out_is_marked(request: pytest.FixtureRequest) -> None:
     for item in request.session.items:
         assert (item.get_closest_marker("medium") is not None) == (item.nodeid in medium())
+
+
+def test_in_as_many_days_as_there_are_parts_each_slow_test_runs_once() -> None:
+    names = [f"a_test[{number}]" for number in range(200)]
+    days = [{name for name in names if of_the_day(name, day, 10)} for day in range(739000, 739010)]
+    assert sum(map(len, days)) == 200 and set().union(*days) == set(names)
+    assert all(5 < len(day) < 40 for day in days)
+
+
+def test_few_cases_have_each_value() -> None:
+    cases = covering([23, 4, 2, 2])
+    assert len(cases) == 23
+    assert [len({case[axis] for case in cases}) for axis in range(4)] == [23, 4, 2, 2]
+    assert {case[1:3] for case in cases} == set(product(range(4), range(2)))
+    assert covering([3]) == {(0,), (1,), (2,)}

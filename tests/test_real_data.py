@@ -184,9 +184,8 @@ def test_a_real_detector_gives_another_name_where_the_object_is(real_data: Path,
         assert row.kind == "control" or row.label in names
 
 
-@pytest.mark.parametrize(
-    "case", [case if case == "small mug" else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_a_real_object_is_fooled_and_verified(case: str, real_data: Path, tmp_path: Path) -> None:
     summary = attack(real_data, tmp_path / case, case)
     assert summary["ending"] == "found"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from check_docs import DOCS, blocks
 from small_models import SIDE, Finder
-from test_docs import DOCS, blocks
 
 from advsearch.cli.main import main
 

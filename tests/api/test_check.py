@@ -82,6 +82,7 @@ def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
     assert finished(folder) and kept(folder).to_dict() == answer.to_dict()
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path, whole: CheckResult) -> None:
     folder = tmp_path / "run"
     words = [sys.executable, "-m", "advsearch", *FLAGS.split(), "--threads", "1", "--run", str(folder)]

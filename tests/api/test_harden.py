@@ -139,6 +139,7 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
     shutil.rmtree(run.path)
 
 
+@pytest.mark.slow
 def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
     wanted: list[harden_scenes.Wanted] = [

@@ -33,7 +33,7 @@ from advsearch.tasks.together import Together
 BOTH = "small_models:easy,small_models:hard"
 SHORT: dict[str, Any] = {
     "object": "mug", "controls": {"texture": {"epsilon": 0.3}}, "steps": 6, "trials": 6,
-    "verify_spp": 4, "spp": 2, "denoise": "none", "baseline": False, "measure": "no", "specialise": False,
+    "verify_spp": 4, "spp": 2, "denoise": "none", "baseline": False, "measure": "no",
 }  # fmt: skip
 
 

@@ -149,6 +149,7 @@ def test_seconds_end_a_plan_and_may_be_changed_before_it_goes_on(
     assert "seed was 0 and is 1 now" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     words = "plan --object mug --control camera.azimuth --denoise none --resolution 16 --spp 1 --threads 1 --run"

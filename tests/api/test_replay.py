@@ -28,7 +28,7 @@ from advsearch.scene.formation import ImageFormation
 EASY = "small_models:easy"
 SHORT: dict[str, Any] = {
     "object": "mug", "model": EASY, "controls": {"texture": {"epsilon": 0.3}}, "steps": 6, "trials": 6,
-    "verify_spp": 4, "spp": 2, "denoise": "none", "baseline": False, "measure": "no", "specialise": False,
+    "verify_spp": 4, "spp": 2, "denoise": "none", "baseline": False, "measure": "no",
     "resolution": 32,
 }  # fmt: skip
 

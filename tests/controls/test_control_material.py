@@ -157,7 +157,15 @@ def test_extremes_render_finite_with_finite_gradients(name: str) -> None:
     assert float((pictures[0] - pictures[1]).abs().max()) > 0.02
 
 
-@pytest.mark.parametrize(("name", "value"), [("roughness", 0.3), ("metallic", 0.4), ("specular", 0.5), ("green", 0.6)])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("roughness", 0.3),
+        pytest.param("metallic", 0.4, marks=pytest.mark.slow),
+        pytest.param("specular", 0.5, marks=pytest.mark.slow),
+        ("green", 0.6),
+    ],
+)
 def test_the_adjoint_agrees_with_differences(name: str, value: float) -> None:
     material = searched(name)
     render = advsearch.load_scene("mug").renderer([material], resolution=32, denoise="none")

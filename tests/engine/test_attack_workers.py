@@ -20,7 +20,7 @@ from advsearch.runs.store import Row, Store
 
 SMALL: dict[str, Any] = {
     "object": "mug", "controls": {"pose": {}}, "policy": "cmaes", "steps": 9, "trials": 6, "average": 3,
-    "resolution": 24, "spp": 1, "verify_spp": 1, "denoise": "none", "measure": "no", "specialise": False,
+    "resolution": 24, "spp": 1, "verify_spp": 1, "denoise": "none", "measure": "no",
 }  # fmt: skip
 
 

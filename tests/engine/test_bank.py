@@ -14,6 +14,7 @@ from advsearch.api.attack import attack_once
 from advsearch.attacks.domain import Block, Domain
 from advsearch.config import AttackConfig
 from advsearch.engine import bank, transport
+from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.bank import Bank, stratified
 from advsearch.errors import ClusterError
 
@@ -45,45 +46,56 @@ def test_conditions_are_stratified_and_numbered() -> None:
     assert ball.contains(stratified(ball, 5, seed=0)) and stratified(ball, 5, seed=0).ne(0.5).any()
 
 
-@pytest.fixture
-def growing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It compares every six evaluations, and goes on growing after each comparison."""
-    monkeypatch.setattr(bank, "EVERY", 6)
-    monkeypatch.setattr(bank, "UNSEEN", 2)
-    monkeypatch.setattr(bank, "SURE", -1e9)
-    monkeypatch.setattr(bank, "FIRST", 3)
-    monkeypatch.setattr(bank, "GROWTH", 4)
+def grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let it compare every six evaluations, and go on growing after each comparison."""
+    for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
+        monkeypatch.setattr(bank, name, value)
     monkeypatch.setattr(transport, "CHANGE_SPP", 4)
 
 
-@pytest.mark.usefixtures("growing")
-def test_a_search_says_what_its_bank_was() -> None:
+@pytest.fixture
+def growing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bank that grows."""
+    grow(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AttackResult]:
+    """A run that nobody disturbed, and its result."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    with pytest.MonkeyPatch.context() as patched:
+        grow(patched)
+        return run, advsearch.attack("mug", run=run, **SMALL)
+
+
+def test_a_search_says_what_its_bank_was(whole: tuple[Path, AttackResult]) -> None:
     """Six conditions, and another one every second evaluation of the first half: three until the comparison at 6, and
     one after it. That at 12 comes when it grows no more."""
-    found = advsearch.attack("mug", **{**SMALL, "baseline": True})
+    _, found = whole
     told, renders = found.summary.transport, found.summary.renders
     assert told is not None and told.used and told.conditions is not None and told.error is not None
     assert (told.conditions.made, told.conditions.dropped, told.conditions.grown) == (10, 0, 2)
     assert told.entries and told.bytes and told.seconds and told.conditions.gap is not None
-    assert renders["products"] == 2 * 18 * 2 and renders["gradient"] == 0
+    assert renders["products"] == 18 * 2 and renders["gradient"] == 0
 
 
 @pytest.mark.usefixtures("growing")
-def test_a_search_that_goes_on_ends_with_the_same_rows(tmp_path: Path) -> None:
-    advsearch.attack("mug", run=tmp_path / "whole", **SMALL)
+def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, AttackResult], tmp_path: Path) -> None:
     stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(14), **SMALL)
     assert stopped.summary.ending == "interrupted"
     advsearch.attack("mug", run=tmp_path / "parts", resume=True, **SMALL)
-    assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
+    assert rows(tmp_path / "parts") == rows(whole[0])
 
 
 @pytest.mark.usefixtures("growing")
-def test_workers_make_the_matrices_and_the_rows_stay(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_workers_make_the_matrices_and_the_rows_stay(
+    whole: tuple[Path, AttackResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Nine before the first comparison, and the trials; one that is lost ends the run."""
-    alone = advsearch.attack("mug", run=tmp_path / "alone", **SMALL)
+    run, alone = whole
     ready = shared(monkeypatch, {"object": "mug", **SMALL})
     result = attack_once(AttackConfig(**SMALL, object="mug", workers=2, run=str(tmp_path / "shared")))
-    assert rows(tmp_path / "shared") == rows(tmp_path / "alone") and torch.equal(result.adversarial, alone.adversarial)
+    assert rows(tmp_path / "shared") == rows(run) and torch.equal(result.adversarial, alone.adversarial)
     assert len(ready.given) >= 9 + 2 * 6
     shared(monkeypatch, {"object": "mug", **SMALL}, lost=(2,))
     with pytest.raises(ClusterError, match=r"light of a condition: it died; .advsearch resume"):

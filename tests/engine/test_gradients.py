@@ -221,9 +221,9 @@ def test_turning_an_environment_has_the_right_sign_and_size() -> None:
     render = renderer(["environment.rotation"])
     loss, u = smooth_loss((SIZE, SIZE)), inside(render)
     names = [render.plan.groups[0].name]
-    adjoint = torch.stack([estimated(render, loss, u, "adjoint", names, seed, 256) for seed in range(6)]).mean()
+    adjoint = torch.stack([estimated(render, loss, u, "adjoint", names, seed, 128) for seed in range(6)]).mean()
     (probe,) = probes(render, loss, u, 0, 16)
-    truth = reference(render, loss, u, probe, seed=0, spp=128)
+    truth = reference(render, loss, u, probe, seed=0, spp=64)
     assert float(adjoint) * truth.value > 0.0
     assert float(adjoint) == pytest.approx(truth.value, rel=0.1)
 

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT
+from covering import once_each
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
@@ -715,8 +716,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[li
     yield rows_of(path), timeless(summary)
 
 
-@pytest.mark.parametrize("kind", [KeyboardInterrupt, MemoryError])
-@pytest.mark.parametrize("stops_at", [1, 4, 5, 30, 54, 55, 107, 108, 109, 116, 119, 121])
+@once_each("stops_at, kind", [1, 4, 5, 30, 54, 55, 107, 108, 109, 116, 119, 121], [KeyboardInterrupt, MemoryError])
 def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     tmp_path: Path, uninterrupted: Any, stops_at: int, kind: type[BaseException]
 ) -> None:

@@ -626,6 +626,7 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
     assert {one.quantity for one in report.points} == {"image", "gradient"}
 
 
+@pytest.mark.slow
 def test_workers_make_the_references_and_what_is_timed_stays_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from covering import once_each
 from samples import GAP, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
@@ -121,10 +122,10 @@ def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.
     assert main(["runs"]) == 0
 
 
-@pytest.mark.parametrize(
-    "value", [None, 3, "text", [], [1], {}, {"a": [1]}, True, float("inf"), {"a\u001b[2J": "\u001b"}]
-)
-@pytest.mark.parametrize("summary", [SUMMARY, SWEEP, GAP, REGION], ids=lambda one: one["command"])
+OTHERS = [None, 3, "text", [], [1], {}, {"a": [1]}, True, float("inf"), {"a\u001b[2J": "\u001b"}]
+
+
+@once_each("summary, value", [SUMMARY, SWEEP, GAP, REGION], OTHERS)
 def test_summaries_of_other_types_are_named(
     summary: dict[str, Any], value: Any, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -139,21 +140,20 @@ def test_summaries_of_other_types_are_named(
     capsys.readouterr()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "[1]",
-        "command: [1]\n",
-        "command: attack\nobject: [1]\n",
-        "command: attack\nobject: mug\ncontrols: 3\n",
-        "command: attack\nobject: mug\nseed: 0b_\n",
-        "command: attack\nobject: mug\nbase: /dev/zero\n",
-        "command: attack\nobject: mug\nset: [1]\nsteps: x\n",
-        "\0",
-    ],
-)
-@pytest.mark.parametrize("command", [["resume", "it"], ["run", "runs/it/run.yaml"], ["region", "--around", "it"]])
+DAMAGED = [
+    "",
+    "[1]",
+    "command: [1]\n",
+    "command: attack\nobject: [1]\n",
+    "command: attack\nobject: mug\ncontrols: 3\n",
+    "command: attack\nobject: mug\nseed: 0b_\n",
+    "command: attack\nobject: mug\nbase: /dev/zero\n",
+    "command: attack\nobject: mug\nset: [1]\nsteps: x\n",
+    "\0",
+]
+
+
+@once_each("command, text", [["resume", "it"], ["run", "runs/it/run.yaml"], ["region", "--around", "it"]], DAMAGED)
 def test_damaged_configurations_are_refused(
     command: list[str], text: str, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from covering import once_each
 from torch import Tensor
 
 from advsearch.controls import EnvironmentControl, make_space
@@ -87,22 +88,17 @@ def test_a_setting_that_a_control_could_move_leaves_the_exposure_alone(given: di
     assert grey_ball(lit_from(0.0), **given).gain == grey_ball(lit_from(0.0)).gain
 
 
-@pytest.mark.parametrize(
-    ("parameter", "value"),
-    [
-        ("camera.azimuth", 200.0),
-        ("camera.elevation", 70.0),
-        ("camera.roll", 30.0),
-        ("camera.fov", 60.0),
-        ("pose.yaw", 90.0),
-        ("material.roughness", 0.9),
-    ],
-)
-@pytest.mark.parametrize("size", [16, (12, 20)])
+CHANGED = {
+    "camera.azimuth": 200.0, "camera.elevation": 70.0, "camera.roll": 30.0, "camera.fov": 60.0, "pose.yaw": 90.0,
+    "material.roughness": 0.9,
+}  # fmt: skip
+
+
+@once_each("parameter, size", CHANGED, [16, (12, 20)])
 def test_a_setting_a_fixed_value_and_a_point_of_a_grid_are_one_picture(
-    parameter: str, value: float, size: int | tuple[int, int]
+    parameter: str, size: int | tuple[int, int]
 ) -> None:
-    kind, _, name = parameter.partition(".")
+    value, (kind, _, name) = CHANGED[parameter], parameter.partition(".")
     searched: dict[str, dict[str, object]] = {"corruption": {"severity": [0.0, 1.0]}}
     grid = {kind: {name: {"choices": [resolve({})[parameter] or 0.1, value]}}}
     renders = [

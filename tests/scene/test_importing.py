@@ -1087,10 +1087,10 @@ def test_messages_show_what_a_file_holds_briefly_and_plainly(tmp_path: Path, lin
 
 def test_warnings_have_an_end(tmp_path: Path) -> None:
     written(tmp_path, "thing.mtl", MTL)
-    faces = "".join(f"usemtl none{k}\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n" for k in range(50))
+    faces = "".join(f"usemtl none{k}\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n" for k in range(22))
     asset = import_object(written(tmp_path, "thing.obj", "mtllib thing.mtl\n" + QUAD_V + QUAD_UV + faces))
     assert len(asset.warnings) == 21
-    assert asset.warnings[-1] == "thing.obj: 30 more warnings are left out"
+    assert asset.warnings[-1] == "thing.obj: 2 more warnings are left out"
 
 
 def test_old_gltf_materials_keep_their_diffuse_color(tmp_path: Path) -> None:

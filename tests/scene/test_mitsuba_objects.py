@@ -10,6 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
+from covering import once_each
 from PIL import Image
 
 import advsearch
@@ -253,8 +254,7 @@ def test_it_still_does_when_it_is_written_again(folder: Path, tmp_path: Path) ->
         assert off(stock(tmp_path / "again.xml"), stock(path)) < CLOSE, name
 
 
-@pytest.mark.parametrize("filter", ["bilinear", "nearest"])
-@pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
+@once_each("wrap, filter", ["repeat", "mirror", "clamp"], ["bilinear", "nearest"])
 def test_where_a_repeating_texture_shows_the_same(filter: str, wrap: str) -> None:
     """What predicts pictures looks textures up as if they repeated and were interpolated."""
     mi = mitsuba()

@@ -52,7 +52,9 @@ def changed(renderer: Renderer, epsilon: float, kind: str) -> Tensor:
     return (renderer.start + epsilon * way.get(kind, torch.tensor(1.0 if kind == "up" else -1.0))).clamp(0.0, 1.0)
 
 
-@pytest.mark.parametrize(("kind", "most"), [("signs", 1.3), ("up", 2.0), ("down", 2.0)])
+@pytest.mark.parametrize(
+    ("kind", "most"), [("signs", 1.3), ("up", 2.0), pytest.param("down", 2.0, marks=pytest.mark.slow)]
+)
 def test_a_predicted_change_is_the_traced_one(
     renderer: Renderer, predicted: linear.LinearRenderer, kind: str, most: float
 ) -> None:
@@ -201,6 +203,7 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
     assert made == 1 and guesses >= 5
 
 
+@pytest.mark.slow
 def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     made, linearised = 0, plan.predicting
 
@@ -232,24 +235,20 @@ def test_a_guess_learns_how_optimistic_a_prediction_was(monkeypatch: pytest.Monk
     assert not made.likely(torch.tensor(1.7)) and made.likely(torch.tensor(2.0))
 
 
-def test_a_search_says_what_predicted_its_pictures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """It compares, makes the matrix anew where that is off, and a run that goes on ends with the same rows."""
-    monkeypatch.setattr(searching, "EVERY", 6)
-    monkeypatch.setattr(searching, "BOUND", 0.0)
-    found = advsearch.attack("mug", run=tmp_path / "a", **SMALL)  # type: ignore[arg-type]
-    told, renders = found.summary.transport, found.summary.renders
-    assert told is not None and told.used and told.entries and told.error and told.error.levels >= 0.0
-    assert told.renewed == 2 and renders["products"] == 2 * 18 and renders["gradient"] == 0
-    kept = json.loads((tmp_path / "a" / "summary.json").read_text())
-    assert kept["transport"]["renewed"] == 2
-
-
-def test_a_search_that_goes_on_ends_with_the_same_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Though what is read back is not predicted again: the matrix was made anew once before the interrupt."""
+def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_with_the_same_rows(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It compares, and makes the matrix anew where that is off. What is read back is not predicted again: the matrix
+    was made anew once before the interrupt."""
     monkeypatch.setattr(searching, "EVERY", 6)
     monkeypatch.setattr(searching, "BOUND", 0.0)
     settings: Any = {**SMALL, "baseline": False, "deterministic": True}
-    advsearch.attack("mug", run=tmp_path / "whole", **settings)
+    found = advsearch.attack("mug", run=tmp_path / "whole", **settings)
+    told, renders = found.summary.transport, found.summary.renders
+    assert told is not None and told.used and told.entries and told.error and told.error.levels >= 0.0
+    assert told.renewed == 2 and renders["products"] == 18 and renders["gradient"] == 0
+    kept = json.loads((tmp_path / "whole" / "summary.json").read_text())
+    assert kept["transport"]["renewed"] == 2
     stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(9), **settings)
     assert stopped.summary.ending == "interrupted"
     advsearch.attack("mug", run=tmp_path / "parts", resume=True, **settings)

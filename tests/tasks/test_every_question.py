@@ -122,6 +122,7 @@ def test_a_search_predicts_verifies_and_draws(
     assert photographed(taker, run, "clean", SIDE // 2) == [True, False]
 
 
+@ALSO_SLOWLY
 def test_a_stopped_search_goes_on_with_the_same_words(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -176,6 +177,7 @@ def test_an_answer_is_tried_on_other_models_and_under_other_conditions(
     assert {row["ending"] for row in again["table"] if row["way"] in ("as verified", "model")} == {"found"}
 
 
+@ALSO_SLOWLY
 def test_how_much_worse_than_the_average(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ["--steps", "3", "--average", "4", "--trials", "6", "--policy", "random", "--run", str(tmp_path / "run")]
     found = answer(capsys, "gap", "--object", "mug", "--control", "pose", *asked, *SHORT, *flags)
@@ -198,6 +200,7 @@ def test_the_smallest_change(asked: list[str], capsys: pytest.CaptureFixture[str
     assert found["ending"] == "found" and 0.0 < found["smallest"]["epsilon"]["texture"] < 0.3
 
 
+@ALSO_SLOWLY
 def test_an_answer_that_holds_for_many_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -268,7 +271,7 @@ def test_a_box_elsewhere_is_sought_by_its_objective(
     )  # fmt: skip
     result = advsearch.attack(
         "mug", model, task="detection", label="cup", objective=objective, controls=controls, steps=24, trials=6, spp=2,
-        verify_spp=4, denoise="none", measure="no", specialise=False, baseline=False, run=tmp_path / "run",
+        verify_spp=4, denoise="none", measure="no", baseline=False, run=tmp_path / "run",
         policy="random" if objective == "create" else "auto",
     )  # fmt: skip
     summary = result.summary

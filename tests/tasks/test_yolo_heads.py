@@ -313,7 +313,7 @@ def test_a_search_goes_through_a_head_to_its_verified_end(tmp_path: Path) -> Non
     result = advsearch.attack(
         "mug", model, task="detection", label="coffee mug", objective="vanish", policy="auto", steps=6,
         controls={"texture": {"epsilon": 0.4}}, trials=6, spp=2, verify_spp=4, denoise="none", measure="no",
-        specialise=False, baseline=False, run=tmp_path / "run",
+        baseline=False, run=tmp_path / "run",
     )  # fmt: skip
     summary = result.summary
     assert summary.ending == "found" and summary.clean.control and summary.clean.control.correct == 6

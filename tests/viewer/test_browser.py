@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from covering import once_each
 from PIL import Image
 from samples import EXPLAIN, GAP, HARDEN, RECIPE, REPLAY, STABILITY, curve, gap, keep_object, make_run, matrix, region
 from samples import attack as attack_with
@@ -439,9 +440,7 @@ def faults(page: Page) -> list[str]:
     return told + ([] if page.evaluate("document.scrollingElement.scrollWidth <= innerWidth") else ["it is too wide"])
 
 
-@pytest.mark.parametrize("width", [390, 1440])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("which", ["sweep", "attack", "study"])
+@once_each("which, scheme, width", ["sweep", "attack", "study"], ["light", "dark"], [390, 1440])
 def test_everybody_can_use_the_pages(
     browser: Browser, request: pytest.FixtureRequest, which: str, scheme: str, width: int
 ) -> None:

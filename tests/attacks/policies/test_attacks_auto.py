@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from covering import once_each
 from torch import Tensor
 
 from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
@@ -82,8 +83,7 @@ def played(domain: Domain, policy: Policy[Any], steps: int, seed: int = 0) -> tu
 # ---- rules
 
 
-@pytest.mark.parametrize("blocks", [(BALL,), (Block(30, "l2", 0.4),), (BALL, Block(7, "l2", 0.1))])
-@pytest.mark.parametrize("seed", [0, 1])
+@once_each("blocks, seed", [(BALL,), (Block(30, "l2", 0.4),), (BALL, Block(7, "l2", 0.1))], [0, 1])
 def test_norm_balls_alone_are_pgd_bit_for_bit(blocks: tuple[Block, ...], seed: int) -> None:
     domain = domain_of(blocks)
     ours, first = played(domain, Auto(), 25, seed)
@@ -101,11 +101,10 @@ def test_without_noise_it_is_pgd_with_more_momentum() -> None:
     assert torch.equal(torch.stack(first.seen), torch.stack(second.seen))
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3, 7, 40])
-@pytest.mark.parametrize(("cost", "free"), [(0, False), (12, False), (12, True)])
-@pytest.mark.parametrize("name", DOMAINS)
-def test_it_stays_inside_and_spends_its_budget_exactly(name: str, cost: int, free: bool, steps: int) -> None:
+@once_each("name, price, steps", DOMAINS, [(0, False), (12, False), (12, True)], [1, 2, 3, 7, 40])
+def test_it_stays_inside_and_spends_its_budget_exactly(name: str, price: tuple[int, bool], steps: int) -> None:
     """`Smooth` itself checks that every configuration lies in the domain."""
+    cost, free = price
     result, problem = played(domain_of(DOMAINS[name], cost, free), Auto(), steps)
     assert result.stopped is Ending.BUDGET_SPENT
     assert result.history[-1].renders == steps

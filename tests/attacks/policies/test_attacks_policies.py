@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from covering import once_each
 from hostile import SHORT, shown
 from torch import Tensor
 
@@ -122,9 +123,7 @@ NORMS = ("linf", "l2", "box")
 # ---- known optima
 
 
-@pytest.mark.parametrize("d", DIMS)
-@pytest.mark.parametrize("norm", NORMS)
-@pytest.mark.parametrize("kind", KINDS)
+@once_each("kind, norm, d", KINDS, NORMS, DIMS)
 def test_pgd_reaches_the_optimum(kind: str, norm: str, d: int) -> None:
     problem = make_problem(kind, norm, d, seed=1)
     result = search(problem.evaluator(), problem.domain, PGD(), steps=STEPS, seed=0)
@@ -133,9 +132,7 @@ def test_pgd_reaches_the_optimum(kind: str, norm: str, d: int) -> None:
     assert problem.domain.contains(result.best_u)
 
 
-@pytest.mark.parametrize("d", DIMS)
-@pytest.mark.parametrize("norm", NORMS)
-@pytest.mark.parametrize("kind", KINDS)
+@once_each("kind, norm, d", KINDS, NORMS, DIMS)
 def test_pgd_reaches_the_optimum_through_noise(kind: str, norm: str, d: int) -> None:
     values = []
     for seed in range(3):
@@ -163,8 +160,7 @@ def test_momentum_pays_under_noise() -> None:
     assert reached(0.5) > 1.1 * reached(0.0)
 
 
-@pytest.mark.parametrize("d", DIMS)
-@pytest.mark.parametrize("norm", ["linf", "l2"])
+@once_each("norm, d", ["linf", "l2"], DIMS)
 def test_random_loses_to_pgd_on_a_linear_objective(norm: str, d: int) -> None:
     problem = linear(d, norm, seed=2)
     ours = search(problem.evaluator(), problem.domain, PGD(), steps=STEPS, seed=0)
@@ -276,8 +272,7 @@ def test_over_drawn_conditions_the_step_of_pgd_falls_in_a_line_whatever_they_wer
     assert float(usual.best_u[0]) < 0.55
 
 
-@pytest.mark.parametrize("norm", NORMS)
-@pytest.mark.parametrize("kind", ["linear", "peak outside"])
+@once_each("kind, norm", ["linear", "peak outside"], NORMS)
 def test_without_noise_pgd_stops_at_the_optimum(kind: str, norm: str) -> None:
     """It ends by itself, long before the budget does, where more and shorter steps gain nothing."""
     problem = make_problem(kind, norm, 30, seed=1)
@@ -423,7 +418,9 @@ def every_policy() -> list[Policy[Any]]:
     return [make_policy(name) for name in POLICIES] + [make_policy(n, **OPTIONS[n]) for n in POLICIES if OPTIONS[n]]
 
 
-def label(policy: Policy[Any]) -> str:
+def label(policy: Any) -> str | None:
+    if not isinstance(policy, Policy):
+        return None
     return policy.name if policy == make_policy(policy.name) else f"{policy.name} with options"
 
 
@@ -459,8 +456,7 @@ def constant(query: Query) -> Evaluation:
     return Evaluation(0.5, torch.zeros_like(query.u) if query.gradient else None, False, cost=query.samples)
 
 
-@pytest.mark.parametrize("objective", sorted(OBJECTIVES))
-@battery
+@once_each("policy, objective", every_policy(), sorted(OBJECTIVES), ids=label)
 def test_the_battery(policy: Policy[Any], objective: str) -> None:
     """Stays inside, keeps dtype and shape, honours the budget, survives NaN, and repeats with its seed."""
     domain = domain_for(policy)
@@ -492,10 +488,7 @@ def test_the_battery(policy: Policy[Any], objective: str) -> None:
         assert not torch.equal(first[0], other[0])
 
 
-@pytest.mark.parametrize("steps", [1, 2, 7, 40])
-@pytest.mark.parametrize("samples", [1, 3])
-@pytest.mark.parametrize("cost", [0, 5])
-@battery
+@once_each("policy, cost, samples, steps", every_policy(), [0, 5], [1, 3], [1, 2, 7, 40], ids=label)
 def test_the_budget_is_exact_with_samples_and_costly_gradients(
     policy: Policy[Any], cost: int, samples: int, steps: int
 ) -> None:
@@ -549,8 +542,7 @@ def test_a_constant_objective_breaks_nothing(policy: Policy[Any]) -> None:
     assert result.stopped is Ending.BUDGET_SPENT or policy.uses_gradient or policy.name == "grid"
 
 
-@pytest.mark.parametrize("bad", [math.nan, -math.inf, math.inf])
-@battery
+@once_each("policy, bad", every_policy(), [math.nan, -math.inf, math.inf], ids=label)
 def test_half_of_the_domain_cannot_be_evaluated(policy: Policy[Any], bad: float) -> None:
     domain = domain_for(policy)
     inner = classifier(domain.dim)

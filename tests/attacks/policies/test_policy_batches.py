@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from covering import once_each
 from torch import Tensor
 
 from advsearch.attacks import POLICIES, Block, Domain, Evaluation, Policy, make_policy
@@ -57,8 +58,7 @@ def proposed(policy: Policy[Any], domain: Domain, n: int) -> tuple[list[tuple[An
     return seen, sizes
 
 
-@pytest.mark.parametrize("domain", DOMAINS)
-@pytest.mark.parametrize("policy", FORMS)
+@once_each("policy, domain", FORMS, DOMAINS)
 def test_a_batch_has_what_would_have_come_one_by_one(policy: str, domain: str) -> None:
     alone, _ = proposed(FORMS[policy], DOMAINS[domain], 1)
     for n in (2, 3, 16, 1000):

@@ -151,7 +151,9 @@ def compare(setup: Setup, axes: range, tolerance: float, **options: Any) -> None
     assert error < tolerance, f"adjoint {found.tolist()}, differences {expected.tolist()}, error {error:.3f}"
 
 
-@pytest.mark.parametrize(("name", "axes"), [("mug", range(6)), ("book", range(2, 6))])
+@pytest.mark.parametrize(
+    ("name", "axes"), [("mug", range(6)), pytest.param("book", range(2, 6), marks=pytest.mark.slow)]
+)
 def test_pose_axes_of_a_floating_object_agree_with_differences(name: str, axes: range) -> None:
     compare(build(name), axes, AGREEMENT, shadow_spp=16)
 

@@ -1,0 +1,393 @@
+"""Hold pages, comments and lists to the code: python tools/check_docs.py
+
+Everything that has a name is documented, made parts are up to date, numbers in the text are those of the code, links
+and citations lead somewhere, and every file of tests has quick ones. Prints one line for each mistake and exits 3 if
+there is one. What runs, such as the commands of a page, is in tests/test_docs.py.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import inspect
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import reference_scenes
+
+from advsearch.api import region as mapping
+from advsearch.attacks import POLICIES, clopper_pearson, planned_renders, region, sample_count, smallest, verification
+from advsearch.attacks.objectives import OBJECTIVE_KINDS
+from advsearch.attacks.policies import pgd
+from advsearch.attacks.verification import WORST_CASE
+from advsearch.cli.list import REGISTRIES
+from advsearch.cli.main import COMMANDS
+from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig, RegionConfig
+from advsearch.config.attack import FEWEST_TRIALS
+from advsearch.controls import CONTROLS, texture
+from advsearch.engine import stages
+from advsearch.files import MESHES
+from advsearch.models import loading, reference
+from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
+from advsearch.runs import directory, export, store
+from advsearch.runs.results import KEPT
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.gap import CurveResult
+from advsearch.runs.results.matrix import MatrixResult
+from advsearch.runs.results.render import RenderResult
+from advsearch.scene import environments, exposure, library
+from advsearch.scene.description import FRAME_FILL
+from advsearch.scene.importing.images import TEXTURE_LIMIT
+from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
+from advsearch.scene.settings import SETTINGS
+from advsearch.settings import settings
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *sorted(DOCS.rglob("*.md"))]
+FOLDERS = ("advsearch", "benchmarks", "docs", "scenes", "tests", "tools")
+MEDIUM = ROOT / "tests" / "medium.txt"
+
+
+def main() -> int:
+    """Print every mistake; returns the exit status."""
+    found = sorted({mistake for check in CHECKS for mistake in check()})
+    for mistake in found:
+        print(mistake, file=sys.stderr)
+    return 3 if found else 0
+
+
+@cache
+def read(path: Path) -> str:
+    """Return the text of a file."""
+    return path.read_text("utf-8")
+
+
+def page(name: str) -> str:
+    """Return the text of a page of docs/."""
+    return read(DOCS / name)
+
+
+def name_of(path: Path) -> str:
+    """Return a path from the repository's root."""
+    return path.relative_to(ROOT).as_posix()
+
+
+@cache
+def script(name: str) -> ModuleType:
+    """Import a script of docs/, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def blocks(path: Path, language: str) -> Iterator[str]:
+    """Yield the fenced blocks of one language, without their indentation."""
+    for indent, body in re.findall(rf"^( *)```{language}\n(.*?)^ *```$", read(path), re.M | re.S):
+        yield re.sub(rf"^{indent}", "", body, flags=re.MULTILINE)
+
+
+def absent(name: str, texts: Iterable[str], text: str | None = None) -> Iterator[str]:
+    """Say which texts are not in a page, or in a part of it."""
+    text = page(name) if text is None else text
+    yield from (f"docs/{name}: expected {wanted.strip()}" for wanted in texts if wanted not in text)
+
+
+# ---- everything that has a name is documented -----------------------------------------------------------------------
+
+
+def commands() -> Iterator[str]:
+    """Every command has a section with an example and its flags; a sentence says which can be quiet."""
+    text, quiet = page("command-line.md"), set()
+    for command in COMMANDS:
+        section = re.search(rf"^## {command}\n(.*?)(?=^## |\Z)", text, re.M | re.S)
+        flags = script("make_figures").flags_of(command)
+        quiet |= {command} if "--quiet" in flags else set()
+        known = flags - {"--json", "--quiet"}
+        if section is not None and "All flags of `attack` but" in section[1]:
+            known -= script("make_figures").flags_of("attack")
+        wanted = [f"\nadvsearch {command}", *(f"`{flag}`" for flag in sorted(known))]
+        yield from absent("command-line.md", wanted, section[1] if section else "")
+    said = " ".join(text.split()).partition("also take `--quiet`")[2].partition(".")[0]
+    if set(re.findall(r"`([a-z]+)`", said)) != quiet:
+        yield f"docs/command-line.md: expected {sorted(quiet)} as commands that take --quiet"
+    yield from absent("command-line.md", [f"| `{one.flag}` |" for one in settings(AttackConfig)])
+    yield from absent("command-line.md", [f"`{kind}`" for kind in REGISTRIES])
+
+
+def controls() -> Iterator[str]:
+    """Every control has a page with its parameters, settings and an example."""
+    for kind, control in CONTROLS.items():
+        declared = [one.name for one in control.parameters] + [one.name for one in control.choices]
+        yield from absent(f"controls/{kind}.md", [f"--control {kind}", *(f"| `{name}` |" for name in declared)])
+
+
+def policies() -> Iterator[str]:
+    """Every policy has a page or a row with an example, and its options in the row with their defaults."""
+    overview = page("policies/README.md")
+    for name, policy in POLICIES.items():
+        own = f"policies/{name}.md"
+        yield from absent(own if (DOCS / own).exists() else "policies/README.md", [f"--policy {name}"])
+        start = f"[`{name}`]({name}.md)" if (DOCS / own).exists() else f"`{name}`"
+        yield from absent("policies/README.md", [f"\n| {start} |"])
+        row = re.search(rf"^\| \[?`{name}`.*$", overview, re.MULTILINE)
+        said = dict(re.findall(r"`([a-z0-9_]+)` \(([^)]*)\)", row[0].rpartition(" | ")[2] if row else ""))
+        declared = {one.name: one.default for one in fields(policy)}  # type: ignore[arg-type]
+        if set(said) != set(declared):
+            yield f"docs/policies/README.md: expected the options {sorted(declared)} of {name}, got {sorted(said)}"
+        for option in set(said) & set(declared):
+            default = declared[option]
+            if isinstance(default, (bool, int, float)):
+                stated = re.split(r"[:;,]\s*", said[option].rpartition("; ")[2] or said[option])[0].strip("` ")
+                wanted = str(default).lower() if isinstance(default, bool) else f"{default:g}"
+                if stated != wanted:
+                    yield f"docs/policies/README.md: expected {wanted} as {name}'s {option}, got {stated}"
+
+
+def names() -> Iterator[str]:
+    """Objectives, scenes, options of models, targets, benchmarks and what a run holds are in their pages."""
+    for name in OBJECTIVE_KINDS:
+        yield from absent("objectives.md", [f"| `{name}` |", f"--objective {name}"])
+    bundled = [*SETTINGS, *library.list_objects(), *library.list_environments()]
+    yield from absent("scenes.md", [f"| `{name}` |" for name in bundled])
+    yield from absent("scenes.md", [f"`{ending}`" for ending in (*MESHES, *environments.SUFFIXES)])
+    options = set(inspect.signature(loading.load_model).parameters) - {"spec", "name", "max_batch"}
+    text = page("models.md")
+    yield from (
+        f"docs/models.md: expected {one}" for one in options if f"{one}=" not in text and f"`{one}`" not in text
+    )
+    text = page("development.md")
+    for target in re.findall(r"^([a-z-]+):.*?## ", read(ROOT / "Makefile"), re.M):
+        if f"`{target}`" not in text and f"make {target}" not in text:
+            yield f"docs/development.md: expected the target {target}"
+    yield from absent("design.md", [f"| [`{path.name}`]" for path in (ROOT / "benchmarks").glob("[!_]*.py")])
+
+
+PLAIN = set(
+    "object objects task environment controls model policy objective loss run ending depth specialised interrupted "
+    "figures seconds seed spp goal renders_per_gradient".split()
+)
+"""Fields that say themselves."""
+
+
+def results() -> Iterator[str]:
+    """Fields of results say what they hold; columns and files of a run are in the page about runs."""
+    kinds: list[type[Result]] = [*KEPT, CurveResult, MatrixResult, RenderResult]
+    for kind in kinds:
+        silent = {name for name, field in kind.model_fields.items() if not script("make_figures")._field(field)}
+        if not (kind.__doc__ and kind.command) or silent - PLAIN:
+            yield f"{kind.__name__}: expected a docstring, a command and descriptions of {sorted(silent - PLAIN)}"
+    text = page("runs.md")
+    rows = re.findall(r"^\| (`.*?) \|", text, re.M)
+    said = {name for row in rows for name in re.findall(r"`([a-z_]+)`", row)}
+    yield from (f"docs/runs.md: expected a row of {name}" for name in {*export.OWN, *export.AFTER} - said)
+    if {*export.OWN, *export.AFTER, "values", "metrics"} != {one.name for one in fields(store.Row)}:
+        yield "advsearch/runs/export.py: expected every field of a row"
+    yield from absent("runs.md", [f"`{format}`" for format in export.FORMATS])
+    stems = [name.removesuffix("-journal").removesuffix("-wal").removesuffix("-shm") for name in directory.CONTENTS]
+    yield from absent("runs.md", [f"`{stem}" for stem in stems], text.partition("## What survives")[0])
+
+
+# ---- what is made from the code is up to date -----------------------------------------------------------------------
+
+
+def made() -> Iterator[str]:
+    """The made parts are there and up to date."""
+    figures = script("make_figures")
+    yield from (f"{name_of(path)}: run python docs/make_figures.py" for path in figures.differing())
+    wanted = [f"controls/{kind}.md" for kind in CONTROLS]
+    own = [name for name in POLICIES if (DOCS / "policies" / f"{name}.md").exists()]
+    wanted += [f"policies/{name}.md" for name in own if inspect.signature(POLICIES[name]).parameters]
+    having = {name for name, _ in figures.PARTS}
+    yield from (f"docs/make_figures.py: expected a part of {name}" for name in wanted if name not in having)
+    for path in DOCS.rglob("*.md"):
+        name = path.relative_to(DOCS).as_posix()
+        if figures.parts_in(read(path)) != {part for known, part in figures.PARTS if known == name}:
+            yield f"docs/{name}: expected the parts that PARTS of docs/make_figures.py names"
+    shown = read(PAGES[0]).partition("<!-- made by docs/make_images.py -->")[2].partition("<!-- end -->")[0]
+    if "fresh renders" not in shown:
+        yield "README.md: run python docs/make_images.py RUN"
+
+
+MADE_BY_HAND = [
+    ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
+    ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
+    ("design.md", f"at {', '.join(map(str, sample_count.LADDER[:-1]))} and {sample_count.LADDER[-1]} samples a pixel"),
+    ("design.md", f"is at most {sample_count.DRIFT} of the margin itself"),
+    ("design.md", f"**Trials**: {TRIALS} renders (`--trials`; {TRIALS_OVER} with `--over`)"),
+    ("design.md", f"must reach {verification.PASS_PERCENT_OVER} % of the trials in which the clean scene is right"),
+    ("design.md", f"rounded up: {WORST_CASE.needed(20)} of 20"),
+    ("design.md", f"20 of 20 means a true rate of at least {100 * clopper_pearson(20, 20)[0]:.0f} %"),
+    ("design.md", f"at most {mitsuba_scene.MAX_DEPTH} segments"),
+    ("questions.md", {8: "Eight renders of the best configurations"}[planned_renders(0)]),
+    ("questions.md", f"**Verified** by {TRIALS} fresh renders"),
+    ("questions.md", f"until they are within {100 * (smallest.RATIO - 1):.0f} % of each other"),
+    ("questions.md", {12: "or twelve searches are done"}[smallest.ROUNDS]),
+    (
+        "questions.md",
+        f"What counts on the way is {FEWEST_TRIALS} trials without a failure, or, after one, {TRIALS} in all",
+    ),
+    ("questions.md", f"**Verified** on {TRIALS_OVER} conditions"),
+    ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
+    ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
+    ("questions.md", {8: "as long as eight random pictures"}[region.PROBES]),
+    ("questions.md", {4: "with other seeds, up to four times"}[region.ATTEMPTS]),
+    ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
+    ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
+    ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),
+    ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
+    ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
+    ("scenes.md", f"reaches to {100 * FRAME_FILL:.0f} % of the way"),
+    ("scenes.md", f"gets the linear value {exposure.METERED_WHITE}"),
+    ("scenes.md", f"averaged down to at most {TEXTURE_LIMIT} texels"),
+    ("scenes.md", "Maps larger than {1} x {0} are".format(*environments.LARGEST)),
+    ("controls/texture.md", f"Default {texture.DEFAULT_EPSILON}"),
+    ("controls/texture.md", "at least {} and at most {}".format(*texture.RESOLUTIONS)),
+    ("policies/pgd.md", f"the first after {100 * pgd.FIRST_WINDOW:.0f} % of the steps"),
+    ("policies/pgd.md", {0.75: "fewer than three quarters of the steps"}[pgd.IMPROVING]),
+    ("policies/pgd.md", {5: "Five in a row end the search"}[pgd.PATIENCE]),
+    ("reference-model.md", {0.25: "A quarter of the pictures is not denoised"}[reference_scenes.RAW_SHARE]),
+    ("reference-model.md", "pictures of {} x {} pixels".format(*reference.INPUT_SIZE)),
+    ("models.md", "goes in as {} x {}, RGB".format(*loading.DEFAULT_INPUT_SIZE)),
+]
+
+
+def numbers() -> Iterator[str]:
+    """Numbers in the text are those of the code."""
+    for name, sentence in MADE_BY_HAND:
+        yield from absent(name, [sentence], " ".join(page(name).split()))
+
+
+# ---- links and words ------------------------------------------------------------------------------------------------
+
+
+def prose(path: Path) -> str:
+    """Return a page without its code, fenced and inline."""
+    text = re.sub(r"^ *```.*?^ *```$", "", read(path), flags=re.M | re.S)
+    return re.sub(r"`[^`\n]*`", "code", text)
+
+
+def anchors(path: Path) -> set[str]:
+    """Return what `#...` may name in a page: its headings as GitHub spells them."""
+    headings = re.findall(r"^#+ (.*)$", read(path), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def links() -> Iterator[str]:
+    """Every relative link leads somewhere, and every page can be reached from the readme."""
+    reached: dict[Path, set[Path]] = {}
+    for path in PAGES:
+        reached[path] = set()
+        for target in re.findall(r"\]\(([^)\s]+)\)", prose(path)):
+            name, _, anchor = target.partition("#")
+            if name.startswith(("http://", "https://")):
+                continue
+            found = (path.parent / name).resolve() if name else path
+            if not found.exists() or (anchor and anchor not in anchors(found)):
+                yield f"{name_of(path)}: the link {target} leads nowhere"
+            reached[path].add(found)
+    seen, todo = set[Path](), [PAGES[0]]
+    while todo:
+        path = todo.pop()
+        if path in reached and path not in seen:
+            seen.add(path)
+            todo += reached[path]
+    yield from (f"{name_of(path)}: no link leads here" for path in set(PAGES) - seen)
+
+
+def words() -> Iterator[str]:
+    """Words are British, and no path of one machine is left."""
+    for path in PAGES:
+        found = re.findall(r"\b\w*(?:color|normaliz|recogniz|gray|behavior)\w*", prose(path), re.I)
+        found += re.findall(r"/(?:work|tmp|home|root)/|\.\./shared", read(path))
+        yield from (f"{name_of(path)}: unexpected {word}" for word in found)
+
+
+# ---- citations ------------------------------------------------------------------------------------------------------
+
+MADE_UP = {"tests/test_architecture.py", "tests/test_docs.py", "tests/test_registry.py"}
+"""Tests of such rules, which name modules that are not there."""
+NAME = re.compile(r"(?<![\w./-])`?(advsearch(?:\.[A-Za-z_]\w*)+)(?:\(\))?`?(?![\w/-])")
+GROUPS = {one.group for one in (CONTROLS, OBJECTIVE_KINDS, POLICIES, SOURCES_OF_MODELS)}
+"""Groups of entry points, which are names and no modules."""
+PATH = re.compile(rf"(?<![\w./-])((?:{'|'.join(FOLDERS)})/[\w./-]*\w\.(?:py|md|sh|json|png))")
+PLACEHOLDER = re.compile(r"\b[A-Z]{4,}\.")
+HEADING = re.compile(r'(docs/[\w/-]+\.md),\s+"([^"]+)"')
+ELSEWHERE = re.compile(r"\bDESIGN\b")
+"""How a text outside the repository was cited."""
+
+
+def citations() -> Iterator[str]:
+    """What code, comments and pages cite is there: modules and what is in them, files, pages and their headings."""
+    written = [
+        path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".md", ".py", ".sh")
+    ]
+    for path in [ROOT / "Makefile", *ROOT.glob("*.md"), *written]:
+        if name_of(path) not in MADE_UP:
+            yield from (f"{name_of(path)}: {cited} is not there" for cited in lost_in(read(path)))
+
+
+def lost_in(text: str) -> list[str]:
+    """Return what a text cites and is not there."""
+    lost = [name for name in NAME.findall(text) if name not in GROUPS and not is_there(name)]
+    lost += [path for path in PATH.findall(text) if not PLACEHOLDER.search(path) and not (ROOT / path).exists()]
+    for path, heading in HEADING.findall(" ".join(text.split())):
+        titles = re.findall(r"^#+ (.*)$", read(ROOT / path), re.M) if (ROOT / path).exists() else []
+        lost += [f'{path}, "{heading}"'] * (heading not in titles)
+    return lost + ELSEWHERE.findall(text)
+
+
+@cache
+def is_there(name: str) -> bool:
+    """Whether a dotted name is a module, or something in one."""
+    parts = name.split(".")
+    found = importlib.import_module(parts[0])
+    for number, part in enumerate(parts[1:], start=2):
+        if not hasattr(found, part):
+            if not hasattr(found, "__path__") or importlib.util.find_spec(".".join(parts[:number])) is None:
+                return False
+            importlib.import_module(".".join(parts[:number]))
+        found = getattr(found, part)
+    return True
+
+
+# ---- tests ----------------------------------------------------------------------------------------------------------
+
+WHOLE_RUNS = {"tests/test_real_data.py"}
+"""Nothing in them is quick."""
+
+
+def quick_tests() -> Iterator[str]:
+    """`make test-quick` covers every file of tests, and the list of what it leaves out names tests that there are."""
+    left_out = set(read(MEDIUM).splitlines())
+    functions = {name_of(path): functions_of(path) for path in (ROOT / "tests").rglob("test_*.py")}
+    for file, known in functions.items():
+        quick = [name for name, slow in known.items() if not slow and f"{file}::{name}" not in left_out]
+        if not quick and file not in WHOLE_RUNS:
+            yield f"{file}: expected a test that is neither slow nor in tests/medium.txt"
+    for test in left_out:
+        file, _, name = test.partition("[")[0].partition("::")
+        if name not in functions.get(file, {}):
+            yield f"tests/medium.txt: there is no {test}; make test ARGS=--measure takes it out"
+
+
+def functions_of(path: Path) -> dict[str, bool]:
+    """Return the tests of a file by name, and whether each is slow whatever its parameters are."""
+    tree = ast.parse(read(path))
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
+    return {one.name: "pytest.mark.slow" in map(ast.unparse, one.decorator_list) for one in functions}
+
+
+CHECKS = (commands, controls, policies, names, results, made, numbers, links, words, citations, quick_tests)
+
+if __name__ == "__main__":
+    sys.exit(main())
