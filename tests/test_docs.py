@@ -50,7 +50,6 @@ from advsearch.engine.loading import as_controls
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.files import MESHES
-from advsearch.models import loading, reference
 from advsearch.questions.compare.settings import CompareConfig
 from advsearch.recipes.description import read_recipe
 from advsearch.recipes.description import recipe_names as recipes
