@@ -201,7 +201,7 @@ FAULTS = (
     Fault(
         "engine: a run that goes on evaluates again",
         "advsearch/engine/journal.py",
-        "return self._trials.get((query.kind, query.number))",
+        "return self._trials_of(query.kind).get(query.number)",
         "return None",
         ("tests/engine/test_resume.py",),
     ),
