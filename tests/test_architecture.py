@@ -83,11 +83,14 @@ RULES = {
     "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
     "explanations": Rule({"attacks", "recipes", "config", "settings"}, {"numpy", "scipy"}, HEAVY),
+    # the lists of questions come after what they list
+    "questions": Rule({"config", "runs"}, set()),
     "recipes": Rule({"attacks", "runs", "report", "config", "settings"}, {"matplotlib", "pydantic"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
     "api": Rule(None),
     "cli": Rule(None),
-    "": Rule({"api", "engine", "losses", "models"}, set()),
+    "testing": Rule(None),
+    "": Rule({"api", "engine", "losses", "models", "testing"}, set()),
 }
 """As in docs/design.md, "Rooms, and who may know whom". The empty name is `advsearch/__init__.py`."""
 
@@ -130,12 +133,23 @@ def imports(module: str, path: Path) -> frozenset[str]:
     return frozenset(names)
 
 
+LAYERS = {
+    **{"settings": "config", "suite": "config", "answer": "runs", "words": "report", "machines": "report"},
+    **{"page": "viewer", "carry_out": "api", "claims": "api", "counterexamples": "api", "command": "cli"},
+}
+"""The room whose rule holds for a file of a question that is a room of its own, by the file's name."""
+
+
 def room(module: str) -> str:
     """The room of one of our modules: the first name below `advsearch`; empty for the package itself.
 
-    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room.
+    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room. A file of a question's
+    room belongs to the layer that its name says; the lists of questions are of the settings'.
     """
     name = module.split(".")[1] if "." in module else ""
+    if name == "questions":
+        file = module.split(".")[3:]
+        return LAYERS[file[0]] if file else "questions"
     if name == "__main__":
         return "cli"
     folder = SOURCES["advsearch"]

@@ -19,6 +19,7 @@ from advsearch.config.rendering import RenderConfig
 from advsearch.config.replaying import WAYS, ReplayConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
+from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config
 
 CONFIGS: dict[str, type[Config]] = {
@@ -37,6 +38,7 @@ CONFIGS: dict[str, type[Config]] = {
         RecipeConfig,
         ExplainConfig,
         HardenConfig,
+        SuiteConfig,
     )
 }
 """What the settings of each command are, in the order in which the docs show them."""
@@ -67,5 +69,6 @@ __all__ = [
     "ReplayConfig",
     "SceneConfig",
     "StabilityConfig",
+    "SuiteConfig",
     "SweepConfig",
 ]

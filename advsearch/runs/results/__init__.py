@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from advsearch.files import JsonObject
+from advsearch.questions.test.answer import SuiteResult
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckResult
@@ -31,6 +32,7 @@ KEPT: tuple[type[Result], ...] = (
     RecipeResult,
     ExplainResult,
     HardenResult,
+    SuiteResult,
 )
 """The results that a run keeps in `summary.json`."""
 
