@@ -170,7 +170,9 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(mapping, "grow", stopped)
-    monkeypatch.setattr(mapping, "_verdict", lambda verifier, centre: next(verifier.trials("centre", {0: centre})).success)
+    monkeypatch.setattr(
+        mapping, "_verdict", lambda verifier, centre: next(verifier.trials("centre", {0: centre})).success
+    )
     folder = tmp_path / "run"
     flags = (
         f"region --object mug --control pose.yaw --resolution 16 --denoise none --verify-spp 2 --run {folder} --quiet"

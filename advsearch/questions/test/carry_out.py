@@ -28,7 +28,7 @@ from advsearch.questions.test.counterexamples import (
     write_expected,
 )
 from advsearch.questions.test.settings import SuiteConfig
-from advsearch.questions.test.suite import COUNTEREXAMPLES, NoWorseClaim, NotBrokenClaim, Suite, read_suite, suite_of
+from advsearch.questions.test.suite import COUNTEREXAMPLES, NotBrokenClaim, NoWorseClaim, Suite, read_suite, suite_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
@@ -73,10 +73,10 @@ def test_from_config(
     try:
         planned = _planned(described, config, added)
         _check(planned, described)
-    except InputError:
+    except InputError as error:
         if added is not None:
             remove(added)
-        raise
+        raise InputError(f"{config.suite}: {error}") from None
 
     def left() -> float:
         return max(0.001, seconds - (time.perf_counter() - begun))
@@ -132,6 +132,8 @@ class _SuiteRun:
             for one in self.planned[len(self.answers) :]:
                 self._add(one, self._not_tried(one, words.STOPPED))
             return INTERRUPTED
+        if any(one.reason == words.NOT_TRIED for one in self.answers):
+            self.trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
         return OUT_OF_TIME if any(words.TIME_OVER in one.reason for one in self.answers) else "done"
 
     def _tried(self, one: Planned, results: Results) -> ClaimAnswer:
@@ -219,11 +221,14 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
     changes = {"model": config.model, "threads": config.threads, "deterministic": config.deterministic or None}
     kept = counterexamples(config.suite) if added is None else [added]
     first = [Planned(one.name, "counterexample", one.config_for(suite, changes), one) for one in kept]
+    if twice := [one.name for one in first if one.name in suite.claims]:
+        raise InputError(f"claims.{twice[0]}: a counterexample is called so, too; call the claim something else")
     if added is not None:
         return first
-    if twice := [one.name for one in first if one.name in suite.claims]:
-        raise InputError(f"claims.{twice[0]}: a counterexample is called so; call the claim something else")
-    rest = [Planned(name, one.claim, suite.config_of(name, **changes)) for name, one in suite.claims.items()]
+    rest = [
+        Planned(name, one.claim, suite.config_of(name, **changes).with_only_here(config.only_here))
+        for name, one in suite.claims.items()
+    ]
     chosen, planned = config.chosen, [*first, *rest]
     known = [one.name for one in planned]
     for name in chosen:

@@ -29,9 +29,13 @@ from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.results.attack import AttackSummary
+from advsearch.scene.formation import next_count
 
-MANY = 8
+MANY = 4
 """Values of a configuration that are said in words, at most."""
+
+MOST_KEPT = 64
+"""Of a configuration with more numbers, a picture's row does not hold the values."""
 
 AHEAD = 2
 """Pictures that are asked for at once, for each worker."""
@@ -236,7 +240,10 @@ class Trial:
 
     def _described(self, problem: Problem, query: Query) -> str:
         values = list(problem.describe(query.u, query.seed).items())
-        shown = [f"{name} {number_text(one['value'])} {one['unit']}".strip() for name, one in values[:MANY]]
+        shown = [
+            f"{name} {number_text(one['value'])}" + ("" if one["unit"] in ("1", "name") else f" {one['unit']}")
+            for name, one in values[:MANY]
+        ]
         return ", ".join([*shown, *(["..."] if len(values) > MANY else [])])
 
     def _decided(
@@ -287,7 +294,7 @@ def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
         generator = torch.Generator().manual_seed(seeds.stream(problem.seed, f"{kind} draw", number))
         (u,) = problem.domain.sample(generator)
         seed = seeds.stream(problem.seed, kind, number)
-        yield Query(u, seed, kind, number, spp=spp, described=problem.domain.dim <= MANY * MANY, sought=False)
+        yield Query(u, seed, kind, number, spp=spp, described=problem.domain.dim <= MOST_KEPT, sought=False)
 
 
 def decided(sequence: ConfidenceSequence, least: float) -> str:
@@ -298,5 +305,4 @@ def decided(sequence: ConfidenceSequence, least: float) -> str:
 def spp_of(config: SceneConfig) -> int:
     """Return the samples a pixel of each picture."""
     assert isinstance(config, DrawnConfig)
-    return config.verify_spp
-
+    return next_count(config.pixel_sampler, config.verify_spp)

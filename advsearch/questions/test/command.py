@@ -76,13 +76,13 @@ def write_files(config: Config, result: SuiteResult) -> None:
 def answer(result: SuiteResult) -> str:
     """Return what the suite says, a table of its claims, what repeats those that are not held, and the cost."""
     from advsearch.questions.test.answer import HELD
-    from advsearch.questions.test.words import TABLE_HEADS, facts, suite_text, table_rows
+    from advsearch.questions.test.words import NOT_TRIED, TABLE_HEADS, facts, suite_text, table_rows
     from advsearch.runs.directory import REPORT
 
     listed = output.aligned([TABLE_HEADS, *table_rows(result)])
     parts = [f"{result.title}\n{suite_text(result)}", listed]
     for one in result.claims:
-        if one.answer != HELD and (one.picture or one.repeat):
+        if one.answer != HELD and one.reason != NOT_TRIED:
             rows = [["picture", f"{result.run}/{one.picture}"]] if one.picture else []
             parts.append(f"{one.name}\n{output.aligned([*rows, ['again', one.repeat]])}")
     parts += ["Expected from now on\n" + output.aligned([[one] for one in result.changes])] if result.changes else []

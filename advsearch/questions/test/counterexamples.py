@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import lzma
 import os
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,17 +25,21 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
 from advsearch.questions.test.answer import ANSWERS, HELD
 from advsearch.questions.test.suite import OWN, Suite
-from advsearch.runs.directory import CONFIG, IMAGES, default_name, find_run
+from advsearch.runs.directory import CONFIG, IMAGES, PARTS, default_name, find_run
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.images import smaller_png
 from advsearch.runs.summary import attack_of
 from advsearch.settings import FILES, settings
 
-STEPS = 32767
-"""Steps of 1 in which a number of a configuration is kept."""
+FINE, COARSE, FEW = 32767, 255, 4096
+"""Steps of 1 in which a number is kept: of a few numbers, and of more than `FEW`, as the texels of a texture, where
+those of an 8-bit picture do."""
 
 LARGEST = 1 << 24
 """Most bytes of a file, and most numbers of a configuration."""
+
+MEMORY = 1 << 27
+"""Bytes that unpacking one may take."""
 
 SIDE = 96
 """Longest side of the picture, in pixels."""
@@ -61,6 +65,7 @@ class _File(BaseModel):
     settings: dict[str, Any]
     scene: str
     spp: int = Field(ge=1, le=65536)
+    steps: int = Field(ge=1, le=32767)
     numbers: int = Field(ge=1, le=LARGEST)
     offsets: str
 
@@ -76,7 +81,8 @@ class Counterexample:
         said: what the model said of it.
         scene: digest of the scene.
         spp: samples a pixel that it was verified with.
-        offsets: (d,) int16, how far each number is from the clean scene's, in steps of 1 / `STEPS`.
+        offsets: (d,) int16, how far each number is from the clean scene's, in steps of 1 / `steps`.
+        steps: of 1.
     """
 
     name: str
@@ -86,6 +92,7 @@ class Counterexample:
     scene: str
     spp: int
     offsets: np.ndarray[Any, np.dtype[np.int16]]
+    steps: int
 
     def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
         """Return what it is tried with: the run's scene, and the suite's model."""
@@ -101,7 +108,7 @@ class Counterexample:
                 f"{self.path}: has {len(self.offsets)} numbers, and its scene has {start.numel()} now; remove it, or "
                 "add the answer of a new run"
             )
-        return (start + torch.from_numpy(self.offsets.astype(np.float32)) / STEPS).clamp(0.0, 1.0)
+        return (start + torch.from_numpy(self.offsets.astype(np.float32)) / self.steps).clamp(0.0, 1.0)
 
 
 def folder_of(suite: str) -> Path:
@@ -133,8 +140,11 @@ def add(suite: str, run: str) -> Counterexample:
         raise InputError(f"add: expected a run that makes the model wrong, got {path}, which makes the object easier")
     parts = parts_in(path)
     problem, _ = problem_of_parts(parts)
-    offsets = ((kept_answer(path, problem) - problem.domain.start) * STEPS).round().to(torch.int16).numpy()
-    folder, name = folder_of(suite), default_name(path.name, ())
+    moved = kept_answer(path, problem) - problem.domain.start
+    steps = FINE if moved.numel() <= FEW else COARSE
+    offsets = (moved * steps).round().to(torch.int16).numpy()
+    of = path.parents[1].name if path.parent.name == PARTS else ""
+    folder, name = folder_of(suite), default_name(of or path.name, (path.name,) if of else ())
     values = {
         "schema": 1,
         "run": path.name,
@@ -142,8 +152,9 @@ def add(suite: str, run: str) -> Counterexample:
         "settings": _settings(config),
         "scene": scene_digest(parts.scene),
         "spp": summary.verified.spp,
+        "steps": steps,
         "numbers": len(offsets),
-        "offsets": base64.b64encode(zlib.compress(offsets.astype("<i2").tobytes(), 9)).decode("ascii"),
+        "offsets": base64.b85encode(lzma.compress(offsets.astype("<i2").tobytes())).decode("ascii"),
     }
     folder.mkdir(parents=True, exist_ok=True)
     picture = (path / IMAGES / "adversarial.png").read_bytes()
@@ -184,14 +195,14 @@ def counterexamples(suite: str) -> list[Counterexample]:
 def _read(path: Path) -> Counterexample:
     try:
         kept = _File.model_validate(parse_json(read_text(path, "a counterexample", LARGEST)))
-        unpack = zlib.decompressobj()
-        data = unpack.decompress(base64.b64decode(kept.offsets, validate=True), 2 * kept.numbers)
+        unpack = lzma.LZMADecompressor(memlimit=MEMORY)
+        data = unpack.decompress(base64.b85decode(kept.offsets), 2 * kept.numbers)
         offsets = np.frombuffer(data, "<i2").astype(np.int16)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         got = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
         raise FileFormatError(f"{path}: expected a counterexample, got one with {got}; remove it") from None
-    except (OSError, ValueError, zlib.error) as error:
+    except (OSError, ValueError, lzma.LZMAError) as error:
         raise FileFormatError(f"{path}: expected a counterexample, got {str(error)[:80]}; remove it") from None
     if len(offsets) != kept.numbers:
         raise FileFormatError(f"{path}: expected {kept.numbers} numbers, got {len(offsets)}; remove it")
@@ -199,7 +210,7 @@ def _read(path: Path) -> Counterexample:
         config = AttackConfig(**kept.settings)
     except InputError as error:
         raise FileFormatError(f"{path}: settings: {error}") from None
-    return Counterexample(path.stem, path, config, kept.said, kept.scene, kept.spp, offsets)
+    return Counterexample(path.stem, path, config, kept.said, kept.scene, kept.spp, offsets, kept.steps)
 
 
 # ---- what is expected -----------------------------------------------------------------------------------------------

@@ -45,5 +45,7 @@ def _pictures(run: Path, result: SuiteResult) -> list[Html]:
             continue
         picture = element("img", src=data_url(file.read_bytes(), "image/png"), alt=f"{one.name}: {one.reason}")
         caption = element("figcaption", f"{one.statement}: {one.answer}. {one.reason}.")
-        found.append(join_html(element("h2", one.name), element("figure", picture, caption), element("pre", one.repeat)))
+        found.append(
+            join_html(element("h2", one.name), element("figure", picture, caption), element("pre", one.repeat))
+        )
     return found

@@ -22,7 +22,9 @@ class SuiteConfig(Config):
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
         Clash("fresh", lambda one: one.seed is not None, "draws a seed, and `seed` says one; leave one of the two out"),
-        Clash("update", lambda one: one.add is not None, "renews what claims are expected to say; first `add`, then it"),
+        Clash(
+            "update", lambda one: one.add is not None, "renews what claims are expected to say; first `add`, then it"
+        ),
         Clash(
             "only",
             lambda one: one.add is not None,
@@ -57,9 +59,7 @@ class SuiteConfig(Config):
         gt=0.0,
         le=1e9,
     )
-    model: str | None = setting_as_in(
-        SceneConfig, "model", default=None, otherwise="what the suite says, or reference"
-    )
+    model: str | None = setting_as_in(SceneConfig, "model", default=None, otherwise="what the suite says, or reference")
     junit: str | None = setting(None, "files", "write JUnit XML, a test case for each claim", "a file")
     sarif: str | None = setting(None, "files", "write SARIF 2.1.0, a result for each claim that is not held", "a file")
     markdown: str | None = setting(None, "files", "write a Markdown table, for the summary of a job", "a file")

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import FileFormatError, InputError, resembling
 from advsearch.questions.test.settings import DrawnConfig
 from advsearch.settings import read_yaml, shown
 from advsearch.settings.configuration import PLACE
@@ -42,6 +42,9 @@ EXPECTED = {
 }
 """What each name of a suite takes."""
 
+A_CLAIM = "a claim such as {claim: right, at_least: 0.9}"
+"""What a name among the claims takes."""
+
 
 class _Described(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
@@ -64,6 +67,13 @@ class RightClaim(_Claim):
     claim: Literal["right"]
     at_least: Annotated[float, Field(gt=0.0, lt=1.0)]
     pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
+
+    @field_validator("at_least", mode="before")
+    @classmethod
+    def _per_cent(cls, value: Any) -> Any:
+        """Accept ``95 %``."""
+        found = re.fullmatch(r"\s*(\d+(?:\.\d+)?) ?%\s*", value) if isinstance(value, str) else None
+        return value if found is None else float(found[1]) / 100.0
 
 
 class NotBrokenClaim(_Claim):
@@ -165,7 +175,9 @@ def suite_of(data: Mapping[str, object], where: str) -> Suite:
     try:
         return Suite(**given)  # type: ignore[arg-type]
     except ValidationError as error:
-        raise FileFormatError(f"{where}: {_told(error.errors(include_url=False)[0])}") from None
+        found = error.errors(include_url=False)
+        first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])  # a slip in a name
+        raise FileFormatError(f"{where}: {_told(first)}") from None
 
 
 def _told(error: Any) -> str:
@@ -177,11 +189,13 @@ def _told(error: Any) -> str:
         got = "nothing" if error["type"] == "union_tag_not_found" else shown(error["ctx"]["tag"])
     where = ".".join(place)
     if error["type"] == "extra_forbidden":
-        return f"{where}: there is no such name in a suite; leave it out, or see docs/testing.md"
+        near = resembling(name, sorted(EXPECTED))[:1]
+        guess = f"did you mean {near[0]}?" if near else "docs/testing.md has the names"
+        return f"{where}: there is no such name in a suite, or in a claim of this kind; {guess}"
     if error["type"] == "missing":
         got = "nothing"
     if error["type"] == "too_short":
         got = "none"
     if error["type"] == "value_error":
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
-    return f"{where}: expected {EXPECTED.get(name, 'something else')}, got {got}"
+    return f"{where}: expected {EXPECTED.get(name, A_CLAIM)}, got {got}"

@@ -14,7 +14,7 @@ TABLE_HEADS = ("claim", "answer", "pictures", "why")
 
 TIME_OVER = "the time of the suite was over"
 STOPPED = "it was interrupted"
-NOT_TRIED = "not tried, since a counterexample failed; `all` goes on"
+NOT_TRIED = "not tried, since a counterexample failed"
 
 
 def statement(claim: AnyClaim, config: SceneConfig) -> str:
@@ -102,7 +102,9 @@ def table_rows(result: SuiteResult) -> list[list[str]]:
 
 def answer_text(one: ClaimAnswer) -> str:
     """Return the answer, with what was expected where that is another one."""
-    return one.answer + ("" if one.answer == one.expected else f" (expected: {one.expected})")
+    if one.expected == HELD:
+        return one.answer
+    return f"{one.answer} ({'as expected' if one.answer == one.expected else f'expected: {one.expected}'})"
 
 
 def suite_text(result: SuiteResult) -> str:
