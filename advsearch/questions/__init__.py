@@ -1,5 +1,5 @@
-"""Questions that are rooms of their own: all that belongs to one question in one folder, each file of the layer that its
-name says (docs/design.md, "Rooms, and who may know whom")."""
+"""Questions that are rooms of their own: all that belongs to one question in one folder, each file of the layer that
+its name says (docs/design.md, "Rooms, and who may know whom")."""
 
 from __future__ import annotations
 

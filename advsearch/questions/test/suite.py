@@ -173,7 +173,7 @@ def suite_of(data: Mapping[str, object], where: str) -> Suite:
     """
     given = {name: value for name, value in data.items() if name not in ("schema", "command")}
     try:
-        return Suite(**given)  # type: ignore[arg-type]
+        return Suite(**given)
     except ValidationError as error:
         found = error.errors(include_url=False)
         first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])  # a slip in a name
