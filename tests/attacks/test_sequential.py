@@ -68,7 +68,7 @@ def test_the_true_mean_is_excluded_at_any_time_less_often_than_the_error(share: 
 
 
 def test_what_is_no_share_is_refused() -> None:
-    with pytest.raises(InputError, match="from 0 to 1, got 1.5"):
+    with pytest.raises(InputError, match=r"from 0 to 1, got 1\.5"):
         of(1.5)
     with pytest.raises(InputError, match="confidence: expected a number between 0 and 1"):
         ConfidenceSequence(95.0)

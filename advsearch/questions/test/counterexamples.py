@@ -204,8 +204,8 @@ def _read(path: Path) -> Counterexample:
         raise FileFormatError(f"{path}: expected a counterexample, got one with {got}; remove it") from None
     except (OSError, ValueError, lzma.LZMAError) as error:
         raise FileFormatError(f"{path}: expected a counterexample, got {str(error)[:80]}; remove it") from None
-    if len(offsets) != kept.numbers:
-        raise FileFormatError(f"{path}: expected {kept.numbers} numbers, got {len(offsets)}; remove it")
+    if len(offsets) != kept.numbers or not unpack.eof:
+        raise FileFormatError(f"{path}: expected {kept.numbers} numbers, got others; remove it")
     try:
         config = AttackConfig(**kept.settings)
     except InputError as error:
