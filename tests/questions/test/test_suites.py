@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -33,6 +34,10 @@ SEARCH: dict[str, Any] = {
     "controls": {"texture": {"resolution": 32}}, "steps": 4, "trials": 6, "spp": 2, "verify_spp": 2, "baseline": False,
     "measure": "no", "specialise": False,
 }  # fmt: skip
+
+
+QUICK = {**SEARCH, "policy": "random", "steps": 8}
+"""Without derivatives, whose kernels take seconds to compile."""
 
 
 def claim(kind: str, controls: dict[str, Any] = FRONT, **more: Any) -> dict[str, Any]:
@@ -107,13 +112,13 @@ def test_the_command_repeats_a_claim_alone(tested: tuple[SuiteResult, Path], tmp
 
 def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_safe(tmp_path: Path) -> None:
     claims = {
-        "little": {"claim": "not_broken", "settings": {**SEARCH, "epsilon": 0.001}},
-        "much": {"claim": "not_broken", "settings": {**SEARCH, "epsilon": 0.3}},
+        "little": {"claim": "not_broken", "settings": {**QUICK, "controls": {"camera": {"azimuth": [-20, 20]}}}},
+        "much": {"claim": "not_broken", "settings": {**QUICK, "controls": {"camera": {"azimuth": [0, 360]}}}},
     }
     result = carry_out(SuiteConfig(suite=written(tmp_path, claims), run=str(tmp_path / "run")))
     little, much = result.claims
     assert (little.answer, much.answer) == ("held", "failed")
-    assert little.reason.startswith("not broken by 4 steps of auto") and "no proof" in little.reason
+    assert little.reason.startswith("not broken by 8 steps of random") and "no proof" in little.reason
     assert "wrong in 6 of 6 trials, most often a vase" in much.reason
     assert much.picture == "parts/much/images/adversarial.png" and (tmp_path / "run" / much.picture).is_file()
 
@@ -297,7 +302,23 @@ def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(
 
 def test_a_search_and_a_suite_can_be_asserted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert assert_not_broken(advsearch.load_scene("mug"), always(), **SMALL, **SEARCH, epsilon=0.3).status == 0
+    assert assert_not_broken(advsearch.load_scene("mug"), always(), **SMALL, **QUICK).status == 0
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
     with pytest.raises(AssertionError, match=r"too-few: undecided: .*(\n.*)*again: advsearch test"):
         assert_suite(suite)
+
+
+def test_the_pytest_file_of_the_docs_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test in it, beside the suite of the same page; with fewer steps, and less to show, than on the page."""
+    page = (Path(__file__).resolve().parents[3] / "docs" / "testing.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    (suite,) = re.findall(r"^```yaml\n(# suite\.yaml\n.*?)^```$", page, re.M | re.S)
+    Path("suite.yaml").write_text(suite.replace("at_least: 0.95", "at_least: 0.6").replace("64", "48"))
+    (code,) = re.findall(r"^```python\n(# test_robustness\.py\n.*?)^```$", page, re.M | re.S)
+    names: dict[str, Any] = {}
+    exec(compile(code.replace("steps=20", 'steps=2, policy="random"'), "testing.md", "exec"), names)
+    tests = [one for name, one in names.items() if name.startswith("test_")]
+    assert len(tests) == 3
+    for one in tests:
+        one()
+    assert len(list(Path("runs").iterdir())) == 3, "each keeps its run"
