@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
 from xml.etree import ElementTree
 
 from advsearch import __version__
@@ -65,13 +68,21 @@ def sarif(result: SuiteResult) -> str:
         {"id": kind, "shortDescription": {"text": MEANINGS[kind]}, "defaultConfiguration": {"level": "error"}}
         for kind in kinds
     ]
+    lines = Path(result.suite).read_text("utf-8").splitlines() if Path(result.suite).is_file() else []
     results = [
         {
             "ruleId": one.kind,
             "ruleIndex": kinds.index(one.kind),
             "level": "error" if one.answer == FAILED else "warning",
             "message": {"text": f"{one.name}: {one.answer}: {one.reason}. Claimed: {one.statement}."},
-            "locations": [{"physicalLocation": {"artifactLocation": {"uri": _uri(result.suite)}}}],
+            "locations": [
+                {
+                    "physicalLocation": {
+                        "artifactLocation": {"uri": quote(result.suite)},
+                        "region": {"startLine": _line_of(one.name, lines)},
+                    }
+                }
+            ],
             "partialFingerprints": {"claim/v1": one.name},
             "baselineState": "unchanged" if one.accepted else "new",
             "properties": {name: value for name, value in _properties(result, one).items() if value},
@@ -108,10 +119,10 @@ def _xml(text: str) -> str:
     return re.sub(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
 
 
-def _uri(path: str) -> str:
-    from urllib.parse import quote
-
-    return quote(path)
+def _line_of(name: str, lines: Sequence[str]) -> int:
+    """The line of a suite's file, from 1, in which a claim begins; the first for what stands elsewhere."""
+    begins = re.compile(rf"\s+{re.escape(name)}\s*:")
+    return next((number for number, line in enumerate(lines, start=1) if begins.match(line)), 1)
 
 
 def _plain(text: str) -> str:
@@ -119,6 +130,5 @@ def _plain(text: str) -> str:
     return re.sub(r"([\\`*_{}\[\]<>#|])", r"\\\1", " ".join(text.split()))
 
 
-def _line(cells: object) -> str:
-    listed = [str(cell) for cell in cells]  # type: ignore[attr-defined]
-    return "| " + " | ".join(one if one == "---" else _plain(one) for one in listed) + " |"
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(one if one == "---" else _plain(one) for one in cells) + " |"

@@ -218,6 +218,8 @@ def test_the_command_writes_what_machines_read_and_its_status_is_the_answer(
     for one in run["results"]:
         assert run["tool"]["driver"]["rules"][one["ruleIndex"]]["id"] == one["ruleId"]
         assert one["message"]["text"] and one["baselineState"] == "new"
+        line = one["locations"][0]["physicalLocation"]["region"]["startLine"]
+        assert Path(suite).read_text().splitlines()[line - 1].strip() == f"{one['partialFingerprints']['claim/v1']}:"
     text = Path("out.md").read_text()
     assert "| behind | failed |" in text and "advsearch test --suite" in text
     assert main(["test", suite, "--code", EASY, "--only", "too-few", "--quiet"]) == 2
