@@ -54,6 +54,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     """Print the answer of a run, or how far one has come that has none yet, and draw its pictures if wanted."""
     import importlib
 
+    from advsearch.cli.main import COMMANDS
     from advsearch.runs.directory import find_run
     from advsearch.runs.listing import listed_run
     from advsearch.runs.summary import NAME, read_result
@@ -62,7 +63,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     if not (path / NAME).is_file():
         return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
-    answer = importlib.import_module(f"advsearch.cli.{result.command}").answer
+    answer = importlib.import_module(COMMANDS[result.command]).answer
     photos = photos_of(path)
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)

@@ -222,6 +222,8 @@ def test_the_command_writes_what_machines_read_and_its_status_is_the_answer(
         assert Path(suite).read_text().splitlines()[line - 1].strip() == f"{one['partialFingerprints']['claim/v1']}:"
     text = Path("out.md").read_text()
     assert "| behind | failed |" in text and "advsearch test --suite" in text
+    assert main(["show", str(said["run"])]) == 0
+    assert "too-few" in capsys.readouterr().out
     assert main(["test", suite, "--code", EASY, "--only", "too-few", "--quiet"]) == 2
     assert main(["test", suite, "--quiet"]) == 2, "code that a file names is not run unless it is named"
     assert "code=small_models:easy" in capsys.readouterr().err.replace("--code ", "code=")
