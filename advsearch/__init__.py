@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from advsearch.engine.loading import load_scene as load_scene
     from advsearch.engine.sweeps.answer import SweepResult as SweepResult
     from advsearch.models import Model as Model
+    from advsearch.questions.compare.carry_out import compare as compare
 
 __version__ = "0.1.0"
 
@@ -48,6 +49,7 @@ _HOMES = {
     "SweepResult": "advsearch.engine.sweeps.answer",
     "attack": "advsearch.api.attack",
     "check": "advsearch.api.check",
+    "compare": "advsearch.questions.compare.carry_out",
     "explain": "advsearch.api.explain",
     "gap": "advsearch.api.gap",
     "harden": "advsearch.api.harden",

@@ -121,9 +121,9 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
         InputError: anything that the caller can put right.
     """
     __tracebackhide__ = True
-    from advsearch.config import SuiteConfig
     from advsearch.engine.turn import in_turn
     from advsearch.questions.test.carry_out import test_from_config
+    from advsearch.questions.test.settings import SuiteConfig
 
     with in_turn():
         result = test_from_config(SuiteConfig(**{"suite": str(suite), **settings}))
@@ -144,7 +144,6 @@ def _asserted(
 ) -> SuiteResult:
     """Try a suite of one claim, and raise what its answer says."""
     __tracebackhide__ = True
-    from advsearch.config import SuiteConfig
     from advsearch.engine.loading import (
         CONTROL,
         MODEL,
@@ -158,6 +157,7 @@ def _asserted(
     from advsearch.engine.naming import exists_here, model_name
     from advsearch.engine.turn import in_turn
     from advsearch.questions.test.carry_out import test_from_config
+    from advsearch.questions.test.settings import SuiteConfig
     from advsearch.questions.test.suite import suite_of
 
     name = str(claim["claim"]).replace("_", "-")

@@ -73,7 +73,8 @@ def step_seconds(model: Model, chosen: list[Lesson], repetitions: int) -> list[f
     """Medians of seconds of a step, in float32 and as it is."""
     timed: list[list[float]] = [[], []]
     made = trainable(model)
-    courses = [Course(one, model, 1e-6, 1, 0) for one in (InSinglePrecision(made.net, made.model), made)]
+    config = HardenConfig(rate=1e-6, epochs=1, views=6)
+    courses = [Course(one, model, config) for one in (InSinglePrecision(made.net, made.model), made)]
     for _ in range(1 + repetitions):
         for kept, course in zip(timed, courses, strict=True):
             begun = time.perf_counter()

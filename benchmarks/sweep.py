@@ -30,12 +30,11 @@ threads.configure()
 
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.controls import Space  # noqa: E402
-from advsearch.engine.loading import PictureSettings, as_controls, framed, load_scene  # noqa: E402
+from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
 from advsearch.engine.sweeps import swept_scene  # noqa: E402
 from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
 from advsearch.engine.sweeps.job import Job, NamedScene  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
-from advsearch.engine.verifier import ladder_of  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
@@ -146,26 +145,7 @@ def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
     axes = read_axes(config.grid, drawn)
     place = NamedScene("mug", "studio", load_scene("mug", "studio"))
     task = Classification().on(model)
-    return Job(
-        object="mug",
-        environment="studio",
-        task=config.task_name,
-        label=None,
-        pictures=PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed),
-        spp=config.search_spp,
-        places=(place,),
-        models=(model,),
-        tasks=(task,),
-        controls=drawn,
-        axes=axes,
-        samples=config.samples or 1,
-        sampler=config.sampler,
-        batch=config.batch,
-        trials=config.trials,
-        ladder=ladder_of(config.pixel_sampler, config.verify_spp),
-        command_line=config.command_line(),
-        warnings=(),
-    )
+    return Job(config, (place,), (model,), (task,), drawn, axes)
 
 
 # ---- beside rendering -----------------------------------------------------------------------------------------------
@@ -215,8 +195,8 @@ class Bare:
         inputs = [self.scene.assembly(self.space.inputs(one)) for one in u]
         begun = time.perf_counter()
         with torch.no_grad():
-            for begin in range(0, count, job.batch):
-                numbers = range(begin, min(count, begin + job.batch))
+            for begin in range(0, count, job.config.batch):
+                numbers = range(begin, min(count, begin + job.config.batch))
                 job.models[0](torch.stack([self.picture(inputs[n], n, job.spp) for n in numbers]))
         return time.perf_counter() - begun
 

@@ -26,6 +26,7 @@ from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
+from advsearch.questions.compare.answer import CompareResult
 from advsearch.questions.test.answer import SuiteResult
 from advsearch.recipes.description import recipe_names as recipe_names
 from advsearch.runs.results.attack import AttackSummary
@@ -468,6 +469,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("questions.md", "gap-fields"): result_fields(GapResult),
     ("questions.md", "region-fields"): result_fields(RegionResult),
     ("explain.md", "explain-fields"): result_fields(ExplainResult),
+    ("compare.md", "compare-fields"): result_fields(CompareResult),
     ("harden.md", "harden-fields"): result_fields(HardenResult),
     ("testing.md", "test-fields"): result_fields(SuiteResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
-from advsearch.scene.formation import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import mesh_part
 
 from .environments import ENVIRONMENTS

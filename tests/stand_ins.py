@@ -58,7 +58,6 @@ class StandInProblem:
     rule: Rule = WORST_CASE
     spp: int = 4
     search_depth: int | None = None
-    printable: bool = False
     seed: int = 3
     steps: int = 0
     draws: int = 1

@@ -30,6 +30,7 @@ COMMON = {
     "options",
     "pictures",
     "registry",
+    "rooms",
     "seeds",
     "threads",
     "progress",
@@ -83,14 +84,16 @@ RULES = {
     "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
     "explanations": Rule({"attacks", "recipes", "config", "settings"}, {"numpy", "scipy"}, HEAVY),
-    # the lists of questions come after what they list
-    "questions": Rule({"config", "runs"}, set()),
     "recipes": Rule({"attacks", "runs", "report", "config", "settings"}, {"matplotlib", "pydantic"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
+    "questions": Rule(
+        {"api", "attacks", "config", "engine", "explanations", "recipes", "report", "runs", "settings", "viewer"},
+        {"numpy", "pydantic", "torch", "typing_extensions"},
+    ),
+    "testing": Rule({"questions", "engine", "config"}, set()),
     "api": Rule(None),
     "cli": Rule(None),
-    "testing": Rule(None),
-    "": Rule({"api", "engine", "losses", "models", "testing"}, set()),
+    "": Rule({"api", "engine", "losses", "models", "questions", "testing"}, set()),
 }
 """As in docs/design.md, "Rooms, and who may know whom". The empty name is `advsearch/__init__.py`."""
 
@@ -133,24 +136,14 @@ def imports(module: str, path: Path) -> frozenset[str]:
     return frozenset(names)
 
 
-LAYERS = {
-    **{"settings": "config", "suite": "config", "answer": "runs", "words": "report", "machines": "report"},
-    **{"page": "viewer", "carry_out": "api", "claims": "api", "counterexamples": "api", "command": "cli"},
-}
-"""The room whose rule holds for a file of a question that is a room of its own, by the file's name."""
-
-
 def room(module: str) -> str:
     """The room of one of our modules: the first name below `advsearch`; empty for the package itself.
 
-    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room. A file of a question's
-    room belongs to the layer that its name says; the lists of questions are of the settings'.
+    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room; so does the command of
+    a question.
     """
     name = module.split(".")[1] if "." in module else ""
-    if name == "questions":
-        file = module.split(".")[3:]
-        return LAYERS[file[0]] if file else "questions"
-    if name == "__main__":
+    if name == "__main__" or (name == "questions" and module.endswith(".command")):
         return "cli"
     folder = SOURCES["advsearch"]
     return name if name == "bundled" or (folder / name).is_dir() or (folder / f"{name}.py").is_file() else ""
@@ -307,7 +300,7 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
 # -- what is shipped -------------------------------------------------------------------------------------------------
 
 
-NOT_MESSAGES = ("advsearch.cli", "advsearch.settings", "advsearch.report.style", "advsearch.scene.importing.blender")
+NOT_MESSAGES = ("advsearch.settings", "advsearch.report.style", "advsearch.scene.importing.blender")
 """Modules that read or write flags themselves, also those of another program, and a style sheet."""
 
 

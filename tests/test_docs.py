@@ -56,19 +56,19 @@ from advsearch.config import (
     ReplayConfig,
     SceneConfig,
     StabilityConfig,
-    SuiteConfig,
     SweepConfig,
 )
 from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.config.hardening import ALL
 from advsearch.controls import CONTROLS, texture
-from advsearch.engine import stages
+from advsearch.engine import run_settings, stages
 from advsearch.engine.loading import as_controls
-from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
+from advsearch.questions.compare.settings import CompareConfig
+from advsearch.questions.test.settings import SuiteConfig
 from advsearch.questions.test.suite import read_suite
 from advsearch.recipes.description import read_recipe
 from advsearch.recipes.description import recipe_names as recipes
@@ -387,6 +387,9 @@ def check_names(config: Config) -> None:
     if isinstance(config, StabilityConfig):
         chosen(config.cases, config.groups)
         return
+    if isinstance(config, CompareConfig) and not config.object:
+        assert config.pictures >= 0
+        return
     if isinstance(config, ExplainConfig):
         assert config.confirm >= 0
         return
@@ -400,10 +403,8 @@ def check_names(config: Config) -> None:
         assert config.recipe in ("list", "mine.yaml") or planned(read_recipe(config.recipe), config)
         return
     assert isinstance(config, SceneConfig)
-    over = getattr(config, "over", {})
-    shared = RunSettings(getattr(config, "epsilon", None), getattr(config, "norm", None), config.texture_resolution)
-    shared.check(config.controls, over)
-    shared.given_to(config.controls)
+    run_settings.check(config)
+    run_settings.given_to(config, config.controls)
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:

@@ -47,6 +47,24 @@ WALKS = {
 }
 """What is typed for each walk."""
 
+AROUND = (
+    "models/reference.py",
+    "attacks/policies/",
+    "attacks/search.py",
+    "attacks/candidates.py",
+    "attacks/domain.py",
+    "engine/searches.py",
+    "engine/journal.py",
+    "engine/memory.py",
+    "engine/record.py",
+    "engine/rows.py",
+    "engine/machines.py",
+    "runs/",
+    "cli/",
+    "progress.py",
+)
+"""The network, the policy, the search loop and the log: what goes around the evaluation itself."""
+
 Step = tuple[str, str]
 """File and function."""
 
@@ -208,8 +226,11 @@ def table(package: Path) -> Iterator[str]:
     trees, ran = trees_of(package), set[Step]()
     for name, command in WALKS.items():
         tracer = traced(command, package)
-        calls, several, files, changes = figures(tracer.walk())
-        yield f"{name:<60}{calls:>7}{several:>11}{files:>7}{changes:>9}"
+        walked = tracer.walk()
+        alone = [step for step in walked if not step[0].startswith(AROUND)]
+        for said, steps in ((name, walked), ("  without network, policy, loop and log", alone)):
+            calls, several, files, changes = figures(steps)
+            yield f"{said:<60}{calls:>7}{several:>11}{files:>7}{changes:>9}"
         ran = ran or set(tracer.steps)
     judging = calling(trees, "judge")
     asking = set(calling(trees, "model", "models", "network"))

@@ -1,4 +1,4 @@
-"""Every question as a function, each in a module called as its command or in a room of its own (`questions/`).
+"""Every question as a function, each in a module called as its command; `import advsearch` offers them all.
 
 Each module also has a function that ends in `_from_config`, by which `carry_out` does what a file or a command line
 says.
@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from advsearch import rooms
 from advsearch import threads as threads  # before torch: it sets how OpenMP waits
 
 if TYPE_CHECKING:
@@ -31,15 +32,14 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
     Raises:
         InputError: anything that whoever asked can put right; nothing is written then.
     """
-    from advsearch.questions import ROOMS
     from advsearch.runs.directory import begun
     from advsearch.runs.results.base import Result
 
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
-        room = f"questions.{config.command}.carry_out" if config.command in ROOMS else f"api.{config.command}"
-        module = import_module(f"advsearch.{room}")
-        answer = getattr(module, f"{config.command}_from_config")(
+        name = f"{config.command}_from_config"
+        own = rooms.in_room(config.command, "carry_out", name)
+        answer = (own or getattr(import_module(f"advsearch.api.{config.command}"), name))(
             config, progress=progress, **({} if folder is None else {"resumed": folder})
         )
     result: Result = answer if isinstance(answer, Result) else answer.summary

@@ -18,12 +18,13 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_object
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
-from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig
+from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig, SweepConfig
 from advsearch.config.attack import OVER_NUMBERS, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
+from advsearch.engine import run_settings
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
 from advsearch.engine.attack_result import AttackParts, AttackResult
 from advsearch.engine.going_on import check_made_of
@@ -31,7 +32,6 @@ from advsearch.engine.journal import Journal
 from advsearch.engine.loading import (
     SCENE,
     Controls,
-    PictureSettings,
     Scene,
     framed,
     lent,
@@ -51,6 +51,7 @@ from advsearch.engine.naming import (
     exists_here,
     load_models,
     model_name,
+    scene_of,
     scene_settings,
     several,
 )
@@ -59,7 +60,6 @@ from advsearch.engine.outcome import summarise
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.stages import Attack
 from advsearch.engine.transport import CleanMatrix, reason_against
@@ -348,7 +348,7 @@ def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, se
         check_not_of_scene({**settings, "object": object})
         return scene
     said = SceneConfig(**{"object": "mug", **{name: one for name, one in settings.items() if name in OF_SCENE}})
-    given = scene_settings(said.set_, said.exposure)
+    given = scene_settings(said)
     if object is not None:
         return load_scene(object, said.environment, scene=scene, up=said.up, settings=given, camera=said.camera)
     if isinstance(scene, Mapping):
@@ -391,10 +391,7 @@ def _job(config: AttackConfig) -> _Job:
     searched, drawn = _controls(config, config.controls, config.over)
     task, objective = _asked(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **_policy_options(config))
-    given = scene_settings(config.set_, config.exposure)
-    scene = lent(SCENE, config.object) or load_scene(
-        config.object, config.environment, up=config.up, settings=given, camera=config.camera
-    )
+    scene = lent(SCENE, config.object) or scene_of(config)
     model = _model(config.model, config, task)
     metrics = load_metrics(config.metrics)
     return _Job(config, scene, model, task, searched, drawn, objective, policy, True, metrics)
@@ -413,9 +410,9 @@ def _controls(
 ) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
     """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
     budget."""
-    shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
-    shared.check(config.controls, config.over)
-    return shared.given_to(searched), replace(shared, epsilon=None).given_to(drawn)
+    run_settings.check(config)
+    without_budget = config.model_copy(update={"epsilon": None})
+    return run_settings.given_to(config, searched), run_settings.given_to(without_budget, drawn)
 
 
 def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tuple[Task, Wanted]:
@@ -444,12 +441,12 @@ def check_from_config(config: AttackConfig) -> None:
         InputError: as for `attack_from_config`.
     """
     job = _job(config)
-    _, _, pictures = _task(job, shows=False)
-    _space(job, framed(job.scene.description, pictures.size(job.loaded[0])))
+    _task(job, shows=False)
+    _space(job, framed(job.scene.description, config.resolution or job.loaded[0].input_size))
 
 
-def _task(job: _Job, *, shows: bool = True) -> tuple[Task, Callable[[Described, Looked], Facts], PictureSettings]:
-    """The task on the model, what gives it facts, and how pictures are made; refuses what cannot be judged.
+def _task(job: _Job, *, shows: bool = True) -> tuple[Task, Callable[[Described, Looked], Facts]]:
+    """The task on the model, and what gives it facts; refuses what cannot be judged.
 
     With `shows`, the task is shown a clean picture where it asks for one.
     """
@@ -457,16 +454,15 @@ def _task(job: _Job, *, shows: bool = True) -> tuple[Task, Callable[[Described, 
     asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
     task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
     facts = partial(facts_of, job.scene, config.object, config.label)
-    pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
     alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
     tasks = list[Task]()
     for one, network in alone:
         known = task.told(one, facts(dict)) if isinstance(task, Together) else facts(dict)
-        check_truth(one, network, job.scene, known, pictures)
-        tasks.append(shown(one, network, [job.scene], config.label, pictures) if shows else one)
+        check_truth(one, network, job.scene, known, config)
+        tasks.append(shown(one, network, [job.scene], config) if shows else one)
         job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
     task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
-    return task, facts, pictures
+    return task, facts
 
 
 def _space(job: _Job, description: SceneDescription) -> Space:
@@ -477,8 +473,8 @@ def _space(job: _Job, description: SceneDescription) -> Space:
 def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
-    task, facts, pictures = _task(job)
-    resolution = pictures.size(model)
+    task, facts = _task(job)
+    resolution = config.resolution or model.input_size
     description = framed(description, resolution)
     space = _space(job, description)
     renderer = make_renderer(
@@ -509,7 +505,6 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
         next_count(config.pixel_sampler, config.search_spp),
         config.seed,
         searched=len(job.controls),
-        printable=config.printable,
         aovs=aovs_of(config.aov),
         metrics=job.metrics,
     )
@@ -569,7 +564,7 @@ def answering_of(settings: JsonObject) -> Call:
 
 
 def executor_for(
-    config: AttackConfig | PrecisionConfig, function: str, progress: Progress, *, ahead: bool = True
+    config: AttackConfig | PrecisionConfig | SweepConfig, function: str, progress: Progress, *, ahead: bool = True
 ) -> AbstractContextManager[Executor | None]:
     """Return what carries out a function of a configuration, as its workers and cluster say; None for this process.
 

@@ -14,6 +14,7 @@ from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import CheckKeywords, asks, configured
 from advsearch.config import CheckConfig
 from advsearch.controls import CONTROLS
+from advsearch.engine import run_settings
 from advsearch.engine.gradients import (
     FACTORS,
     Estimate,
@@ -41,7 +42,6 @@ from advsearch.engine.planning import (
     tuned,
 )
 from advsearch.engine.problem import Problem
-from advsearch.engine.run_settings import RunSettings
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.check import (
@@ -176,7 +176,6 @@ def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
     if not config.all:
         yield config
         return
-    shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
     for object, environment in SCENES:
         for control in CONTROLS:
             if not CONTROLS[control].parameters:
@@ -191,7 +190,7 @@ def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
                     "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
                     "controls": {control: {}},
                     "label": None,
-                    **vars(shared.alone(control, {})),
+                    **run_settings.alone(config, control, {}),
                 }
             )
 

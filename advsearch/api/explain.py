@@ -409,7 +409,7 @@ def right_of(right: int, of: int) -> RightOf:
 
 def _rule_row(rule: CountedRule, factors: Sequence[Factor], confirmed: RightOf | None) -> RuleRow:
     return RuleRow(
-        conditions=_condition_rows(rule.conditions, factors),
+        conditions=condition_rows(rule.conditions, factors),
         **vars(right_of(rule.right, rule.of)),
         elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
         confirmed=confirmed,
@@ -417,11 +417,12 @@ def _rule_row(rule: CountedRule, factors: Sequence[Factor], confirmed: RightOf |
 
 
 def _envelope_row(one: Envelope, factors: Sequence[Factor], accuracy: float) -> EnvelopeRow:
-    rows = _condition_rows(one.conditions, factors)
+    rows = condition_rows(one.conditions, factors)
     return EnvelopeRow(conditions=rows, **vars(right_of(one.right, one.of)), accuracy=accuracy, held=one.held)
 
 
-def _condition_rows(conditions: RuleConditions, factors: Sequence[Factor]) -> list[ConditionRow]:
+def condition_rows(conditions: RuleConditions, factors: Sequence[Factor]) -> list[ConditionRow]:
+    """Return conditions with the names of their factors."""
     return [_condition_row(one, factors[one.place]) for one in conditions]
 
 
@@ -451,7 +452,7 @@ def _weights(importance: Sequence[FactorWeight], factors: Sequence[Factor]) -> l
 def _not_told(rule: CountedRule, found: Observations) -> RuleNotTold:
     times = rule.times_needed()
     return RuleNotTold(
-        conditions=_condition_rows(rule.conditions, found.factors),
+        conditions=condition_rows(rule.conditions, found.factors),
         **vars(right_of(rule.right, rule.of)),
         elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
         chance=rule.chance,

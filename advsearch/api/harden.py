@@ -33,6 +33,7 @@ from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.config import HardenConfig
 from advsearch.config.hardening import PLAIN_SCENES, RENDERED_SCENES
+from advsearch.engine import run_settings
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.hardening.lessons import Lesson
 from advsearch.engine.hardening.pictures import FOLDER
@@ -40,7 +41,6 @@ from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, Trainin
 from advsearch.engine.hardening.split import FURTHER, HELD_OUT, TRAINING, VALIDATION, Split, check_disjoint
 from advsearch.engine.hardening.training import Course, Examples, MakeOptimiser, right_share
 from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name
-from advsearch.engine.run_settings import RunSettings
 from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
 from advsearch.models.imported import split_weights
@@ -120,13 +120,12 @@ def _carry_out(
 ) -> HardenResult:
     begun = time.perf_counter()
     progress.stage(LOADING)
-    RunSettings(config.epsilon, config.norm, config.texture_resolution).check(config.controls)
+    run_settings.check(config)
     task = make_task(config.task)
     (loaded, *_), warnings = load_models([model], task, config)
     student = trainable(loaded, config.layers)
     splits = splits_of(config, loaded)
-    order = seeds.stream(config.seed, "order")
-    course = Course(student, loaded, config.rate, config.epochs, order, config.texture_looks, optimiser, beside)
+    course = Course(student, loaded, config, optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
         _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None})
         check_made_of(run, [loaded])
@@ -181,9 +180,8 @@ class Hardening:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.config = config = self.scenes.config
-        amounts = (config.scenes, config.views, config.clean_loss)
-        self.rounds = TrainingRounds(self.run, self.course, self._drawn, *amounts, self.progress)
+        self.config = self.scenes.config
+        self.rounds = TrainingRounds(self.run, self.course, self._drawn, self.progress)
         self.measured: dict[str, str] = json.loads(self.run.store.note(MEASURED) or "{}")
         self.clean: dict[str, Share] = {}
         self._executor: Executor = InProcess(self.scenes)
@@ -210,7 +208,7 @@ class Hardening:
                 self._measure("before", "attacking the model as it is")
                 self._measure("stronger_before", "attacking it with a stronger search", known="before")
             with self._timed("training"):
-                self.rounds.carry_out(self.config.rounds)
+                self.rounds.carry_out()
             with self._timed("measurement"):
                 weights = (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
                 self._measure("after", "attacking the hardened model", weights)

@@ -17,6 +17,7 @@ from advsearch.bundled.objects import OBJECTS
 from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import ALL
+from advsearch.engine import run_settings
 from advsearch.engine.hardening.lessons import Lesson, has_matrix, lessons, plain_lessons
 from advsearch.engine.hardening.split import (
     FURTHER,
@@ -30,7 +31,6 @@ from advsearch.engine.hardening.split import (
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.problem import Problem
-from advsearch.engine.run_settings import RunSettings
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -253,15 +253,14 @@ class SceneWork:
 
     @property
     def _set(self) -> Given:
-        return scene_settings(self.config.set_, self.config.exposure)
+        return scene_settings(self.config)
 
     def _of(self, controls: Sequence[str], name: str, **changes: object) -> AttackConfig:
         """What some of the controls are searched with, on an object of a name."""
         config, given = self.config, {control: self.config.controls[control] for control in controls}
-        shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
-        own: dict[str, object] = dict.fromkeys(vars(shared))
+        own: dict[str, object] = dict.fromkeys(run_settings.RUN_SETTINGS)
         for control in controls:
-            for setting, value in vars(shared.alone(control, given[control])).items():
+            for setting, value in run_settings.alone(config, control, given[control]).items():
                 before = own[setting]
                 if isinstance(before, Mapping) and isinstance(value, Mapping):
                     own[setting] = {**before, **value}

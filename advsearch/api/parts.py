@@ -15,8 +15,8 @@ from advsearch.api.attack import attack_once
 from advsearch.cluster.executor import Call, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import CONFIGS, AttackConfig, GapConfig
+from advsearch.engine import run_settings
 from advsearch.engine.naming import different
-from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
@@ -79,12 +79,11 @@ def chains_of(config: AttackConfig) -> list[Chain]:
 
 def _controls_of(config: GapConfig) -> Chain:
     """Every object with every control."""
-    shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
-    shared.check(config.controls, config.over)
+    run_settings.check(config)
     attacks = []
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
-            own = vars(shared.alone(control, settings))
+            own = run_settings.alone(config, control, settings)
             one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
             attacks.append(StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control))
     return attacks

@@ -21,9 +21,8 @@ from advsearch.attacks import clopper_pearson
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
 from advsearch.engine.answers import facts_of
-from advsearch.engine.loading import PictureSettings, load_scene
 from advsearch.engine.metrics import judgements
-from advsearch.engine.naming import load_models, scene_settings
+from advsearch.engine.naming import load_models, scene_of
 from advsearch.engine.rows import judged
 from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import check_all
@@ -213,22 +212,19 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
     if made.varies or made.looks:
         return _by_sweep(config) if isinstance(config, SweepConfig) else _by_attack(run, config)
     models, _ = load_models(config.models, made, config)
-    given, judges = scene_settings(config.set_, config.exposure), []
+    judges = []
     for model in models:
         task = made.on(model)
 
         def truth(rendering: str, name: str, task: Task = task) -> Truth:
-            scene = load_scene(name, up=config.up, settings=given, camera=config.camera)
-            return task.truth(facts_of(scene, name, config.label, dict))
+            return task.truth(facts_of(scene_of(config, name), name, config.label, dict))
 
         judges.append(
-            _PhotoJudge(config.objects[0], model, task, _size(config, model), len(models), truth, varies=False)
+            _PhotoJudge(
+                config.objects[0], model, task, config.resolution or model.input_size, len(models), truth, varies=False
+            )
         )
     return judges
-
-
-def _size(config: AttackConfig | SweepConfig, model: Model) -> tuple[int, int]:
-    return PictureSettings(config.resolution, "none", config.pixel_sampler, 0).size(model)
 
 
 def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
@@ -267,7 +263,9 @@ def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
         return own.truth(problem.facts(partial(problem.space.describe, whole), look))
 
     return [
-        _PhotoJudge(config.object, model, own, _size(config, model), len(alone[0]), partial(truth, own))
+        _PhotoJudge(
+            config.object, model, own, config.resolution or model.input_size, len(alone[0]), partial(truth, own)
+        )
         for model, own in zip(*alone, strict=True)
     ]
 

@@ -13,6 +13,8 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import RegionKeywords, asks, configured
+from advsearch.attacks.evaluation import most_at_once
+from advsearch.attacks.product import batches
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.journal import Journal
@@ -99,7 +101,7 @@ def region_from_config(
     varied = _varied(problem, config)
     centre = _centre(problem, config)
     with RunDirectory.of(config, resumed) as run:
-        verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config.pixel_sampler, config.verify_spp), stages)
+        verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config), stages)
         try:
             with interruptible():
                 answer, ending = _answer(verifier, config, varied, centre, run), "done"
@@ -264,8 +266,10 @@ def _map(verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: Ru
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
 
-    places = dict(enumerate(at(torch.stack([column, row])) for row in steps for column in steps))
-    scores = [trial.score for trial in verifier.trials("map", places, sought=False)]
+    scores = list[float]()
+    for numbers in batches(0, side * side, most_at_once(verifier.problem.domain.dim)):
+        places = {one: at(torch.stack([steps[one % side], steps[one // side]])) for one in numbers}
+        scores += [trial.score for trial in verifier.trials("map", places, sought=False)]
     margins = [scores[begin : begin + side] for begin in range(0, len(scores), side)]
     ends = [verifier.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []

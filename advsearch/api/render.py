@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 
 from advsearch.config import RenderConfig
-from advsearch.engine import rendering
-from advsearch.engine.loading import load_scene
-from advsearch.engine.naming import load_models, scene_settings
+from advsearch.engine import rendering, run_settings
+from advsearch.engine.naming import load_models, scene_of
 from advsearch.engine.rendering import Rendering as Rendering
-from advsearch.engine.rendering import writable
-from advsearch.engine.run_settings import RunSettings
+from advsearch.engine.rendering import pictures_of, writable
 from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
@@ -37,11 +35,9 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         if spec is not None and out.exists() and os.path.exists(spec) and out.samefile(spec):
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
     progress.stage("loading the scene and the model")
-    shared = RunSettings(texture_resolution=config.texture_resolution)
-    shared.check(config.controls)
-    controls = shared.given_to(config.controls)
-    given = scene_settings(config.set_, config.exposure)
-    scene = load_scene(config.object, config.environment, up=config.up, settings=given, camera=config.camera)
+    run_settings.check(config)
+    controls = run_settings.given_to(config, config.controls)
+    scene = scene_of(config)
     task = make_task(config.task)
     (model,), notes = load_models([config.model], task, config)
     rendering = render(
@@ -51,13 +47,10 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         label=config.label,
         controls=controls,
         around=config.around,
-        resolution=config.resolution,
         spp=config.spp,
-        denoise=config.denoise,
-        sampler=config.pixel_sampler,
-        seed=config.seed,
         aov=bool(aovs),
         progress=progress,
+        **pictures_of(config),
     )
     warnings = [*rendering.warnings, *notes]
     for text in warnings:

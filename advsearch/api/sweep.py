@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from advsearch.api.attack import LOADING, is_named
+from advsearch.api.attack import LOADING, executor_for, is_named
 from advsearch.api.keywords import SweepKeywords, asks
-from advsearch.cluster.executor import Call, Executor, Work
-from advsearch.cluster.opening import executor_of
+from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
+from advsearch.engine import run_settings
 from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.going_on import check_made_of
-from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, only_here, settings_of
+from advsearch.engine.loading import Controls, Scene, load_scene, named_camera, only_here, settings_of
 from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
 from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
@@ -30,16 +30,14 @@ from advsearch.engine.naming import (
     exists_here,
     load_models,
     model_name,
-    scene_settings,
+    scene_of,
     several,
 )
-from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
 from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
-from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -50,9 +48,8 @@ from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, fi
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import attack_of
 from advsearch.scene.description import ENVIRONMENT
-from advsearch.scene.formation import next_count
 from advsearch.scene.surfaces import aovs_of
-from advsearch.settings import FILES, split_names
+from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task
 from advsearch.tasks.own import OwnTask, function_of
 
@@ -62,11 +59,11 @@ if TYPE_CHECKING:
 OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
+BATCHES = "advsearch.api.sweep:batches_of"
+"""What a worker does."""
+
 CLEAN = "clean"
 """What the scene without the answer of a run is called beside that with it."""
-
-SAMPLES = 100
-"""Draws where there is no grid and nothing is said."""
 
 AnyScene = Scene | str | Path
 
@@ -169,7 +166,7 @@ def sweep(
         job = replace(job, metrics=load_metrics(config.metrics, metrics))
         if config.run is not None:
             return _kept(config, job, progress, folder)
-        with _executor(config, progress) as executor:
+        with executor_for(config, BATCHES, progress) as executor:
             return carry_out(job, None, progress, executor)
 
 
@@ -231,7 +228,7 @@ def _beside_answer(
     summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
     if summary.adversarial is None:
         raise InputError(f"answer_of: {folder} ended with {summary.ending!r}, so that there is no answer to sweep")
-    held = RunSettings(theirs.epsilon, theirs.norm, theirs.texture_resolution).given_to(theirs.controls)
+    held = run_settings.given_to(theirs, theirs.controls)
     varied = {control.name for control in drawn} | {axis.instance for axis in axes}
     if twice := sorted(varied & {control.name for control in held}):
         raise InputError(
@@ -276,9 +273,8 @@ def job_of(config: SweepConfig) -> Job:
 def _job(
     config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:
-    shared = RunSettings(texture_resolution=config.texture_resolution)
-    shared.check(config.controls)
-    drawn = shared.given_to(controls)
+    run_settings.check(config)
+    drawn = run_settings.given_to(config, controls)
     axes = read_axes(config.grid, drawn)
     if config.samples is not None and not drawn:
         raise InputError(
@@ -291,13 +287,11 @@ def _job(
             "`controls=pose` `samples=100`"
         )
     places = _beside_answer(config, places, drawn, axes)
-    samples = config.samples or (SAMPLES if drawn and not axes else 1)
     check_scenes(places, drawn, axes)
     made = make_task(task)
     networks, warnings = _models(models, config, made)
-    pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
     scenes = [place.scene for place in places]
-    tasks = tuple(shown(made.on(network), network, scenes, config.label, pictures) for network in networks)
+    tasks = tuple(shown(made.on(network), network, scenes, config) for network in networks)
     warnings += [remark for task in tasks for remark in task.remarks]
     own = {place.object: place.scene.description.object.label for place in places}
     warnings += one_label_for_several(networks, config.label, own)
@@ -307,37 +301,22 @@ def _job(
             described = control.prepare(described) if control.kind == ENVIRONMENT else described
         warnings += described.notes
     return Job(
-        object=config.object,
-        environment=config.lit_by,
-        task=config.task_name,
-        label=config.label,
-        pictures=pictures,
-        spp=next_count(config.pixel_sampler, config.search_spp),
+        config=config,
         places=tuple(places),
         models=networks,
         tasks=tasks,
         controls=drawn,
         axes=axes,
-        samples=samples,
-        sampler=config.sampler,
-        batch=config.batch,
-        trials=config.trials,
-        ladder=ladder_of(config.pixel_sampler, config.verify_spp),
-        command_line=config.command_line(),
-        warnings=tuple(dict.fromkeys(warnings)),
-        keep_pictures=config.keep_pictures,
-        specialise=config.specialise,
         aovs=aovs_of(config.aov),
-        surface=config.surface,
+        warnings=tuple(dict.fromkeys(warnings)),
     )
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
     """Every object under every environment; each is loaded once."""
-    given = scene_settings(config.set_, config.exposure)
     objects, environments = different(config.objects, "object"), different(config.environments, "environment")
     asked = environments[0] if config.environment else None
-    scenes = {name: load_scene(name, asked, up=config.up, settings=given, camera=config.camera) for name in objects}
+    scenes = {name: scene_of(config, name, asked) for name in objects}
     if asked is None:
         return tuple(NamedScene(name, scene.description.environment_name, scene) for name, scene in scenes.items())
     lights = {asked: scenes[objects[0]].description.environment}
@@ -372,7 +351,7 @@ def _stopped(config: SweepConfig) -> Path | None:
 
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
-    with RunDirectory.of(config, resumed) as run, _executor(config, progress) as executor:
+    with RunDirectory.of(config, resumed) as run, executor_for(config, BATCHES, progress) as executor:
         functions = {f"metric {name}": one for name, one in job.metrics.items()}
         check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
         return carry_out(job, run, progress, executor)
@@ -386,10 +365,3 @@ def batches_of(settings: JsonObject) -> Call:
     job = job_of(SweepConfig(**settings))
     points, _ = check_all(job)
     return Batches(job, points.count)
-
-
-def _executor(config: SweepConfig, progress: Progress) -> AbstractContextManager[Executor | None]:
-    """What carries out the batches; None for this process."""
-    settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
-    work = Work("advsearch.api.sweep:batches_of", settings, FILES, config.used_threads or 1)
-    return executor_of(work, workers=config.workers, cluster=config.cluster, tell=progress.message)

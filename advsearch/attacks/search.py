@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -218,9 +217,9 @@ class _Log:
     renders: int = 0
     before: Tensor | None = None
     agreement: list[float] = field(default_factory=list)
-    answer: Callable[[], Distribution | None] = lambda: None
-    failures: Callable[[], Failures | None] = lambda: None
-    counts: Callable[[], Counts] = lambda: NO_COUNTS
+    policy: Policy[Any] | None = None
+    state: Any = None
+    told: list[tuple[Tensor, Evaluation]] = field(default_factory=list)
 
     def evaluated(self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase) -> Iterator[Evaluation]:
         """Have proposals evaluated, each with the seed of an index, and take note of each as it comes."""
@@ -284,7 +283,8 @@ class _Log:
 def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) -> Ending:
     """Let the policy propose until the budget is spent or something ends it sooner; return what."""
     generator = torch.Generator().manual_seed(stream(seed, "search"))
-    name, policy = policy.name, with_choices(policy, log.domain)
+    name = policy.name
+    policy = log.policy = with_choices(policy, log.domain)
     state = policy.start(log.domain, generator, steps)
     in_a_row, most = 0, most_at_once(log.domain.dim)
     while log.renders < steps:
@@ -300,23 +300,19 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
             if left > 0:
                 batch.append(affordable(proposal, log.domain, left))
                 left -= batch[-1].cost(log.domain)
-        told, over, first = list[tuple[Tensor, Evaluation]](), False, len(log.records)
+        log.state, log.told, over, first = state, [], False, len(log.records)
         answers = log.evaluated(batch, range(first, first + len(batch)), "search")
         for proposal, evaluation in zip(batch, answers, strict=True):
-            told.append((proposal.u, evaluation))
+            log.told.append((proposal.u, evaluation))
             in_a_row = 0 if evaluation.finite else in_a_row + 1
             if in_a_row == NON_FINITE_LIMIT:
                 return Ending.NON_FINITE
             if over := late(len(log.records)):
                 break
-        if log.renders >= steps:  # nothing comes of the last one
-            told.pop()
-        if told:
-            state = policy.update(state, told)
-            log.answer, log.counts = partial(policy.answer, state), partial(policy.counts, state)
-            log.failures = partial(policy.failures, state)
         if over:
             break
+        state = log.state = policy.update(state, log.told)
+        log.told = []
     return Ending.BUDGET_SPENT
 
 
@@ -351,6 +347,9 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         ending = Ending.BUDGET_SPENT
     else:
         ending = Ending.FOUND if found else stopped
+    policy, state = (log.policy, log.state) if log.state is not None else (None, None)
+    if policy is not None and log.told:  # a batch that was cut
+        state = policy.update(state, log.told)
     return SearchResult(
         best_u=answer.u,
         best_objective=answer.believed if math.isfinite(answer.believed) else math.nan,
@@ -366,9 +365,9 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         non_finite_elements=sum(r.non_finite for r in log.records),
         seconds=seconds,
         agreement=tuple(log.agreement),
-        counts=log.counts(),
-        distribution=log.answer(),
-        failures=log.failures(),
+        counts=NO_COUNTS if policy is None else policy.counts(state),
+        distribution=None if policy is None else policy.answer(state),
+        failures=None if policy is None else policy.failures(state),
     )
 
 

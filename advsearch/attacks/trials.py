@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from scipy.special import betaincinv, ndtri
+from scipy.special import bdtr, betaincinv, ndtri
 
 from advsearch.errors import InputError
 
@@ -73,6 +73,28 @@ def paired_difference(both: int, first: int, second: int, neither: int) -> tuple
     up = high - shares[0], shares[1] - other_low
     below, above = (math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b)) for a, b in (down, up))
     return p - q, (max(-1.0, p - q - below), min(1.0, p - q + above))
+
+
+def mcnemar(first: int, second: int) -> float:
+    """Return how likely it is that of pairs in which one outcome alone happens, chance splits so many so unevenly.
+
+    The exact test of McNemar (1947, "Note on the sampling error of the difference between correlated proportions or
+    percentages"): the pairs in which both happen, or none, say nothing about which happens more often, and the others
+    are throws of a fair coin where none does. Two-sided: twice the smaller tail of the binomial distribution.
+
+    Args:
+        first: pairs in which the first alone happens.
+        second: in which the second alone does.
+
+    Returns:
+        In (0, 1]; 1 without such pairs.
+
+    Raises:
+        InputError: one is less than 0.
+    """
+    if min(first, second) < 0:
+        raise InputError(f"pairs: expected numbers from 0, got {first} and {second}")
+    return min(1.0, 2.0 * float(bdtr(min(first, second), first + second, 0.5))) if first + second else 1.0
 
 
 def _wilson(share: float, n: int) -> tuple[float, float]:

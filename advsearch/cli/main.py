@@ -32,6 +32,7 @@ GROUPS = {
         "gap": "advsearch.cli.gap",
         "region": "advsearch.cli.region",
         "explain": "advsearch.cli.explain",
+        "compare": "advsearch.questions.compare.command",
         "recipe": "advsearch.cli.recipe",
         "harden": "advsearch.cli.harden",
     },

@@ -18,7 +18,7 @@ HELP = "do what a YAML file describes; the run.yaml of a run repeats it"
 
 COMMANDS = (
     *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden", "explain"),
-    "test",
+    *("compare", "test"),
 )
 """What the `command` of a file may say."""
 
@@ -90,10 +90,10 @@ def run_file(
     Raises:
         UnknownNameError: there is no such command.
     """
-    from advsearch.cli.main import COMMANDS as MODULES
+    from advsearch.cli import main
     from advsearch.registry import only_named_code
 
     config = config_of_file(command, file, changes)
-    module = importlib.import_module(MODULES[command])
+    module = importlib.import_module(main.COMMANDS[command])
     with only_named_code(file, args.code):
         return int(module.COMMAND.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))

@@ -102,6 +102,7 @@ class Coordinator:
         self._next_ticket = self._under_way = 0
         self._todo: deque[_Range] = deque()
         self._given: Sequence[Any] | None = None
+        self._call = 0
         self._events: deque[Event] = deque()
         self._free: deque[_Worker] = deque()
         self._per_number: deque[float] = deque(maxlen=MEDIAN_OF)
@@ -114,12 +115,16 @@ class Coordinator:
         Raises:
             ClusterError: nobody can carry them out, or the scheduler has gone.
         """
-        source, self._given = iter(ranges), given
+        self._let_go()  # what an earlier call has left under way
+        self._call += 1
+        call, source, self._given = self._call, iter(ranges), given
         self._per_number.clear()  # those before may have taken other times
         if not self._workers:
             self._alone_since = self._clock()
         try:
             while True:
+                if call != self._call:
+                    raise RuntimeError("these results were given up when others were asked for")
                 self._give_out(source)
                 if not self._todo and not self._under_way:
                     numbers = next(source, None)  # there may be more, and nobody yet who is ready for it
@@ -133,10 +138,15 @@ class Coordinator:
                 self._count_time()
                 yield from self._look_at_clock()
         finally:
-            self._todo.clear()
-            for _, one in self._tickets.values():
-                if one is not None:
-                    one.wanted = False
+            if call == self._call:
+                self._let_go()
+
+    def _let_go(self) -> None:
+        """Let what is under way come to nothing."""
+        self._todo.clear()
+        for _, one in self._tickets.values():
+            if one is not None:
+                one.wanted = False
 
     # ---- giving out -------------------------------------------------------------------------------------------------
 

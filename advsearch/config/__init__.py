@@ -7,6 +7,7 @@ that this package stays light.
 
 from __future__ import annotations
 
+from advsearch import rooms
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.checking import CheckConfig, PlanConfig, StabilityConfig
 from advsearch.config.derivative import DerivativeConfig
@@ -19,29 +20,37 @@ from advsearch.config.rendering import RenderConfig
 from advsearch.config.replaying import WAYS, ReplayConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
-from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config
 
-CONFIGS: dict[str, type[Config]] = {
-    one.command: one
-    for one in (
-        AttackConfig,
-        RenderConfig,
-        SweepConfig,
-        GapConfig,
-        RegionConfig,
-        ReplayConfig,
-        PlanConfig,
-        CheckConfig,
-        StabilityConfig,
-        PrecisionConfig,
-        RecipeConfig,
-        ExplainConfig,
-        HardenConfig,
-        SuiteConfig,
-    )
-}
-"""What the settings of each command are, in the order in which the docs show them."""
+CONFIGS: dict[str, type[Config]]
+"""What the settings of each command are, in the order in which the docs show them; those of questions that are rooms
+are read when somebody first asks, since they are made of the kinds here."""
+
+_OWN: tuple[type[Config], ...] = (
+    AttackConfig,
+    RenderConfig,
+    SweepConfig,
+    GapConfig,
+    RegionConfig,
+    ReplayConfig,
+    PlanConfig,
+    CheckConfig,
+    StabilityConfig,
+    PrecisionConfig,
+    RecipeConfig,
+    ExplainConfig,
+    HardenConfig,
+)
+
+
+def __getattr__(name: str) -> object:
+    """`CONFIGS`, when it is first asked for (PEP 562)."""
+    if name != "CONFIGS":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = {one.command: one for one in (*_OWN, *rooms.in_rooms("settings", "CONFIG"))}
+    globals()[name] = found
+    return found
+
 
 __all__ = [
     "AUTO_SHARE",
@@ -69,6 +78,5 @@ __all__ = [
     "ReplayConfig",
     "SceneConfig",
     "StabilityConfig",
-    "SuiteConfig",
     "SweepConfig",
 ]

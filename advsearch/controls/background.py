@@ -21,8 +21,8 @@ from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.settings import CHANNELS
 
 COLOR = "backdrop.color"

@@ -18,8 +18,8 @@ from torch import Tensor
 from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, Range
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.parts import HazePart
 from advsearch.scene.settings import CHANNELS, LIT, colors

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 
 DOTS = 4
 """How many dots there are when nothing is said."""

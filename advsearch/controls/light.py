@@ -24,9 +24,9 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number
 from advsearch.errors import InputError
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.exposure import WHITE, metered_gain
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.geometry import affine
 from advsearch.scene.parts import BallLamp, PointLamp
 from advsearch.scene.settings import CHANNELS, LIT, colors, moving

@@ -30,8 +30,8 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.corruption.digital import coded
 from advsearch.controls.corruption.tools import picture, planes, warped
 from advsearch.controls.numbers import NumberControl, Values
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 
 _DARK = 1e-6
 """Keeps the slope of a square root finite in black."""

@@ -35,8 +35,8 @@ from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Contr
 from advsearch.controls.values import LARGEST_EPSILON
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.surface_map import Mask, texel_area, texels_of_faces
 

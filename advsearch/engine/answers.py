@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from advsearch.config import SceneConfig
 from advsearch.described import Value
-from advsearch.engine.loading import PictureSettings, Scene
-from advsearch.engine.rendering import render, sight_of
+from advsearch.engine.loading import Scene
+from advsearch.engine.rendering import pictures_of, render, sight_of
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.report.phrases import seen_text
@@ -45,13 +46,12 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described, lo
     return Facts(name, label, scene.description.object.label, numbers, sight)
 
 
-def shown(task: Task, model: Model, scenes: Sequence[Scene], label: str | None, pictures: PictureSettings) -> Task:
+def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig) -> Task:
     """Return the task after it has seen what its model answers to clean pictures, where it asks for that (`looks`).
 
     Args:
-        task, model, pictures: as for `check_truth`.
+        task, model, config: as for `check_truth`.
         scenes: at least one; the next is shown where those before leave open how answers are to be read.
-        label: what was said to be right.
 
     Raises:
         InputError: no scene shows it, so it has to be said.
@@ -59,14 +59,14 @@ def shown(task: Task, model: Model, scenes: Sequence[Scene], label: str | None, 
     if not task.looks:
         return task
     for scene in scenes:
-        view = render(scene, model, task=task, label=label, spp=LOOK_SPP, **vars(pictures)).views[0]
+        view = render(scene, model, task=task, label=config.label, spp=LOOK_SPP, **pictures_of(config)).views[0]
         task = task.seeing(view.output, view.truth)
         if not task.unsaid:
             return task
     raise InputError(f"model {model.name}: {task.unsaid}")
 
 
-def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, pictures: PictureSettings) -> None:
+def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:
     """Refuse a scene of which the task cannot say what is right, before anything is prepared.
 
     Args:
@@ -74,7 +74,7 @@ def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, pictures: 
         model: whose answers it judges.
         scene: with the object.
         facts: of the scene.
-        pictures: how it is rendered.
+        config: says how it is rendered.
 
     Raises:
         InputError: what `Task.check` raises; where no label was given, with the model's first answers to a clean
@@ -85,7 +85,7 @@ def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, pictures: 
     except InputError as error:
         if facts.label is not None:
             raise
-        raise InputError(f"{error}; {_advice(task, model, scene, pictures)}") from None
+        raise InputError(f"{error}; {_advice(task, model, scene, config)}") from None
 
 
 def one_label_for_several(models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]) -> list[str]:
@@ -119,9 +119,9 @@ def _differs(models: Sequence[Model], label: str, own: str) -> bool:
     return False
 
 
-def _advice(task: Task, model: Model, scene: Scene, pictures: PictureSettings) -> str:
+def _advice(task: Task, model: Model, scene: Scene, config: SceneConfig) -> str:
     """What the model answers to a clean picture, and how to take the first of these for right."""
-    looked = render(scene, model, task=task, spp=LOOK_SPP, **vars(pictures))
+    looked = render(scene, model, task=task, spp=LOOK_SPP, **pictures_of(config))
     answers = looked.views[0].answers
     listed = ", ".join(seen_text(task.name, replace(answer, label=repr(answer.label))) for answer in answers)
     return (

@@ -15,7 +15,7 @@ from advsearch.controls import Control
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.objective import task_for
-from advsearch.engine.rendering import Rendering, render
+from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
 from advsearch.models import Model
@@ -147,12 +147,7 @@ class AttackResult:
             raise InputError(f"settings: the answer says what {twice[0]} is; leave it out")
         shown = shown.with_settings(settings) if settings else shown
         shown = replace(shown, description=shown.description.seen_by(camera)) if camera else shown
-        own: dict[str, Any] = {
-            "resolution": config.resolution,
-            "denoise": config.denoise,
-            "sampler": config.pixel_sampler,
-            "seed": config.seed,
-        }
+        own = pictures_of(config)
         return render(
             shown,
             parts.loaded[0] if model is None else model,

@@ -127,17 +127,22 @@ class Bank(Predictor):
         self._fill(0, tick)
 
     def passed(self, query: Query) -> None:
+        self._come_to(query)
+        if query.keep:
+            self._picture(query.u)
+
+    def evaluate(self, query: Query) -> Evaluation:
+        self._come_to(query)
+        answer = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
+        return replace(answer, picture=to_8_bit(self._picture(query.u))) if query.keep else answer
+
+    def _come_to(self, query: Query) -> None:
+        """Compare where that is due, and have the matrices that there are by then."""
         if query.kind == "search" and query.phase == "search":
             self._last = query.number
             if query.number and query.number % EVERY == 0:
-                self._fill(query.number - 1)
                 self._compare(query.u, query.number)
-
-    def evaluate(self, query: Query) -> Evaluation:
-        self.passed(query)
         self._fill(self._last)
-        answer = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
-        return replace(answer, picture=to_8_bit(self._picture(query.u))) if query.keep else answer
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 

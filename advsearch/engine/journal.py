@@ -23,7 +23,7 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine.going_on import same
 from advsearch.engine.machines import Machines
 from advsearch.engine.problem import Problem
-from advsearch.engine.rows import judged, judgement_of, trial_row
+from advsearch.engine.rows import LOST, judged, judgement_of, trial_row
 from advsearch.engine.sharing import Shared
 from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
@@ -44,26 +44,22 @@ class Journal:
         problem: whose questions they are; it describes configurations.
         rows: what was written, where there is no run directory.
         lost: queries that nobody could answer.
+        machines: on which answers were made that are not like this one.
     """
 
     run: RunDirectory | None
     traced: Shared
     rows: list[Row] = field(default_factory=list)
     lost: int = 0
-    _counts: dict[str, int] | None = None
-    _trials: dict[tuple[str, int], Evaluation] = field(default_factory=dict)
+    machines: Machines = field(default_factory=lambda: Machines(None))
+    _counts: dict[str, int] = field(default_factory=dict)
+    _trials: dict[str, dict[int, Evaluation]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.problem: Problem = self.traced.problem
-        self.machines = Machines(self.run)
-        if self._counts is not None:  # that of another problem of the same run
-            return
-        self._counts = {} if self.run is None else self.run.store.counts()
-        for kind in self._counts:
-            assert self.run is not None
-            if not is_search(kind):
-                rows = (row for row in self.run.store.rows(kind) if row.correct is not None)  # old ones don't say it
-                self._trials |= {(kind, row.step): Evaluation.of(judgement_of(row)) for row in rows}
+        if self.run is not None and self.machines.run is None:  # not that of another problem of the same run
+            self.machines = Machines(self.run)
+            self._counts |= self.run.store.counts()
 
     # ---- queries ----------------------------------------------------------------------------------------------------
 
@@ -95,16 +91,20 @@ class Journal:
                 passed(query)
             yield known
 
-    def holds(self, query: Query) -> bool:
-        """Whether a query is answered already."""
-        if query.phase is None:
-            return (query.kind, query.number) in self._trials
-        return query.number < (self._counts or {}).get(query.kind, 0)
+    def _trials_of(self, kind: str) -> dict[int, Evaluation]:
+        """The trials of a kind by their numbers: those of earlier lives, and of this one."""
+        if kind not in self._trials:
+            rows = () if self.run is None or kind not in self._counts else self.run.store.rows(kind)
+            stored = {row.step: judgement_of(row) for row in rows if row.correct is not None}  # old ones don't say it
+            self._trials[kind] = {step: Evaluation.of(judgement) for step, judgement in stored.items()}
+            self.lost += sum(judgement.answer.label == LOST for judgement in stored.values())
+        return self._trials[kind]
 
     def _read(self, query: Query) -> Evaluation | None:
         if query.phase is None:
-            return self._trials.get((query.kind, query.number))
-        told = self.run.store.told(query.kind, query.number) if self.run is not None and self.holds(query) else None
+            return self._trials_of(query.kind).get(query.number)
+        stored = self.run is not None and query.number < self._counts.get(query.kind, 0)
+        told = self.run.store.told(query.kind, query.number) if self.run is not None and stored else None
         if told is None:
             return None
         row, beside = told
@@ -114,6 +114,8 @@ class Journal:
                 f"{path}: cannot go on: evaluation {query.number} of the {query.kind} is another one now than it was, "
                 f"so advsearch, its packages or the number of threads have changed since; {again}"
             )
+        if beside.non_finite:
+            self.problem.renderer.non_finite += beside.non_finite
         return Evaluation(
             objective=math.nan if row.objective is None else row.objective,
             gradient=None if beside.gradient is None else torch.from_numpy(beside.gradient.copy()),
@@ -131,7 +133,7 @@ class Journal:
         if answer.machine is not None:
             self.machines.meet(answer.machine, self.traced.facts)
         if query.phase is None:
-            self._trials[query.kind, query.number] = replace(answer, picture=None)
+            self._trials_of(query.kind)[query.number] = replace(answer, picture=None)
             values = problem.describe(query.u, query.seed) if query.described else {}
             values |= problem.conditions_of(query.u, query.seed) if query.drawn else {}
             sought, machine = query.sought, answer.machine
@@ -161,7 +163,7 @@ class Journal:
                 gradient=None if answer.gradient is None else answer.gradient.detach().numpy(),
                 picture=None if answer.picture is None else levels_of(answer.picture).numpy(),
             )
-        if query.phase is not None and self.holds(query):  # of a run that was done
+        if query.phase is not None and query.number < self._counts.get(query.kind, 0):  # of a run that was done
             return
         if self.run is None:
             self.rows.append(replace(row, id=len(self.rows) + 1, time=time.time()))
@@ -186,7 +188,9 @@ class Journal:
         left, begun = seconds - math.fsum(explored), time.perf_counter()
 
         def late(count: int) -> bool:
+            nonlocal begun
             if count < len(explored):
+                begun = time.perf_counter()  # to read back takes none of the time
                 return False
             return len(phases) > len(explored) or time.perf_counter() - begun >= left
 
@@ -214,11 +218,6 @@ def other_answers(run: RunDirectory | None, values: Mapping[str, tuple[float | N
         f"{path}: cannot go on: the same picture of the clean scene has other values now ({told}), so model, "
         f"objective or scene are not those that it began with; take these again, or {again}"
     )
-
-
-def is_search(kind: str) -> bool:
-    """Whether rows of a kind are evaluations of a search; all others are trials."""
-    return kind == "baseline" or kind.startswith("search")
 
 
 def _digest(u: Tensor) -> bytes:

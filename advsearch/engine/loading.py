@@ -16,7 +16,6 @@ from torch import Tensor
 
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.errors import InputError
-from advsearch.models import Model
 from advsearch.models.switches import plainly
 from advsearch.options import told
 from advsearch.scene import settings
@@ -137,27 +136,6 @@ class Scene:
         check_meshes(own, given)
         values = {**own.values, **{name: resolved[name] for name in given}}
         return Scene(replace(own, values=values, given=own.given | set(given)), self.only_here)
-
-
-@dataclass(frozen=True)
-class PictureSettings:
-    """How a scene is shown to models.
-
-    Attributes:
-        resolution: (height, width) in pixels; None for what a model takes.
-        denoise: "oidn" or "none".
-        sampler: of pixels: "multijitter" or "independent".
-        seed: root of the noise.
-    """
-
-    resolution: tuple[int, int] | None
-    denoise: str
-    sampler: str
-    seed: int
-
-    def size(self, model: Model) -> tuple[int, int]:
-        """Height and width of the pictures that a model is shown, in pixels."""
-        return self.resolution or (model.input_size[0], model.input_size[1])
 
 
 @plainly()

@@ -12,7 +12,7 @@ from torch import nn
 from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS
-from advsearch.engine.loading import MODEL, lent
+from advsearch.engine.loading import MODEL, Scene, lent, load_scene
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.ensemble import together
@@ -23,17 +23,30 @@ from advsearch.tasks import Task
 from advsearch.tasks.together import Together
 
 
-def scene_settings(fixed: Given | None, exposure: float | None) -> Given:
+def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:
+    """Load the scene that a configuration describes.
+
+    Args:
+        config: what.
+        name: of one of its objects; None for the only one, in the configuration's environment.
+        environment: of that object; None for the default.
+    """
+    if name is None:
+        name, environment = config.object, config.environment
+    return load_scene(name, environment, up=config.up, settings=scene_settings(config), camera=config.camera)
+
+
+def scene_settings(config: SceneConfig) -> Given:
     """Return the parameters that a scene is loaded with: those of `set`, and the exposure.
 
     Raises:
         InputError: both say what the exposure is.
     """
-    given = dict(fixed or {})
-    if exposure:
+    given: dict[str, Any] = dict(config.set_)
+    if config.exposure:
         if "camera.exposure" in given:
             raise InputError("`exposure` and `set` camera.exposure say the same thing; leave one of them out")
-        given["camera.exposure"] = exposure
+        given["camera.exposure"] = config.exposure
     return given
 
 

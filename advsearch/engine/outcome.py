@@ -183,7 +183,7 @@ def _summary(
         policy_verified=_verified(findings.beaten),
         average=_average(findings) if findings.average else None,
         smallest=None if findings.smallest is None else _smallest(findings.smallest, problem),
-        printability=_printability(problem, findings),
+        printability=_printability(problem, findings) if config.printable else None,
         distribution=_distribution(search.distribution, problem) if search and search.distribution else None,
         failures=described_failures(problem, findings),
         transport=_transport(findings),
@@ -217,10 +217,8 @@ def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
     return ObjectiveValues(mean=mean(values), deviation=spread, low=min(values), high=max(values))
 
 
-def _printability(problem: Problem, findings: Findings) -> Printability | None:
-    """The terms of the clean scene and of the answer; None where no search was about them."""
-    if not problem.printable:
-        return None
+def _printability(problem: Problem, findings: Findings) -> Printability:
+    """The terms of the clean scene and of the answer."""
     space, domain, search = problem.searched_space, problem.domain, findings.search
     answer = None if search is None else print_terms(space, domain.project(search.best_u))
     return Printability(clean=print_terms(space, domain.start), answer=answer, cost=_print_cost(problem, findings))

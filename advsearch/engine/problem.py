@@ -74,7 +74,6 @@ class Problem:
         draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
-        printable: whether searches prefer colours that can be printed; see `print_terms`.
         metrics: numbers of every picture that rows have beside what the task says.
         aovs: layers of ground truth that are kept of the clean scene and the answer (`scene.surfaces.AOVS`).
         domain: where a search may look: the searched controls.
@@ -93,7 +92,6 @@ class Problem:
     steps: int = 0
     draws: int = 1
     search_depth: int | None = None
-    printable: bool = False
     aovs: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
     domain: Domain = field(init=False)
@@ -246,7 +244,13 @@ class Problem:
 
     def evaluate(self, query: Query) -> Evaluation:
         """Answer one query: the only place where a run renders, asks and judges."""
-        u, seed, before = query.u, query.seed, self.renderer.non_finite
+        before = self.renderer.non_finite
+        answer = self._answer(query)
+        lost = self.renderer.non_finite - before
+        return replace(answer, non_finite=lost) if lost else answer
+
+    def _answer(self, query: Query) -> Evaluation:
+        u, seed = query.u, query.seed
         if query.wanted == "light":
             return Evaluation(math.nan, None, False, light=self.linearised(u, seed, query.spp).collected)
         if query.wanted == "picture":
@@ -254,8 +258,7 @@ class Problem:
         if query.phase is None:
             picture = self.picture(u, seed, query.spp, drawn=query.drawn)
             said = self.judge(picture, self.whole(u, seed if query.drawn else None))
-            lost = self.renderer.non_finite - before
-            return Evaluation.of(said, picture=picture if query.keep else None, non_finite=lost)
+            return Evaluation.of(said, picture=picture if query.keep else None)
         if self.conditions is None:
             return self.evaluated(query, u, seed)[0]
         draws = [seeds.stream(seed, "draw", number) for number in range(self.draws)]

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
+from advsearch.config import SceneConfig
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
 from advsearch.controls import Control, Space, compose
 from advsearch.controls.clean import sentences
@@ -249,7 +250,7 @@ def render(
     instances = as_controls(controls)
     if around is not None and any(_turns(one) for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
-    size = as_python(resolution) or (model.input_size[0], model.input_size[1])
+    size = as_python(resolution) or model.input_size
     progress = watcher(progress)
     progress.stage("rendering", around or 1)
     formation = None
@@ -309,6 +310,16 @@ def _facts(
 def sight_of(surfaces: Surfaces) -> Sight:
     """Return what a task judges by, of what the camera sees."""
     return Sight(surfaces.seen(OBJECT), surfaces.depth, surfaces.z_depth)
+
+
+def pictures_of(config: SceneConfig) -> dict[str, Any]:
+    """Return how `render` makes the pictures that a configuration's models are shown."""
+    return {
+        "resolution": config.resolution,
+        "denoise": config.denoise,
+        "sampler": config.pixel_sampler,
+        "seed": config.seed,
+    }
 
 
 def writable(path: str | Path, views: int) -> Path:

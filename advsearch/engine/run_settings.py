@@ -3,104 +3,91 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
+from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
 from advsearch.controls.values import is_number
 from advsearch.engine.loading import CONTROL, Controls, as_controls, controls_by_name, lent
 from advsearch.errors import InputError, UnknownNameError
 
+RUN_SETTINGS = ("epsilon", "norm", "texture_resolution")
+"""What a configuration says for all of its controls; each control declares what it takes of it (`Choice.run_setting`).
+A configuration without such a setting counts as one that does not say it."""
 
-@dataclass(frozen=True)
-class RunSettings:
-    """What a run says for all of its controls; each control declares what it takes of it (`Choice.run_setting`).
 
-    Attributes:
-        epsilon: how far a control may go, in its own unit: one for all, by the names of controls, or the several of a
-            curve; None for each control's own.
-        norm: how that distance is measured: "linf" or "l2"; None for each control's own.
-        texture_resolution: side of a searched texture, texels; None for a choice by the object's own.
+def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
+    """Return control instances, with what they take of the configuration where they say nothing themselves.
+
+    Args:
+        config: of the run.
+        controls: in any form; instances stay as they are.
+
+    Raises:
+        InputError: an instance takes a setting that is given here.
     """
+    asked = controls_by_name(controls)
+    as_controls(controls)  # refuses what is none
+    for one in (one if isinstance(one, Control) else lent(CONTROL, name) for name, one in asked.items()):
+        for choice in _counting(type(one), one.settings()) if one is not None else ():
+            if getattr(config, choice.run_setting, None) is not None:
+                raise InputError(
+                    f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
+                    f"{type(one).__name__}({choice.name}=...)"
+                )
+    return as_controls(
+        {name: one if isinstance(one, Control) else {**_taken(config, name, one), **one} for name, one in asked.items()}
+    )
 
-    epsilon: float | Mapping[str, float] | tuple[float, ...] | None = None
-    norm: str | None = None
-    texture_resolution: int | None = None
 
-    def given_to(self, controls: Controls) -> tuple[Control, ...]:
-        """Return control instances, with what they take of this where they say nothing themselves.
+def alone(config: SceneConfig, asked: str, given: Mapping[str, object]) -> dict[str, Any]:
+    """Return what a run over one of the controls says: None for what that does not take."""
+    _, name = names_of(asked, given)
+    kept = {}
+    for setting in RUN_SETTINGS:
+        value = getattr(config, setting, None)
+        if isinstance(value, Mapping):
+            value = {own: number for own, number in value.items() if own == name} or None
+        kept[setting] = value if takes(asked, given, setting) else None
+    return kept
 
-        Args:
-            controls: in any form; instances stay as they are.
 
-        Raises:
-            InputError: an instance takes a setting that is given here.
-        """
-        asked = controls_by_name(controls)
-        as_controls(controls)  # refuses what is none
-        for one in (one if isinstance(one, Control) else lent(CONTROL, name) for name, one in asked.items()):
-            for choice in _counting(type(one), one.settings()) if one is not None else ():
-                if choice.run_setting and getattr(self, choice.run_setting) is not None:
-                    raise InputError(
-                        f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
-                        f"{type(one).__name__}({choice.name}=...)"
-                    )
-        return as_controls(
-            {
-                name: one if isinstance(one, Control) else {**self._taken(name, one), **one}
-                for name, one in asked.items()
-            }
-        )
+def check(config: SceneConfig) -> None:
+    """Refuse a setting that none of the controls takes; those that vary by chance have no epsilon.
 
-    def _taken(self, asked: str, given: Mapping[str, object]) -> dict[str, object]:
-        """What one control takes, by the names of its own settings."""
-        _, name = names_of(asked, given)
-        taken = {one.name: self._value(one.run_setting, name) for one in _choices(asked, given) if one.run_setting}
-        return {own: value for own, value in taken.items() if value is not None}
+    Raises:
+        UnknownNameError: an epsilon for a control that is not searched.
+        InputError: no control takes it, or not the one that it names.
+    """
+    for setting in RUN_SETTINGS:
+        value = getattr(config, setting, None)
+        if value is None:
+            continue
+        drawn = {} if setting == "epsilon" else getattr(config, "over", {})
+        asked = gathered({**config.controls, **drawn})
+        if isinstance(value, Mapping):
+            known = {names_of(one, given)[1]: one for one, given in asked.items()}
+            for name in value:
+                if name not in known:
+                    raise UnknownNameError(f"control in `{setting}`", name, known)
+                if not takes(known[name], asked[known[name]], setting):
+                    raise _not_taken(setting, name, names_of(known[name], asked[known[name]])[0])
+            continue
+        without = [one for one, given in asked.items() if not takes(one, given, setting)]
+        if without and (isinstance(value, tuple) or len(without) == len(asked)):
+            raise _not_taken(setting, without[0], names_of(without[0], asked[without[0]])[0])
 
-    def _value(self, setting: str, name: str) -> Any:
-        """The value of a setting for the control of a name."""
-        value = getattr(self, setting)
-        return value.get(name) if isinstance(value, Mapping) else None if isinstance(value, tuple) else value
 
-    def alone(self, asked: str, given: Mapping[str, object]) -> RunSettings:
-        """Return what a run over one of the controls says: None for what that does not take."""
-        _, name = names_of(asked, given)
-        kept = {}
-        for setting, value in vars(self).items():
-            if isinstance(value, Mapping):
-                value = {own: number for own, number in value.items() if own == name} or None
-            kept[setting] = value if takes(asked, given, setting) else None
-        return RunSettings(**kept)
-
-    def check(
-        self, searched: Mapping[str, Mapping[str, object]], drawn: Mapping[str, Mapping[str, object]] | None = None
-    ) -> None:
-        """Refuse a setting that none of the controls takes.
-
-        Args:
-            searched: the controls that are searched.
-            drawn: those that vary by chance, which have no epsilon.
-
-        Raises:
-            UnknownNameError: an epsilon for a control that is not searched.
-            InputError: no control takes it, or not the one that it names.
-        """
-        for setting, value in vars(self).items():
-            if value is None:
-                continue
-            asked = gathered(searched if setting == "epsilon" else {**searched, **(drawn or {})})
-            if isinstance(value, Mapping):
-                known = {names_of(one, given)[1]: one for one, given in asked.items()}
-                for name in value:
-                    if name not in known:
-                        raise UnknownNameError(f"control in `{setting}`", name, known)
-                    if not takes(known[name], asked[known[name]], setting):
-                        raise _not_taken(setting, name, names_of(known[name], asked[known[name]])[0])
-                continue
-            without = [one for one, given in asked.items() if not takes(one, given, setting)]
-            if without and (isinstance(value, tuple) or len(without) == len(asked)):
-                raise _not_taken(setting, without[0], names_of(without[0], asked[without[0]])[0])
+def _taken(config: SceneConfig, asked: str, given: Mapping[str, object]) -> dict[str, object]:
+    """What one control takes, by the names of its own settings."""
+    _, name = names_of(asked, given)
+    taken = {}
+    for choice in _choices(asked, given):
+        value = getattr(config, choice.run_setting, None)
+        value = value.get(name) if isinstance(value, Mapping) else value
+        if value is not None and not isinstance(value, tuple):  # the several epsilons of a curve: each run has its own
+            taken[choice.name] = value
+    return taken
 
 
 def takes(asked: str, given: Mapping[str, object], setting: str) -> bool:

@@ -92,7 +92,7 @@ class Searches:
         seed, frames = self.problem.seed, findings.frames
         findings.search = self.search("search", self.policy, steps, seed, frames, config.seconds)
         steps = steps if config.seconds is None else _spent(findings.search)
-        if self.problem.printable:
+        if config.printable:
             title = "searching without print terms, to see what they cost"
             self.begin("without print terms", title, steps, "`printable=false` leaves both out")
             findings.unprinted = self.search(UNPRINTED, self.policy, steps, seed)
@@ -161,7 +161,7 @@ class Searches:
             self.journal.traced(queries) if transport is None or not predicted else map(transport.evaluate, queries)
         )
         for query, answer in zip(queries, answers, strict=True):
-            printed = self.problem.printable and query.kind != UNPRINTED
+            printed = self.config.printable and query.kind != UNPRINTED
             yield penalised(answer, self.problem.searched_space, query.u) if printed else answer
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:

@@ -59,7 +59,7 @@ class Attack:
     def __post_init__(self) -> None:
         self.problem = self.journal.problem
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
-        ladder = ladder_of(self.config.pixel_sampler, self.config.verify_spp)
+        ladder = ladder_of(self.config)
         self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, self.config.trial_count)
         kept = (self.stages, self.findings, self.clean)
         self._searches = Searches(self.journal, self.config, self.policy, *kept)
@@ -155,7 +155,7 @@ class Attack:
 
     def worth_attacking(self) -> bool:
         """Look at the clean configuration; one that is wrong in every look goes through the full trials at once, as
-        does one whose smallest change is config."""
+        does one whose smallest change is wanted."""
         problem, config, findings = self.problem, self.config, self.findings
         seed, start = seeds.stream(problem.seed, "first look"), problem.domain.start
         self.stages.begin(

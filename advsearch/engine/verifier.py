@@ -13,6 +13,7 @@ from advsearch.attacks import Evaluation, SearchResult, Verification, choose_spp
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.product import batches
 from advsearch.attacks.sample_count import LADDER, most_samples
+from advsearch.config import AttackConfig, RegionConfig, SweepConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages
@@ -24,10 +25,10 @@ MANY = 64
 """Of a configuration with more numbers than this, a trial's row does not hold the values."""
 
 
-def ladder_of(sampler: str, asked: int | None) -> Sequence[int]:
-    """Return the samples a pixel that a verification climbs, as a sampler has them; the only count, if one was asked
+def ladder_of(config: AttackConfig | RegionConfig | SweepConfig) -> Sequence[int]:
+    """Return the samples a pixel that a verification climbs, as the sampler has them; the only count, if one was asked
     for."""
-    return LADDER if asked is None else (next_count(sampler, asked),)
+    return LADDER if config.verify_spp is None else (next_count(config.pixel_sampler, config.verify_spp),)
 
 
 @dataclass
@@ -161,8 +162,6 @@ class Verifier:
     def average(self, count: int) -> None:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
         problem, found = self.problem, list[Judgement]()
-        if self.findings.sample_count is None:
-            self.choose_spp({"clean": problem.domain.start})
         self.begin("trying random configurations", count, name="average", flags="`average`")
         for numbers in batches(0, count, most_at_once(problem.domain.dim)):
             generators = [torch.Generator().manual_seed(seeds.stream(problem.seed, "draw", one)) for one in numbers]

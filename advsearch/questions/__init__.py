@@ -1,11 +1,4 @@
-"""Questions that are rooms of their own: all that belongs to one question in one folder, each file of the layer that
-its name says (docs/design.md, "Rooms, and who may know whom")."""
+"""Questions that are rooms: each folder holds the settings, what carries it out, the answer, words, page and command.
 
-from __future__ import annotations
-
-# These list the settings and the answers of every room, and so come before any of them.
-import advsearch.config
-import advsearch.runs.results  # noqa: F401
-
-ROOMS = ("test",)
-"""The questions whose `carry_out.py` stands here, not in `advsearch/api/`."""
+`advsearch.rooms` finds them; a folder that is deleted is a question that nobody can ask.
+"""

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
+from advsearch import rooms
 from advsearch.report import wording
 from advsearch.report.explanations import conditions_text, envelope_text
 from advsearch.report.phrases import percent
@@ -63,6 +64,8 @@ def claims_of(result: Result) -> list[Claim]:
     if result.goes_on:
         told = f"; so far: {result.brief}" if result.brief else ""
         return [_nothing(f"the run was stopped before its end{told}")]
+    if own := rooms.in_room(result.command, "words", "claims"):
+        return list(own(result))
     for kind, claims in _CLAIMS.items():
         if isinstance(result, kind):
             return list(claims(result)) or [_nothing("nothing in this run came to its end")]

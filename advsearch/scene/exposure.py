@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import EnvironmentAsset, Floats
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import pixels_in

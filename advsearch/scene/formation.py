@@ -11,14 +11,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
+from advsearch.scene.color import linear_to_srgb
 
 DENOISERS = ("oidn", "none")
 FILTERS = ("box", "gaussian")
@@ -29,8 +27,6 @@ SAMPLER = "multijitter"
 PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61, 67, 71, 73, 79, 83, 89, 97, 101)
 DARK = 1e-6
 """Keeps the slope of a power finite in black; half of one of 255 levels comes of it."""
-
-Values = TypeVar("Values", npt.NDArray[np.float32], Tensor)
 
 
 @dataclass(frozen=True)
@@ -85,25 +81,6 @@ class ImageFormation:
             light = (radiance * self.gain).clamp_min(0.0)
             return linear_to_srgb(light / (1.0 + light))
         return linear_to_srgb(radiance * self.gain)
-
-
-def srgb_to_linear(display: Values) -> Values:
-    """Decode display-referred sRGB in [0, 1] to linear values; any shape, float32; differentiable everywhere."""
-    low_end, low = display <= 0.04045, display / 12.92
-    curve = ((display.clip(0.04045, None) + 0.055) / 1.055) ** 2.4
-    if isinstance(display, np.ndarray):
-        return np.where(low_end, low, curve).astype(np.float32)
-    return low.where(low_end, curve)
-
-
-def linear_to_srgb(linear: Values) -> Values:
-    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape, float32; differentiable."""
-    clipped = linear.clip(0.0, 1.0)
-    low_end, low = clipped <= 0.0031308, clipped * 12.92
-    curve = 1.055 * clipped.clip(0.0031308, None) ** (1.0 / 2.4) - 0.055
-    if isinstance(linear, np.ndarray):
-        return np.where(low_end, low, curve).astype(np.float32)
-    return low.where(low_end, curve)
 
 
 def levels_of(display: Tensor) -> Tensor:

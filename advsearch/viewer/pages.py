@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from advsearch.questions.test.answer import SuiteResult
-from advsearch.questions.test.page import suite_page
+from advsearch import rooms
 from advsearch.runs.directory import REPORT
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary
@@ -54,8 +53,6 @@ def write_page(run: Path, result: Result) -> Path:
             text = harden_page(run, result)
         case RecipeResult():
             text = recipe_page(run, result)
-        case SuiteResult():
-            text = suite_page(run, result)
         case _:
-            text = result_page(run, result)
+            text = (rooms.in_room(result.command, "page", "page") or result_page)(run, result)
     return write_text(run / REPORT, text, durable=False)

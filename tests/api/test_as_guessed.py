@@ -21,10 +21,11 @@ from PIL import Image
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.config import AttackConfig
 from advsearch.controls import LightControl, PoseControl
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.loading import as_controls, instances_in, settings_of
-from advsearch.engine.run_settings import RunSettings
+from advsearch.engine.run_settings import given_to
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import NullProgress
@@ -385,7 +386,7 @@ def test_a_mapping_may_have_instances(scene: advsearch.Scene) -> None:
         made = as_controls(controls)
         assert [one.name for one in made] == ["pose", "light", "camera"] and made[1] is given["light"]
         assert list(settings_of(controls)) == [*given] and instances_in(controls) == [made[1]]
-        assert [one.name for one in RunSettings(epsilon=None).given_to(controls)] == ["pose", "light", "camera"]
+        assert [one.name for one in given_to(AttackConfig(object="mug"), controls)] == ["pose", "light", "camera"]
     refused: list[tuple[Any, str]] = [
         (
             {"mine": LightControl()},

@@ -20,7 +20,7 @@ from advsearch.config import AttackConfig
 from advsearch.controls import make_control, make_space
 from advsearch.engine.pictures import write_object
 from advsearch.runs.directory import OBJECT_FILE, RunDirectory
-from advsearch.scene.formation import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
@@ -152,8 +152,10 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
     corners, middle = (world - world.min(axis=0)) / size.max(), size / (2 * size.max())
     middle[2] = 0.0
     there = np.concatenate([back.mesh.vertices + middle, back.mesh.uvs], axis=1)
-    apart, _ = KDTree(there).query(np.concatenate([corners, own.mesh.uvs], axis=1))
+    apart, at = KDTree(there).query(np.concatenate([corners, own.mesh.uvs], axis=1))
     assert apart.max() < 1e-5
+    normals = torch.nn.functional.normalize(inputs["object.normals"], dim=1).numpy()
+    assert float((back.mesh.normals[at] * normals).sum(axis=1).mean()) > 0.99
 
 
 def test_the_object_to_turn_is_the_answer_and_what_was_before(run: Path, tmp_path: Path) -> None:

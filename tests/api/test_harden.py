@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -106,7 +107,7 @@ def work_of(config: HardenConfig, run: RunDirectory, course: Course) -> hardenin
 def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,light", "labels": "labels.json"})
     with RunDirectory.create_for(config) as run:
-        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), 0.1, 1, 0)
+        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), config)
         work = work_of(config, run, course)
         found = work._drawn("scenes", TRAINING, range(1), 1)
         held_back = work._drawn("scenes", VALIDATION, range(1), 2)
@@ -124,7 +125,7 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
 ) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,haze", "labels": "labels.json"})
     with RunDirectory.create_for(config) as run:
-        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), 0.1, 1, 0)
+        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), config)
         work = work_of(config, run, course)
         assert work.scenes.beside == ("pose",)  # no matrix says what haze does
         drawn = [work._chance("texture", number) for number in range(400)]
@@ -165,13 +166,9 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
     with RunDirectory.create_for(config) as run:
         noted = [{"lessons": 1, "part": 1.0, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
         run.store.set_note(ROUNDS, json.dumps(noted))
-        course: Any = None
-        work = work_of(config, run, course)
-        assert work.rounds.best == 3
-        work.rounds.clean_loss = 0.05
-        assert work.rounds.best == 2
-        work.rounds.clean_loss = 0.0
-        assert work.rounds.best == 0
+        for loss, best in ((0.02, 3), (0.05, 2), (0.0, 0)):
+            course: Any = SimpleNamespace(config=config.model_copy(update={"clean_loss": loss}))
+            assert work_of(config, run, course).rounds.best == best
     shutil.rmtree(run.path)
 
 
@@ -192,12 +189,12 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
 
     monkeypatch.setattr("advsearch.engine.hardening.rounds.score", judged)
     with RunDirectory.create_for(config) as run:
-        work = work_of(config, run, Course(student, load(), 0.1, 1, 0))
+        work = work_of(config, run, Course(student, load(), config))
         work.rounds._keep(0, [], Score(1.0, 0.5), 0, 0.0)
         for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):
             judged_at.clear()
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})
-            work.rounds.clean_loss = loss
+            work.course.config = config.model_copy(update={"clean_loss": loss})
             found, part = work.rounds._mixed([])
             assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
             assert len(judged_at) == looked_at, "less than the best part is looked at once"

@@ -26,7 +26,7 @@ def test_dir_lists_the_public_names() -> None:
 
 QUESTIONS = (
     *("attack", "sweep", "gap", "region", "replay", "recipe", "plan", "check", "precision", "stability", "harden"),
-    "explain",
+    *("explain", "compare"),
 )
 
 
@@ -43,6 +43,7 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
         "answer",
         "recipe",
         "sweeps",
+        "compared",
         "model",
         "grid",
         "resume",
@@ -51,7 +52,9 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
         "beside",
     }
     assert set(parameters) - set(names) <= own
-    written = vars(importlib.import_module("advsearch.api.keywords"))[f"{name.capitalize()}Keywords"]
+    keywords = f"{name.capitalize()}Keywords"
+    places = ("advsearch.api.keywords", function.__module__)
+    written = next(found for one in places if (found := vars(importlib.import_module(one)).get(keywords)))
     inner = inspect.signature(function.__wrapped__).parameters
     assert set(get_type_hints(written)) == set(names) - set(inner)
     for key, one in names.items():

@@ -17,7 +17,7 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.report.contact_sheet import GAP, LINE, NARROWEST, columns_for, contact_sheet
 from advsearch.runs.images import read_png
-from advsearch.scene.formation import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 
 SMALL = ["--resolution", "16", "--spp", "1", "--quiet"]
 

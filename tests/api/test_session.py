@@ -206,7 +206,14 @@ def holds(kept: Any, value: Any) -> bool:
 def test_every_setting_takes_each_value_that_it_is_given_or_none(command: str) -> None:
     """The same over all settings of all questions: nothing of a list is dropped, and a number is one of any library."""
     config = CONFIGS[command]
-    needed = {"object": "mug", "out": "a.png", "answer": "run", "recipe": "a.yaml", "sweeps": "run"}
+    needed = {
+        "object": "mug",
+        "out": "a.png",
+        "answer": "run",
+        "recipe": "a.yaml",
+        "sweeps": "run",
+        "compared": "run,b",
+    }
     needed = {name: value for name, value in needed.items() if name in {one.field for one in settings(config)}}
     taken = 0
     for one in settings(config):

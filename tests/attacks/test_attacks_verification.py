@@ -321,6 +321,7 @@ def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interv
         (Ending.FOUND, 19, 19, Ending.FOUND),
         (Ending.FOUND, 20, 18, Ending.NOT_VERIFIED),
         (Ending.FOUND, 18, 18, Ending.NOT_VERIFIED),
+        (Ending.FOUND, 18, 20, Ending.NOT_VERIFIED),
         (Ending.BUDGET_SPENT, 20, 19, Ending.FOUND),
         (Ending.BUDGET_SPENT, 20, 18, Ending.BUDGET_SPENT),
         (Ending.STALLED, 20, 0, Ending.STALLED),

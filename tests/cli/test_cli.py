@@ -31,7 +31,7 @@ from advsearch.cli import list as listing
 from advsearch.cli.attack import answer
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
-from advsearch.cli.output import aligned
+from advsearch.cli.output import aligned, finish
 from advsearch.cli.progress import watch_progress
 from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
 from advsearch.controls.base import Choice
@@ -241,6 +241,12 @@ def test_what_the_api_raises_becomes_a_status(
     assert capsys.readouterr() == ("", message)
 
 
+@pytest.mark.parametrize(("ending", "status"), [("interrupted", 130), ("found", 0), ("budget spent", 0)])
+def test_a_result_of_a_run_that_was_stopped_has_the_status_of_an_interrupt(ending: str, status: int) -> None:
+    result: Any = types.SimpleNamespace(ending=ending, run=None)
+    assert finish(result, lambda _: "the answer", as_json=False) == status
+
+
 SWALLOWING = """
 import importlib.abc, importlib.util, os, signal, sys
 
@@ -393,7 +399,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         (
             "object: mug\ncommand: atack\n",
             [],
-            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, explain, gap, harden, plan, ",
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, compare, explain, gap, harden, ",
         ),
         ("object: mug\n", ["steps"], "change 'steps': expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),

@@ -136,6 +136,12 @@ def test_another_version_is_refused_with_both_versions() -> None:
     assert told == ["w0 is given nothing: it has advsearch 2, and 1 asks; install the same on both"]
 
 
+def test_a_worker_does_nothing_for_another_version() -> None:
+    found = prepare("key", Work("nowhere:work", {}), Files({}, {}), "0.0.0")
+    text = f"it has advsearch {version()}, and 0.0.0 asks; install the same on both"
+    assert found == Failure(text, unfit=True)
+
+
 def test_workers_none_of_which_can_do_it_end_the_run_with_the_reason() -> None:
     without = Failure("no libLLVM is found; apt install libllvm19", unfit=True)
     pool = Simulated(answers={"w0": without, "w1": without})
@@ -259,3 +265,19 @@ def test_runs_that_share_a_worker_all_get_on(monkeypatch: pytest.MonkeyPatch) ->
         assert isinstance(unknown, Failure) and unknown.forgotten
     finally:
         threads.configure()
+
+
+def test_results_that_are_given_up_do_not_answer_what_is_asked_next() -> None:
+    """Though their ranges are still under way, and though nobody has closed them."""
+    pool = Simulated()
+    pool.add(2)
+    shared = coordinator(pool)
+    first = shared.results(ranges(400))
+    for _ in range(3):
+        next(first)
+    numbers = sorted(
+        number for done in shared.results(iter([range(900, 901), range(901, 902)])) for number in done.numbers
+    )
+    assert numbers == [900, 901]
+    with pytest.raises(RuntimeError, match="given up when others were asked for"):
+        next(first)

@@ -30,6 +30,7 @@ from advsearch.config import (
     StabilityConfig,
     SweepConfig,
 )
+from advsearch.config.attack import TRIALS, TRIALS_OVER
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.settings import Config, all_finite, parse_assignment, read_yaml, settings
@@ -591,3 +592,9 @@ def test_a_file_with_a_comma_in_its_name_is_one(tmp_path: Path) -> None:
     assert AttackConfig(object="mug", model=file).model == str(file)
     assert SweepConfig(object="mug,bowl", environment="noon,loft", model="a,b").models == ("a", "b")
     assert AttackConfig(object="mug,bowl").objects == ("mug", "bowl")
+
+
+def test_an_answer_for_many_conditions_is_tried_more_often() -> None:
+    assert AttackConfig(object="mug").trial_count == TRIALS == 20
+    assert AttackConfig(object="mug", over={"light": {}}).trial_count == TRIALS_OVER == 200
+    assert AttackConfig(object="mug", over={"light": {}}, trials=7).trial_count == 7

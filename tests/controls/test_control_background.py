@@ -11,8 +11,8 @@ import torch
 import advsearch
 from advsearch.controls.background import COLOR, BackgroundControl, hsv_to_rgb
 from advsearch.errors import InputError
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 
 
 @pytest.fixture(scope="module")

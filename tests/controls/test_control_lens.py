@@ -10,8 +10,8 @@ from torch import Tensor
 
 from advsearch.controls.lens import LensControl, spread, with_dots
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 
 NAMES = ("x", "y", "radius", "red", "green", "blue", "opacity", "falloff")
 

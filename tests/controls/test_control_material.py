@@ -13,8 +13,8 @@ import advsearch
 from advsearch.controls.material.control import NUMBERS, MaterialControl
 from advsearch.controls.material.patterns import PATTERNS, SIDE, covering, tile
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.settings import CHANNELS
 from advsearch.scene.surface_map import texel_positions
 

@@ -12,8 +12,8 @@ from advsearch.controls import make_control, make_space
 from advsearch.controls.base import BoundControl
 from advsearch.controls.texture import TextureControl, palette
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.surface_map import texel_area
 

@@ -13,8 +13,8 @@ from hostile import SHORT, shown
 from advsearch import load_scene
 from advsearch.controls import CONTROLS, BoundControl, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import describe
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.gradients.plan import ESTIMATORS
 from advsearch.scene.settings import SETTINGS
 

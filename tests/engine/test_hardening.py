@@ -9,6 +9,7 @@ import tarfile
 import weakref
 from importlib import resources
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -33,6 +34,7 @@ from advsearch.engine.hardening.lessons import (
     tried,
 )
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
+from advsearch.engine.hardening.rounds import TrainingRounds
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, check_unmeasured, fingerprint
 from advsearch.engine.hardening.training import Course, Score, score
 from advsearch.engine.hardening.variation import white_light_changed
@@ -40,6 +42,8 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.trainable import Trainable, trainable
+from advsearch.progress import NullProgress
+from advsearch.runs.results.harden import TrainingRound
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
 
@@ -123,8 +127,8 @@ def test_lessons_of_textures_let_go_of_their_scene() -> None:
     assert scene() is None and isinstance(lesson, TextureLesson)
     harder([lesson], model, 2)
     assert lesson.worst.shape == (16, 16, 3) and not torch.equal(lesson.worst, lesson.plain)
-    for looks, steps in ((1, 2), (3, 2), (6, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and so many of this
-        assert Course(student(), model, 0.1, 2, 0, looks).steps([lesson, *plain * 20]) == steps
+    for views, steps in ((6, 2), (2, 2), (1, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and 6 / views of this
+        assert Course(student(), model, HardenConfig(epochs=2, views=views)).steps([lesson, *plain * 20]) == steps
 
 
 def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
@@ -256,13 +260,30 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     made, lessons = student(), pupils()
     before = score(made.model, lessons)
     ticks: list[int] = []
-    course = Course(made, student().model, 0.04, 12, seed=3)
+    course = Course(made, student().model, HardenConfig(rate=0.04, epochs=12))
     course.round(1, lessons, lambda: ticks.append(1))
     after = score(made.model, lessons)
     assert len(ticks) == course.steps(lessons) == 12
     more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
     assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
+
+
+def test_to_judge_a_model_leaves_the_lessons_as_they_are() -> None:
+    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3)]))
+    lesson = RenderedLesson.of((1,), pictures[0], pictures)
+    score(student().model, [lesson])
+    assert bool(lesson.losses.isinf().all())
+
+
+@pytest.mark.parametrize(("clean_loss", "best"), [(0.0, 0), (0.02, 2), (0.1, 1)])
+def test_the_weights_that_are_kept_lose_no_more_plain_pictures_than_they_may(clean_loss: float, best: int) -> None:
+    scores = ((0.9, 0.1), (0.82, 0.9), (0.89, 0.5))
+    done = [TrainingRound(lessons=1, part=1.0, clean=clean, robust=robust, kept=False) for clean, robust in scores]
+    noted = json.dumps([one.model_dump() for one in done])
+    run: Any = SimpleNamespace(store=SimpleNamespace(note=lambda key: noted))
+    course: Any = SimpleNamespace(config=SimpleNamespace(clean_loss=clean_loss))
+    assert TrainingRounds(run, course, lambda *_: [], NullProgress()).best == best
 
 
 def test_the_given_model_is_asked_about_scenes_as_they_are_alone() -> None:
@@ -287,7 +308,7 @@ def test_a_round_comes_to_the_same_whatever_the_number_of_threads() -> None:
         made = student()
         torch.set_num_threads(count)
         try:
-            Course(made, student().model, 0.04, 2, seed=3).round(1, pupils())
+            Course(made, student().model, HardenConfig(rate=0.04, epochs=2)).round(1, pupils())
             assert torch.get_num_threads() == count
         finally:
             torch.set_num_threads(before)
@@ -342,7 +363,7 @@ def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
         return torch.optim.SGD(parameters, 0.5)  # type: ignore[arg-type]
 
     further = [(torch.stack([coloured(2, 0.4, n) for n in range(8)]), torch.full((8,), 9))]
-    Course(made, student().model, 1.0, 10, 3, 1, optimiser, further).round(1, pupils())
+    Course(made, student().model, HardenConfig(epochs=10), optimiser, further).round(1, pupils())
     assert asked == [1]
     assert (made.model(further[0][0]).argmax(dim=1) == 9).float().mean() > 0.5  # only the batches beside say 9
 

@@ -115,12 +115,14 @@ def test_an_interrupt_of_the_check_keeps_the_answer_and_going_on_verifies_it(
     """In the first of what finds the samples, in the control group, and in the trials of the answer."""
     config = configuration().model_copy(update={"verify_spp": None if trials == 5 else 8})
     whole, rendered, once = carry_out(tmp_path / "whole", config), 0, StandInProblem.evaluate
+    answered = list[tuple[str, int]]()
 
     def evaluate(self: Any, query: Query) -> Evaluation:
         nonlocal rendered
         rendered += query.phase is None
         if rendered == trials:
             raise KeyboardInterrupt
+        answered.append((query.kind, query.number))
         return once(self, query)
 
     monkeypatch.setattr(StandInProblem, "evaluate", evaluate)
@@ -132,6 +134,8 @@ def test_an_interrupt_of_the_check_keeps_the_answer_and_going_on_verifies_it(
     assert resumed.verification is not None and whole.verification is not None
     assert resumed.verification.adversarial == whole.verification.adversarial
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
+    once_each = [number for kind, number in answered if kind == "control"]
+    assert once_each == list(range(config.trial_count)), "what was tried is not tried again"
 
 
 def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> None:

@@ -20,25 +20,16 @@ from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.patch.control import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.run_settings import RunSettings
+from advsearch.engine.run_settings import RUN_SETTINGS, check, given_to
 from advsearch.errors import InputError, UnknownNameError
 
-RUN_SETTINGS = tuple(vars(RunSettings()))
 ALL: dict[str, Any] = {"epsilon": 0.07, "norm": "l2", "texture_resolution": 16}
-
-
-def shared(config: AttackConfig) -> RunSettings:
-    return RunSettings(config.epsilon, config.norm, config.texture_resolution)
-
-
-def check(config: AttackConfig) -> None:
-    shared(config).check(config.controls, config.over)
 
 
 def settings(controls: Any, **options: Any) -> dict[str, dict[str, object]]:
     """Settings of the controls of an attack, by the name of the instance."""
     config = AttackConfig(object="mug", controls=controls, **options)
-    return {one.name: one.settings() for one in shared(config).given_to(config.controls)}
+    return {one.name: one.settings() for one in given_to(config, config.controls)}
 
 
 def test_controls_declare_settings_that_a_run_has() -> None:
@@ -93,7 +84,7 @@ def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expec
 def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
     job: Any = advsearch.attack("mug", controls=controls, **ALL)
-    again = shared(job.config).given_to(job.config.controls)
+    again = given_to(job.config, job.config.controls)
     texture: Any
     for texture in (job.controls[0], again[0]):
         assert (texture.epsilon, texture.norm, texture.resolution) == (0.07, "l2", 16)
@@ -190,7 +181,7 @@ def test_an_environment_takes_an_epsilon_for_its_harmonics(controls: Any) -> Non
     named = controls if isinstance(controls, dict) else {name: {} for name in controls}
     config = AttackConfig(object="mug", controls=named, epsilon=0.07)
     check(config)
-    (control,) = shared(config).given_to(named)
+    (control,) = given_to(config, named)
     assert control.settings()["epsilon"] == 0.07
 
 
@@ -203,7 +194,7 @@ def test_an_environment_without_harmonics_refuses_an_epsilon_of_its_own() -> Non
 def test_a_patch_takes_an_epsilon_for_searched_pixels(controls: Any) -> None:
     config = AttackConfig(object="mug", controls=controls, epsilon=0.07)
     check(config)
-    (control,) = shared(config).given_to(config.controls)
+    (control,) = given_to(config, config.controls)
     assert control.settings()["epsilon"] == 0.07
 
 
@@ -212,14 +203,14 @@ def test_an_epsilon_that_another_control_takes_leaves_a_fixed_patch() -> None:
         object="mug", controls={"texture": {}, "patch": {"pixels": 0.5, "size": [0.1, 0.3]}}, epsilon=0.07
     )
     check(config)
-    texture, patch = shared(config).given_to(config.controls)
+    texture, patch = given_to(config, config.controls)
     assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in patch.settings()
 
 
 def test_an_epsilon_that_another_control_takes_leaves_an_environment_as_it_is() -> None:
     config = AttackConfig(object="mug", controls="texture,environment", epsilon=0.07)
     check(config)
-    texture, environment = shared(config).given_to("texture,environment")
+    texture, environment = given_to(config, "texture,environment")
     assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in environment.settings()
 
 
@@ -236,8 +227,8 @@ def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
 def test_an_instance_says_its_own(setting: str) -> None:
     config = AttackConfig(object="mug", **{setting: ALL[setting]})
     with pytest.raises(InputError, match=rf"{setting}: control texture is an instance already; give it its own"):
-        shared(config).given_to([PoseControl(), TextureControl()])
-    assert shared(config).given_to([PoseControl()])[0].name == "pose"
+        given_to(config, [PoseControl(), TextureControl()])
+    assert given_to(config, [PoseControl()])[0].name == "pose"
 
 
 @pytest.mark.parametrize("given", [{"estimators": {"*": "secant"}}, {"measure": "full"}])

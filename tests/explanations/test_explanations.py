@@ -133,6 +133,7 @@ def test_intervals_of_what_decides_hold(accuracy: tuple[float, ...], rows: int) 
     steps, factors = np.array(accuracy), (Factor("x"), Factor("which", "", tuple("abcdef"[: len(accuracy)])))
     true = float(steps.var() / (steps.mean() * (1.0 - steps.mean())))
     covered_true, samples = np.zeros(2), 200
+    chance = list[tuple[float, float]]()
     for seed in range(samples):
         generator = np.random.default_rng(seed)
         values = np.stack([generator.random(rows), generator.integers(0, len(steps), rows)], axis=1)
@@ -141,7 +142,11 @@ def test_intervals_of_what_decides_hold(accuracy: tuple[float, ...], rows: int) 
             if len(one.places) == 1:
                 at = 0.0 if one.places == (0,) else true
                 covered_true[one.places[0]] += one.interval[0] <= at <= one.interval[1]
+            if one.places == (0,):
+                chance.append((one.share, (one.parts - 1) / rows))
     assert (covered_true >= 0.93 * samples).all(), covered_true / samples
+    share, added = np.mean(chance, axis=0)
+    assert share < 0.5 * added, "what decides nothing has what chance adds, less that: under 0 it counts as 0"
 
 
 def test_the_envelope_leaves_out_what_fails_and_little_else() -> None:

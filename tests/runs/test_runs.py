@@ -231,6 +231,7 @@ def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> Non
         ]
         assert store.count() == 4
         assert list(store.missing("sweep", 8)) == [range(2, 4), range(5, 8)]
+        assert list(store.missing("sweep", 6)) == [range(2, 4), range(5, 6)]
         assert list(store.missing("sweep", 5)) == [range(2, 4)] and list(store.missing("none", 2)) == [range(2)]
 
 
@@ -693,7 +694,8 @@ def filled(run: RunDirectory) -> Store:
     run.record(
         Row("search", 0, seed=2**63 - 1, spp=8, objective=0.1 + 0.2, success=True, label="bowl", label_index=2,
             probability=0.5, values=yaw, seconds=0.25, renders=1),
-        Row("search", 1, objective=math.nan, success=False, label="mug", values={**yaw, **target}, renders=13),
+        Row("search", 1, objective=math.nan, success=False, label="mug", values={**yaw, **target}, renders=13,
+            metrics={"light": 0.25}),
         Row("control", 0, spp=64, success=None),
     )  # fmt: skip
     return run.store
@@ -701,7 +703,7 @@ def filled(run: RunDirectory) -> Store:
 
 COLUMNS = [
     "id", "kind", "step", "phase", "seed", "spp", "objective", "score", "success", "correct", "margin",
-    "label", "label_index", "probability", "payload",
+    "label", "label_index", "probability", "payload", "light",
     "pose.yaw [degrees]", "camera.target[0] [sizes]", "camera.target[1] [sizes]", "backdrop.which",
     "renders", "machine", "seconds", "time",
 ]  # fmt: skip
@@ -722,6 +724,7 @@ def test_csv_has_a_column_for_each_value_with_its_unit_and_rows_in_their_order(f
     assert float(first["objective"]) == 0.1 + 0.2 and second["objective"] == ""
     assert (second["camera.target[1] [sizes]"], second["backdrop.which"]) == ("-1.0", 'a,"b"\n')
     assert (first["camera.target[0] [sizes]"], third["pose.yaw [degrees]"], second["renders"]) == ("", "", "13")
+    assert [row["light"] for row in (first, second, third)] == ["", "0.25", ""]
 
 
 def test_json_and_parquet_have_the_same_rows(filled: Store, tmp_path: Path) -> None:

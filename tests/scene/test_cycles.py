@@ -87,6 +87,7 @@ def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> No
     (lamp,) = told["lamps"]
     np.testing.assert_allclose(lamp["ball"], inputs["light.ball"].numpy(), rtol=1e-6)
     assert told["environment"] and told["bounces"] == 4 and told["turn"] == math.pi / 2
+    assert told["fov"] == pytest.approx(math.radians(float(inputs["camera.fov"])))
     assert (folder / "environment.exr").exists()
     arguments, environment = json.loads((folder / "seen.json").read_text())
     assert arguments[:3] == ["--background", "--factory-startup", "--disable-autoexec"] and "SECRET" not in environment

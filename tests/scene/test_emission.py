@@ -20,10 +20,10 @@ from trimesh.visual.material import PBRMaterial
 import advsearch
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription, describe
 from advsearch.scene.exporting.gltf import glb, posed
 from advsearch.scene.exposure import irradiance
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.files.writing import write_scene

@@ -18,7 +18,7 @@ from PIL import Image, PngImagePlugin
 import advsearch
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import EnvironmentAsset, Material
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.images import display_image
 from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.objects import import_object

@@ -24,7 +24,7 @@ from trimesh.visual.material import PBRMaterial
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene import library
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import objects, unwrap
 from advsearch.scene.importing.images import area_average, display_image
 from advsearch.scene.importing.objects import import_object

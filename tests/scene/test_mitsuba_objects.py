@@ -15,7 +15,7 @@ from PIL import Image
 import advsearch
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
-from advsearch.scene.formation import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.files.scene import import_plugins
 from advsearch.scene.mitsuba_backend.files.writing import write_scene
 from advsearch.scene.mitsuba_backend.meshes import base_texture, repeating

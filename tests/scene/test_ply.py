@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.formation import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.parts import read_parts

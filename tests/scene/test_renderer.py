@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -11,8 +13,9 @@ from torch import Tensor
 from advsearch.controls import TextureControl, make_space
 from advsearch.engine.loading import load_scene, make_renderer
 from advsearch.errors import InputError
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import describe
-from advsearch.scene.formation import ImageFormation, linear_to_srgb, srgb_to_linear, to_8_bit
+from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.scene import BASE_COLOR, MitsubaScene
 from advsearch.scene.renderer import Renderer
@@ -161,6 +164,30 @@ def test_gradients_are_finite_at_black_and_white_texels(raw: Renderer, value: fl
     assert float(u.grad.abs().sum()) > 0.0
 
 
+def test_pictures_guides_and_gradients_have_noise_of_their_own(
+    denoised: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gradient with the noise of its picture is biased: both are products of the same samples."""
+    scene, used = denoised.scene, list[int]()
+    pictures, adjoint = scene.pictures, scene.adjoint
+
+    def pictured(inputs: Mapping[str, Tensor], seeds: Mapping[str, int], spp: int) -> list[Tensor]:
+        used.extend(seeds.values())
+        return pictures(inputs, seeds, spp)
+
+    def differentiated(
+        inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, **more: Any
+    ) -> dict[str, Tensor]:
+        used.append(seed)
+        return adjoint(inputs, cotangent, seed, spp, **more)
+
+    monkeypatch.setattr(scene, "pictures", pictured)
+    monkeypatch.setattr(scene, "adjoint", differentiated)
+    for seed in (0, 1):
+        loss(denoised, inside(denoised).requires_grad_(), seed, 1).backward()
+    assert len(set(used)) == len(used) == 2 * 3
+
+
 def test_the_denoiser_is_the_identity_in_the_backward_pass(raw: Renderer, denoised: Renderer) -> None:
     gradients = []
     for render in (raw, denoised):
@@ -213,6 +240,19 @@ def test_the_transfer_curve_is_its_own_inverse_and_has_the_standard_values() -> 
     values = torch.linspace(0.0, 1.0, 257)
     assert torch.allclose(linear_to_srgb(srgb_to_linear(values)), values, atol=2e-6)
     assert float(srgb_to_linear(torch.tensor(0.5))) == pytest.approx(0.21404, abs=1e-5)
+
+
+def test_a_picture_is_radiance_times_the_gain_through_the_curve() -> None:
+    radiance = torch.tensor([[0.0, 0.1, 0.2]])
+    light = 2.5 * radiance
+    shown = {
+        "srgb": linear_to_srgb(light),
+        "gamma": light.clamp_min(1e-6) ** (1.0 / 2.2),
+        "reinhard": linear_to_srgb(light / (1.0 + light)),
+        "linear": light,
+    }
+    for transfer, expected in shown.items():
+        assert torch.allclose(ImageFormation(gain=2.5, transfer=transfer).display(radiance), expected)
 
 
 def test_the_transfer_curve_is_flat_where_it_clips_and_finite_at_black() -> None:

@@ -18,9 +18,11 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.attacks import Query
 from advsearch.cli.main import main
-from advsearch.engine.memory import Memory
+from advsearch.engine.journal import Journal
 from advsearch.engine.rows import judgement_of, trial_row
+from advsearch.engine.sharing import Shared
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.runs.directory import RunDirectory
@@ -97,7 +99,9 @@ def test_a_payload_comes_back_from_the_rows_of_searches_and_trials(tmp_path: Pat
     assert row.payload == plain(payload) and without.payload is None
     assert judgement_of(row) == Judgement(1.0, 1.0, False, Answer("here"), plain(payload))
     with RunDirectory.resume(tmp_path / "run") as run:
-        assert Memory(run).trial("sweep", 0) == judgement_of(row)
+        problem: Any = None
+        (answer,) = Journal(run, Shared(problem)).answers([Query(torch.zeros(1), 0, "sweep", 0)], lambda queries: [])
+        assert answer.said == judgement_of(row), "it is read back, and nothing is asked"
 
 
 @pytest.fixture(scope="module")

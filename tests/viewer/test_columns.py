@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stored_sweeps import make_sweep
 
 from advsearch.described import Value
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, Columns, columns_of, read_columns
+from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 
 def row(step: int, **values: Any) -> Row:
@@ -32,6 +34,17 @@ def unpacked(columns: Columns) -> tuple[dict[str, Any], dict[str, Any]]:
         name: np.frombuffer(data, kind.newbyteorder("<"), head["count"], 4 + size + at)
         for name, (kind, at) in kinds.items()
     }
+
+
+def test_a_page_embeds_the_pictures_of_the_worst_margins(tmp_path: Path) -> None:
+    run = make_sweep(tmp_path / "run", keep="all")
+    kept, columns = kept_pictures(run), read_columns(run)
+    assert kept is not None
+    wrong = [step for step, right in zip(columns.step.tolist(), columns.right.tolist(), strict=True) if not right]
+    first = [number for number, _ in kept.embedded(columns, most=1 << 20)][: len(wrong)]
+    assert first == [str(step) for step in sorted(wrong, reverse=True)]  # the margin of a wrong one grows with its step
+    size = len(path_of(run, max(wrong)).read_bytes()) * 4 // 3
+    assert [number for number, _ in kept.embedded(columns, most=size)] == first[:1]
 
 
 def test_what_is_packed_is_what_the_rows_are() -> None:

@@ -35,6 +35,7 @@ def test_the_notebook_of_the_docs_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     from matplotlib import pyplot as plt
 
     mpl.use("Agg")
+    plt.close("all")
     names: dict[str, Any] = {}
     for cell in code():
         exec(compile(cell, NOTEBOOK.name, "exec"), names)

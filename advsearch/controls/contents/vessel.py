@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import Mesh, ObjectAsset
-from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.raster import pixels_in
 
 Doubles = npt.NDArray[np.float64]

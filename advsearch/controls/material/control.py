@@ -24,8 +24,8 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.assets import Material, Mesh
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 from advsearch.scene.settings import CHANNELS, MATERIAL, colors
 
 OWN = "own"

@@ -41,8 +41,8 @@ from advsearch.controls.values import (
     read,
 )
 from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.images import read_picture
 
 BASE_COLOR = "object.base_color"

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 from advsearch.scene.geometry import Doubles, camera_to_world, object_to_world
 from advsearch.scene.surface_map import Charts, MeshSurface, rasterised
 

@@ -26,8 +26,8 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.sky.dome import TURBIDITIES, Sky
 from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import srgb_to_linear
 
 METERED_IRRADIANCE = 0.9 * math.pi / 0.8
 """`M`: the irradiance on what faces the sun, the same for every sky that is metered."""

@@ -46,9 +46,6 @@ class TrainingRounds:
         run: keeps them.
         course: trains.
         draw: draws lessons.
-        each: scenes that a round adds for each control.
-        views: of each.
-        clean_loss: share of plain pictures that may be lost.
         progress: told how far it is.
         done: what each round came to; the first is the model as it was.
     """
@@ -56,9 +53,6 @@ class TrainingRounds:
     run: RunDirectory
     course: Course
     draw: Draw
-    each: int
-    views: int
-    clean_loss: float
     progress: Progress
     done: list[TrainingRound] = field(init=False)
 
@@ -69,7 +63,7 @@ class TrainingRounds:
     @property
     def judged(self) -> int:
         """Scenes by which weights are chosen, for each control: a third as many as a round adds, up to `JUDGED`."""
-        return min(-(-self.each // 3), JUDGED)
+        return min(-(-self.course.config.scenes // 3), JUDGED)
 
     @property
     def best(self) -> int:
@@ -78,26 +72,26 @@ class TrainingRounds:
         return max(allowed, key=lambda number: (self.done[number].robust, number))
 
     def _allowed(self, clean: float) -> bool:
-        return clean >= self.done[0].clean - self.clean_loss - 1e-9
+        return clean >= self.done[0].clean - self.course.config.clean_loss - 1e-9
 
-    def carry_out(self, count: int) -> None:
-        """Do what is left of so many rounds; the student has the best weights afterwards, which the run keeps."""
-        if len(self.done) <= count:
-            self._train(count)
+    def carry_out(self) -> None:
+        """Do what is left of the rounds; the student has the best weights afterwards, which the run keeps."""
+        if len(self.done) <= self.course.config.rounds:
+            self._train()
         student = self.course.student
         student.net.load_state_dict(self._weights(self.best))
         self._save(WEIGHTS)
         folder = self.run.path / ARTIFACTS
         write_archive(folder / FOLDER, folder / ARCHIVE)
 
-    def _train(self, count: int) -> None:
-        student, pool, begun = self.course.student, list[Lesson](), 0
+    def _train(self) -> None:
+        student, config, pool, begun = self.course.student, self.course.config, list[Lesson](), 0
         held_back = self.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged), VALIDATION_VIEWS)
         if not self.done:
             self._keep(0, [], score(student.model, held_back), 0, 0.0)
-        for number in range(1, count + 1):
-            places = range((number - 1) * self.each, number * self.each)
-            new = self.draw(f"round {number}: drawing scenes", TRAINING, places, self.views)
+        for number in range(1, config.rounds + 1):
+            places = range((number - 1) * config.scenes, number * config.scenes)
+            new = self.draw(f"round {number}: drawing scenes", TRAINING, places, config.views)
             pool += new
             if number < len(self.done):
                 continue  # done before this run was stopped

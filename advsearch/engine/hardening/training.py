@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from advsearch import threads
+from advsearch import seeds, threads
+from advsearch.config import HardenConfig
 from advsearch.engine.hardening.gradients import Gradients
 from advsearch.engine.hardening.lessons import TOGETHER, Lesson, TextureLesson, harder, with_worst
 from advsearch.models import Model
@@ -50,20 +51,14 @@ class Course:
     Attributes:
         student: what is trained.
         given: the model as it was given; its answers to plain pictures are kept.
-        rate: the highest learning rate; of an optimiser of the user's, its own counts.
-        epochs: how often a round looks at each lesson.
-        seed: of the order.
-        looks: how often an epoch looks at each lesson with a texture.
+        config: what was asked for; of an optimiser of the user's, its own learning rate counts.
         optimiser: makes one of the parameters; None for AdamW.
         beside: further examples; a batch of them is taken with each step, from the start again when they end.
     """
 
     student: Trainable
     given: Model
-    rate: float
-    epochs: int
-    seed: int
-    looks: int = 1
+    config: HardenConfig
     optimiser: MakeOptimiser | None = None
     beside: Examples | None = None
     _further: Iterator[tuple[Tensor, Tensor]] = field(default_factory=lambda: iter(()))
@@ -76,9 +71,9 @@ class Course:
             chosen: lessons.
             tick: told of every step.
         """
-        parameters = self.student.parameters()
+        parameters, config = self.student.parameters(), self.config
         if self.optimiser is None:
-            optimiser: torch.optim.Optimizer = torch.optim.AdamW(parameters, lr=self.rate, weight_decay=WEIGHT_DECAY)
+            optimiser: torch.optim.Optimizer = torch.optim.AdamW(parameters, lr=config.rate, weight_decay=WEIGHT_DECAY)
         else:
             optimiser = self.optimiser(parameters)
         steps, done, places = self.steps(chosen), 0, self._places(chosen)
@@ -87,10 +82,10 @@ class Course:
             optimiser, highest, total_steps=steps + 1, pct_start=WARM_UP, cycle_momentum=False
         )
         average = [one.detach().clone() for one in parameters]
-        rng = np.random.default_rng([self.seed, number])
+        rng = np.random.default_rng([seeds.stream(config.seed, "order"), number])
         with threads.one_each_for_torch() as pool:
             gradients = Gradients(self.student, self.given, pool)
-            for _ in range(self.epochs):
+            for _ in range(config.epochs):
                 order = rng.permutation(places)
                 for begin in range(0, len(order), BATCH):
                     batch = [chosen[place] for place in order[begin : begin + BATCH]]
@@ -107,11 +102,11 @@ class Course:
 
     def steps(self, chosen: Sequence[Lesson]) -> int:
         """Steps of a round over lessons."""
-        return self.epochs * -(-len(self._places(chosen)) // BATCH)
+        return self.config.epochs * -(-len(self._places(chosen)) // BATCH)
 
     def _places(self, chosen: Sequence[Lesson]) -> list[int]:
         """Places of lessons, as often as an epoch looks at each."""
-        often = [self.looks if isinstance(one, TextureLesson) else 1 for one in chosen]
+        often = [self.config.texture_looks if isinstance(one, TextureLesson) else 1 for one in chosen]
         return [place for place, times in enumerate(often) for _ in range(times)]
 
     def _step(self, batch: Sequence[Lesson], gradients: Gradients, optimiser: torch.optim.Optimizer, seed: int) -> None:

@@ -76,7 +76,7 @@ class Batches:
 
     def __init__(self, job: Job, per_scene: int) -> None:
         self._job, self._per_scene = job, per_scene
-        self._seeds = Seeds(job.pictures.seed, KIND)
+        self._seeds = Seeds(job.config.seed, KIND)
         self.view: SweptScene | None = None
 
     def open(self, scene: int) -> SweptScene:
@@ -125,5 +125,5 @@ class Batches:
 
     def _is_kept(self, seen: Iterable[Judgement]) -> bool:
         """Whether the thumbnail of a picture of which the models say this is kept."""
-        asked = self._job.keep_pictures
+        asked = self._job.config.keep_pictures
         return asked == "all" or (asked == "wrong" and not all(one.right for one in seen))

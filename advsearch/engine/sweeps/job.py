@@ -5,24 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from advsearch.config import SweepConfig
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
 from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
-from advsearch.engine.loading import PictureSettings, Scene, framed
+from advsearch.engine.loading import Scene, framed
 from advsearch.engine.metrics import Metrics
 from advsearch.engine.sweeps.axes import Axis, on_grid
 from advsearch.engine.sweeps.points import Drawn, Points
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.scene.description import ENVIRONMENT
+from advsearch.scene.formation import next_count
 from advsearch.tasks import Facts, Task
 from advsearch.tasks.base import Truth
+
+SAMPLES = 100
+"""Draws where there is no grid and nothing is said."""
 
 
 @dataclass(frozen=True)
@@ -60,59 +64,41 @@ class Job:
     """Everything that was asked for, found and loaded.
 
     Attributes:
-        object: as it was asked for: all names, separated by commas.
-        environment: likewise.
-        task: name of the task.
-        label: what was said to be right; None for each object's own.
-        pictures: how the scenes are rendered.
-        spp: samples a pixel.
+        config: what was asked for.
         places: the scenes.
         models: the networks, loaded.
         tasks: what judges the output of each.
         controls: what is drawn by chance.
         axes: of the grid.
-        samples: draws at each point of the grid.
-        sampler: how they are made: "sobol" or "random".
-        batch: pictures that the models see at once.
-        trials: fresh renders that check the worst configuration; 0 for none.
-        ladder: sample counts that this climbs.
-        command_line: the command that asks the same again.
-        warnings: on the way.
-        keep_pictures: thumbnails that are kept: "all", "wrong" (what any of the models gets wrong) or "none".
-        specialise: whether pictures that differ in light alone may be predicted.
         aovs: layers of ground truth that are kept of every picture of the first model (`scene.surfaces.AOVS`).
-        surface: whether it is counted which parts of the surface, when seen, go with wrong answers.
+        warnings: on the way.
         metrics: numbers of every picture that rows have beside what the task says.
     """
 
-    object: str
-    environment: str
-    task: str
-    label: str | None
-    pictures: PictureSettings
-    spp: int
+    config: SweepConfig
     places: tuple[NamedScene, ...]
     models: tuple[Model, ...]
     tasks: tuple[Task, ...]
     controls: tuple[Control, ...]
     axes: tuple[Axis, ...]
-    samples: int
-    sampler: Literal["sobol", "random"]
-    batch: int
-    trials: int
-    ladder: Sequence[int]
-    command_line: str
-    warnings: tuple[str, ...]
-    keep_pictures: Literal["all", "wrong", "none"] = "none"
-    specialise: bool = True
     aovs: tuple[str, ...] = ()
-    surface: bool = False
+    warnings: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
+
+    @property
+    def samples(self) -> int:
+        """Draws at each point of the grid."""
+        return self.config.samples or (SAMPLES if self.controls and not self.axes else 1)
+
+    @property
+    def spp(self) -> int:
+        """Samples a pixel, as the sampler has them."""
+        return next_count(self.config.pixel_sampler, self.config.search_spp)
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:
         """(height, width) of the pictures for each model."""
-        return tuple(map(self.pictures.size, self.models))
+        return tuple(self.config.resolution or model.input_size for model in self.models)
 
     def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
         """The controls, those of the grid as choices, bound to a scene.
@@ -139,8 +125,8 @@ class Job:
         """The configurations of a space; those with an answer have the draws of those without it."""
         scenes = len(self.places) // 2 if self.places[0].answer else 0
         domain = domain_of(space.controls)
-        among = len(self.places)
-        return Points(space, domain, self.axes, self.samples, self.sampler, self.pictures.seed, scenes, among)
+        among, config = len(self.places), self.config
+        return Points(space, domain, self.axes, self.samples, config.sampler, config.seed, scenes, among)
 
     def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
         """What is true of a configuration, as the task of a model needs it.
@@ -154,7 +140,7 @@ class Job:
         return self.tasks[model].truth(self._facts(place, values, look))
 
     def _facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
-        return facts_of(place.scene, place.object, self.label, lambda: values, look)
+        return facts_of(place.scene, place.object, self.config.label, lambda: values, look)
 
     def check_truths(self, place: NamedScene) -> None:
         """Refuse a scene of which a task cannot say what is right.
@@ -163,7 +149,7 @@ class Job:
             InputError: a model has no such class, say, or the object has no label.
         """
         for task, model in zip(self.tasks, self.models, strict=True):
-            check_truth(task, model, place.scene, self._facts(place, {}), self.pictures)
+            check_truth(task, model, place.scene, self._facts(place, {}), self.config)
 
 
 def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]) -> None:

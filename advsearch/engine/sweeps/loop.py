@@ -99,7 +99,7 @@ class Sweep:
         self.per_scene, self.models = self.points.count, len(job.models)
         self.total = len(job.places) * self.per_scene * self.models
         self.samples = job.spp
-        self._seeds = Seeds(job.pictures.seed, KIND)
+        self._seeds = Seeds(job.config.seed, KIND)
         self._kept: list[store.Row] = []
         self._batches = Batches(job, self.per_scene)
         self._executor = InProcess(self._batches) if executor is None else executor
@@ -142,7 +142,7 @@ class Sweep:
                 self._batches.open((left[0].start if left else self.total - 1) // self.models // self.per_scene)
                 hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
                 hint += " or fewer points shorten it"
-                if self.run is not None and self.job.keep_pictures != "none":
+                if self.run is not None and self.job.config.keep_pictures != "none":
                     hint += f"; pictures that are kept take {self._pictures_text()}"
                 self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
                 self.stages.progress.advance(self.total - sum(map(len, left)))
@@ -150,7 +150,7 @@ class Sweep:
                 worst = self._claimed(tally)
                 if worst is not None:
                     worst = worst.model_copy(update=self._verified(worst))
-                if self.job.surface and self.run is not None:
+                if self.job.config.surface and self.run is not None:
                     self.stages.begin("surface", "tracing the surface that was seen", self.total)
                     rows = self.run.store.rows(KIND)
                     self._surface = map_surface(self.job, rows, self._batches.open, self.run, self.stages.progress)
@@ -189,7 +189,7 @@ class Sweep:
             while first < last:
                 scene = first // self.per_scene
                 before = scene * self.per_scene
-                for piece in batches(first - before, min(last - before, self.per_scene), self.job.batch):
+                for piece in batches(first - before, min(last - before, self.per_scene), self.job.config.batch):
                     yield range(before + piece.start, before + piece.stop)
                 first = before + self.per_scene
 
@@ -231,7 +231,7 @@ class Sweep:
         share = min(1.0, thumbnails.SIDE / max(height, width)) ** 2 * height * width / thumbnails.SIDE**2
         megabytes = self.total // self.models * thumbnails.BYTES * share / 1e6
         size = f"{megabytes / 1e3:.1f} GB" if megabytes >= 1e3 else f"{max(megabytes, 0.1):.1f} MB"
-        return f"about {size}" if self.job.keep_pictures == "all" else f"at most about {size}"
+        return f"about {size}" if self.job.config.keep_pictures == "all" else f"at most about {size}"
 
     def _row(
         self,
@@ -388,10 +388,10 @@ class Sweep:
             formation = formation.model_copy(update={"gain": None})
         summary = SweepSummary(
             run=None if self.run is None else str(self.run.path),
-            object=job.object,
+            object=job.config.object,
             model=",".join(model.name for model in job.models),
-            task=job.task,
-            environment=self.points.environment or job.environment,
+            task=job.config.task_name,
+            environment=self.points.environment or job.config.lit_by,
             controls=[control.name for control in job.controls],
             ending=ending,
             image_formation=formation,
@@ -407,7 +407,7 @@ class Sweep:
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
-            sampler=job.sampler if job.controls else None,
+            sampler=job.config.sampler if job.controls else None,
             spp=self.samples,
             renders={
                 "sweep": self._traced,
@@ -419,9 +419,9 @@ class Sweep:
             shared=SharedWork.of_facts(self._executor.facts, self._machines.known),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
-            seed=job.pictures.seed,
+            seed=job.config.seed,
             warnings=[*job.warnings, *self._remarks(tally, checked)],
-            command_line=job.command_line,
+            command_line=job.config.command_line(),
         )
         if self.run is not None:
             self.run.write_summary(summary)

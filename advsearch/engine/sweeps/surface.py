@@ -182,7 +182,7 @@ def _empty(job: Job, wrong: npt.NDArray[np.int8]) -> dict[str, SurfaceCounts]:
         parts, tallies = SurfaceParts(asset.mesh), []
         mine = wrong[[place.object == name for place in job.places]]
         for model in range(models):
-            seed = seeds.stream(job.pictures.seed, "surface", number * models + model)
+            seed = seeds.stream(job.config.seed, "surface", number * models + model)
             answers, failures = (int((mine[..., model] >= least).sum()) for least in (0, 1))
             tallies.append(PartCounts(parts.count, answers, failures, seed))
         counts[name] = SurfaceCounts(parts, tallies)

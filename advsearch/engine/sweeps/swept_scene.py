@@ -57,7 +57,7 @@ class SweptScene:
     """
 
     def __init__(self, job: Job, number: int) -> None:
-        place, pictures = job.places[number], job.pictures
+        place, config = job.places[number], job.config
         self.number, self._job = number, job
         self.points: dict[tuple[int, int], Points] = {}
         self.renderers: dict[tuple[int, int], Renderer] = {}
@@ -65,7 +65,7 @@ class SweptScene:
         for size, space in self._spaces.items():
             description = framed(place.scene.description, size)
             self.renderers[size] = make_renderer(
-                description, space, size, pictures.denoise, pictures.seed, sampler=pictures.sampler
+                description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
             )
             self.points[size] = job.points(space)
         self.light = {
@@ -74,9 +74,9 @@ class SweptScene:
                 self.points[size],
                 job.axes,
                 job.spp,
-                seeds.stream(pictures.seed, "sweep light", number),
+                seeds.stream(config.seed, "sweep light", number),
                 partial(self._score, job.sizes.index(size)),
-                job.specialise,
+                config.specialise,
             )
             for size, renderer in self.renderers.items()
         }

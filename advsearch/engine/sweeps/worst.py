@@ -20,6 +20,7 @@ from advsearch.engine.rows import rate_of
 from advsearch.engine.sharing import Shared
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import SweptScene
+from advsearch.engine.verifier import ladder_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import WorstVerified
 
@@ -57,9 +58,10 @@ def check_worst(
     Returns:
         As `verified` in the summary; None without trials.
     """
-    if job.trials == 0:
+    config = job.config
+    if config.trials == 0:
         return None
-    seed, ladder = job.pictures.seed, job.ladder
+    seed, ladder = config.seed, ladder_of(config)
     stages.begin(
         "verification",
         "finding how many samples the check needs",
@@ -72,24 +74,25 @@ def check_worst(
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
         nonlocal number
+        first, number = number, number + len(seeds)
+        asked = enumerate(seeds, first)
+        queries = [Query(u, seed, PROBES, place, spp=spp, drawn=False, sought=False) for place, seed in asked]
         found = []
-        for seed in seeds:
-            (answer,) = journal.answers([Query(u, seed, PROBES, number, spp=spp, drawn=False, sought=False)])
+        for answer in journal.answers(queries):
             found.append(answer.said.score)
-            number += 1
             stages.progress.advance(spp)
         return found
 
     count = choose_spp({"worst": margins}, seed=seed, ladder=ladder)
-    hint = f"{job.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
-    stages.begin("verification", "checking the worst configuration with fresh renders", job.trials, hint=hint)
+    hint = f"{config.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
+    stages.begin("verification", "checking the worst configuration with fresh renders", config.trials, hint=hint)
 
     def answers(queries: Sequence[Query]) -> Iterator[Evaluation]:
         for answer in journal.answers([replace(one, drawn=False, sought=False) for one in queries]):
             stages.progress.advance(1)
             yield answer
 
-    tried = run_trials(answers, u, spp=count.spp, seed=seed, trials=job.trials)
+    tried = run_trials(answers, u, spp=count.spp, seed=seed, trials=config.trials)
     settled = count.converged or len(ladder) == 1
     renders = count.renders + len(tried)
     wrong = [trial for trial in tried if trial.success]

@@ -27,7 +27,8 @@ from advsearch.evaluation.stability.closed_form import Toy
 from advsearch.evaluation.stability.scene import SIZE, ControlSettings, small
 from advsearch.models import load_model
 from advsearch.scene.assets import Floats
-from advsearch.scene.formation import linear_to_srgb, to_8_bit
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.formation import to_8_bit
 
 LONG = 10_000
 BITS = 1e-5

@@ -276,7 +276,7 @@ class Evaluator:
     def __call__(self, query: Query) -> Evaluation:
         """Answer a query."""
         renderer, derivative = self.renderer, None
-        u, seed, spp, gradient = query.u, query.seed, self.spp * query.samples, query.gradient
+        u, seed, spp, gradient = query.u, query.number, self.spp * query.samples, query.gradient
         bad, renders = renderer.non_finite, renderer.renders
         if gradient:
             value, derivative = renderer.gradient(self.loss, u, seed, spp, free=gradient == "free")

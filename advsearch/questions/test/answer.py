@@ -76,3 +76,6 @@ def verdict(claims: list[ClaimAnswer]) -> str:
     """Return what a suite says as a whole: the worst of what was not expected."""
     worse = [one.answer for one in claims if not one.accepted]
     return max(worse, key=ANSWERS.index, default=HELD)
+
+
+RESULT = SuiteResult

@@ -20,6 +20,7 @@ from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
 from advsearch.engine.sharing import Shared
+from advsearch.engine.verifier import ladder_of
 from advsearch.progress import Progress
 from advsearch.questions.test import words
 from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer
@@ -29,7 +30,6 @@ from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.scene.formation import next_count
 
 MANY = 4
 """Values of a configuration that are said in words, at most."""
@@ -305,4 +305,4 @@ def decided(sequence: ConfidenceSequence, least: float) -> str:
 def spp_of(config: SceneConfig) -> int:
     """Return the samples a pixel of each picture."""
     assert isinstance(config, DrawnConfig)
-    return next_count(config.pixel_sampler, config.verify_spp)
+    return ladder_of(AttackConfig.of(config, verify_spp=config.verify_spp))[0]

@@ -14,7 +14,7 @@ LARGEST = 2_000_000
 """Bytes of a picture that the page takes along."""
 
 
-def suite_page(run: Path, result: SuiteResult) -> str:
+def page(run: Path, result: SuiteResult) -> str:
     """Return the page of a suite in the folder `run`."""
     links = part_links(run, [one.part for one in result.claims])
     note = (

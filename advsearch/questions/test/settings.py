@@ -104,3 +104,6 @@ class DrawnConfig(SceneConfig):
     verify_spp: int = setting_as_in(
         AttackConfig, "verify_spp", default=16, description="samples per pixel of each picture", otherwise=""
     )
+
+
+CONFIG = SuiteConfig

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from advsearch import rooms
 from advsearch.files import JsonObject
-from advsearch.questions.test.answer import SuiteResult
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckResult
@@ -32,13 +32,13 @@ KEPT: tuple[type[Result], ...] = (
     RecipeResult,
     ExplainResult,
     HardenResult,
-    SuiteResult,
 )
-"""The results that a run keeps in `summary.json`."""
+"""The results that a run keeps in `summary.json`, but for those of questions that are rooms."""
 
 
 def kind_of(values: JsonObject) -> type[Result] | None:
     """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
     if values.get("command") == AttackSummary.command and "parts" in values:
         return MatrixResult if "models" in values else CurveResult
-    return next((kind for kind in KEPT if kind.command == values.get("command")), None)
+    own: type[Result] | None = rooms.in_room(str(values.get("command")), "answer", "RESULT")
+    return own or next((kind for kind in KEPT if kind.command == values.get("command")), None)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Floats, Material, Mesh
-from advsearch.scene.formation import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 
 Doubles = npt.NDArray[np.float64]

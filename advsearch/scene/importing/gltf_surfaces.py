@@ -11,7 +11,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.pictures import FORMATS
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.gltf_buffers import Buffers
 from advsearch.scene.importing.gltf_entries import (

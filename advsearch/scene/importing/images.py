@@ -12,7 +12,7 @@ from PIL import Image
 from scipy import sparse
 
 from advsearch.pictures import check_decodable, opened, steps_of
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import LARGEST_FILE
 
 Floats = npt.NDArray[np.float32]

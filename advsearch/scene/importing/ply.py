@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.checks import MOST_CORNERS, check_faces
 from advsearch.scene.importing.corners import Looked, split_at_corners
 from advsearch.scene.importing.files import damaged, shown

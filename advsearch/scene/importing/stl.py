@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.checks import check_faces
 from advsearch.scene.importing.files import damaged, looks_like, text_of
 from advsearch.scene.importing.imported_part import ImportedPart

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
-from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 
 Floats = npt.NDArray[np.float32]
 

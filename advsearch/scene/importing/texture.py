@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, csgraph
 
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.geometry import Array, Ints, Soup
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.importing.normal_maps import FLAT

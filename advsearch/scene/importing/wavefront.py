@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.corners import Looked, split_at_corners
 from advsearch.scene.importing.files import damaged, looks_like, shown
 from advsearch.scene.importing.imported_part import ImportedPart

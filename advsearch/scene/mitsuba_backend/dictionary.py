@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from advsearch.errors import InputError
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.meshes import matt, mitsuba_mesh
 from advsearch.scene.mitsuba_backend.parts import SceneInput, number, transform

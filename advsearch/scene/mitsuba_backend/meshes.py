@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.assets import Floats, Mesh
-from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
 from advsearch.scene.parts import BASE_COLOR, MeshPart

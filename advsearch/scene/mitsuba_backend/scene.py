@@ -34,7 +34,7 @@ from advsearch.scene.mitsuba_backend.parts import (
     translation,
 )
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, media_in, mitsuba, one_at_a_time, population
+from advsearch.scene.mitsuba_backend.variant import Plugin, media_in, mitsuba, one_at_a_time, population, recorded
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -215,7 +215,7 @@ class MitsubaScene:
             for (what, seed), integrator in zip(seeds.items(), integrators, strict=True):
                 key = what, spp, self._depth
                 if self._freeze and key not in self._recorded:
-                    self._recorded[key] = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
+                    self._recorded[key] = recorded(render, media)
                 function: Callable[..., Any] = self._recorded.get(key, render)
                 image = function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)).torch().clone()
                 if what == "guides":
@@ -382,11 +382,9 @@ class MitsubaScene:
         Vertices are written into the memory where they are: recordings hold on to it. Numbers that Mitsuba takes for
         constants are part of a recording, so that every change makes all recordings stale.
         """
+        mi = mitsuba()  # somebody else may have taken another variant since
         import drjit as dr
-        import mitsuba as mi
 
-        if mi.variant() != VARIANT:  # somebody else has taken another one since
-            mitsuba()
         unknown = [name for name in inputs if name not in self.declared]
         if any(name.endswith(".base_color") for name in unknown):
             raise InputError(
@@ -409,7 +407,7 @@ class MitsubaScene:
             own = self.parameters[key]
             if name not in self._base:
                 self._base[name] = type(own)(own.torch().clone() if name in self._buffers else own)
-            given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)  # type: ignore[call-overload]
+            given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
             if fresh is not None and one.write:
                 given = one.write(given)
             if name in self._buffers:

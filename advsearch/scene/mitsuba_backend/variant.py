@@ -7,7 +7,7 @@ import gc
 import sys
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
@@ -56,6 +56,28 @@ def fewer_warnings() -> Iterator[None]:
         yield
     finally:
         mi.set_log_level(before)
+
+
+def recorded(render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]:
+    """Return a function that Dr.Jit records on first use and replays later; `media` are a part of what it is given.
+
+    Nothing may be freed while it records: memory that torch shares and scenes end with a host function, which Dr.Jit
+    1.5.0 cannot record, and the process ends. So Python's garbage collector waits until after.
+    """
+    import drjit as dr
+
+    frozen = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
+
+    def function(*arguments: Any) -> Any:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return frozen(*arguments)
+        finally:
+            if collects:
+                gc.enable()
+
+    return function
 
 
 def _settle(mi: ModuleType) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import Floats
-from advsearch.scene.formation import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
 from advsearch.scene.parts import BASE_COLOR, plugins_in
 

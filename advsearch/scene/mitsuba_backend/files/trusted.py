@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.files import note_opened
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
 from advsearch.scene.environments import import_environment, read_light
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.images import TEXTURE_LIMIT, banded_average, read_picture
 from advsearch.scene.importing.parts import read_parts

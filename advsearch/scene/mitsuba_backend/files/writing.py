@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import linear_to_srgb
 from advsearch.scene.mitsuba_backend.dictionary import GROUND, scene_dict
 from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, matt, own_surface, principled
 from advsearch.scene.mitsuba_backend.parts import translation

@@ -1,0 +1,263 @@
+"""`compare`: read the sides from stored sweeps, or sweep first; count pairs; show what one side alone gets right."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from advsearch.api.keywords import Named, Names, PictureKeywords, asks, configured
+from advsearch.api.subruns import carry_out_part
+from advsearch.api.sweep import job_of
+from advsearch.attacks import clopper_pearson
+from advsearch.engine.loading import Controls
+from advsearch.engine.sweeps.batch import Batches
+from advsearch.engine.sweeps.job import check_all
+from advsearch.errors import InputError, ModelError
+from advsearch.interrupts import interruptible
+from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult, PairPicture
+from advsearch.questions.compare.pairs import compared, far_apart
+from advsearch.questions.compare.settings import CompareConfig
+from advsearch.questions.compare.sides import Side, differing, read_sides, varying
+from advsearch.runs.directory import PARTS, RunDirectory, find_run
+from advsearch.runs.files import write_bytes
+from advsearch.runs.results.base import INTERRUPTED
+from advsearch.settings import split_names
+from advsearch.viewer import thumbnails
+from advsearch.viewer.columns import Column
+from advsearch.viewer.pages import write_page
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+SWEEP = "sweep"
+"""The part that holds the sweep of models."""
+
+
+class CompareKeywords(PictureKeywords, total=False):
+    """Of `compare`."""
+
+    object: Names
+    task: Named
+    grid: dict[str, object]
+    controls: Controls
+    samples: int | None
+    sampler: Literal["sobol", "random"]
+    batch: int
+    keep_pictures: Literal["all", "wrong", "none"]
+    specialise: bool
+    spp: int | None
+    workers: int | None
+    cluster: str | None
+    pictures: int
+    run: str | Path | None
+    overwrite: bool
+
+
+@asks(CompareConfig, CompareKeywords)
+def compare(
+    compared: str | Path | Sequence[str | Path],
+    *,
+    progress: Watched = None,
+    **settings: Unpack[CompareKeywords],
+) -> CompareResult:
+    """Compare models, objects or answers on the same pictures, pair by pair (docs/compare.md).
+
+    All other arguments are the settings of `advsearch compare`. The run is kept, in `run` or under runs/. Models that
+    exist in Python alone are swept first (`sweep(scene, [one, other], run=...)`), and then the run is compared.
+
+    Args:
+        compared: names or folders of runs of `sweep`: one of several models, or several of the same draws. With
+            `object`, names of models, which are shown it first.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    return compare_from_config(configured(CompareConfig, compared=compared, **settings), progress=watcher(progress))
+
+
+def compare_from_config(
+    config: CompareConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> CompareResult:
+    """Compare what a configuration describes.
+
+    Raises:
+        InputError: sweeps are of other draws, or there is nothing to compare.
+        FileFormatError: a run is not a finished sweep.
+    """
+    begun, progress = time.perf_counter(), progress or NullProgress()
+    stored: list[Side] = []
+    if not config.object:
+        progress.stage("reading rows")
+        stored = read_sides([find_run(name) for name in split_names(config.compared)])
+    with RunDirectory.of(config, resumed) as run:
+        sides, swept = stored, 0
+        if config.object:
+            part = run.path / PARTS / SWEEP
+            done = carry_out_part(part, config.sweep().with_only_here(config.only_here), progress)
+            swept = sum(getattr(done, "renders", {}).values())
+            sides = [] if done.goes_on else read_sides([part])
+        pictures = _Pictures(run.path, progress)
+        pairs = []
+        for number, other in enumerate(sides[1:], start=1):
+            progress.stage("counting pairs")
+            pair = _counted(sides[0], other, config.seed, pictures)
+            shown = list(pictures.of(sides[0], other, config.pictures, number))
+            pairs.append(pair.model_copy(update={"shown": shown}))
+        first = sides[0] if sides else None
+        result = CompareResult(
+            run=str(run.path),
+            environment=_together([one.summary.environment for one in sides]) or config.lit_by,
+            controls=first.summary.controls if first else list(config.controls),
+            object=_together([one.named["object"] for one in sides]) or config.object,
+            model=_together([one.named["model"] for one in sides]) or config.compared,
+            task=first.summary.task if first else config.task_name,
+            differ=differing(sides) if sides else [],
+            sides=[_side(one) for one in sides],
+            pairs=pairs,
+            renders=swept + pictures.rendered,
+            ending=INTERRUPTED if pictures.interrupted or not sides else "done",
+            warnings=[*_cautions(sides), *pictures.warnings],
+            seconds={"total": time.perf_counter() - begun},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        run.write_summary(result)
+        write_page(run.path, result)
+        return result
+
+
+def _counted(first: Side, second: Side, seed: int, pictures: _Pictures) -> ComparedPair:
+    """Two sides counted; without rules, and why, where the library that finds them is missing."""
+    try:
+        return compared(first, second, seed)
+    except InputError as error:
+        text = f"Where one side is worse was not looked for: {error}"
+        pictures.warnings += [text] if text not in pictures.warnings else []
+        return compared(first, second, seed, rules=False)
+
+
+def _side(side: Side) -> ComparedSide:
+    right, total = int(side.right.sum()), len(side)
+    return ComparedSide(
+        name=side.name,
+        run=str(side.folder),
+        **side.named,
+        configurations=total,
+        correct=right,
+        accuracy=right / total,
+        interval=clopper_pearson(right, total),
+        seconds=side.seconds,
+    )
+
+
+def _together(names: Sequence[str]) -> str:
+    return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
+
+
+def _cautions(sides: Sequence[Side]) -> list[str]:
+    """What a reader has to know of the sweeps."""
+    if not sides:
+        return []
+    found = [text for side in sides for text in side.summary.warnings]
+    names = differing(sides)
+    if len(names) > 1:
+        listed = f"{', '.join(names[:-1])} and {names[-1]}"
+        found.append(f"The sweeps differ in {listed}: what is told here is of all of that together.")
+    if not names:
+        found.append("The sweeps have the same settings: what differs is in files, in versions, or in the machine.")
+    tasks = {side.summary.task for side in sides}
+    if len(tasks) > 1:
+        found.append(f"What counts as right is judged by different tasks: {', '.join(sorted(tasks))}.")
+    return list(dict.fromkeys(found))
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Pictures:
+    """Small pictures of pairs in the folder of the run: those that sweeps kept, or rendered again."""
+
+    folder: Path
+    progress: Progress
+    rendered: int = 0
+    interrupted: bool = False
+    warnings: list[str] = field(default_factory=list)
+    batches: dict[Path, Batches | None] = field(default_factory=dict)
+
+    def of(self, first: Side, second: Side, most: int, pair: int) -> Iterator[PairPicture]:
+        """Yield what one side alone gets right, with pictures as far as they are to be had.
+
+        Args:
+            first: of the sides.
+            second: of them.
+            most: pictures of each.
+            pair: number of the two.
+        """
+        numbers, columns = far_apart(first, second, most), varying(first.columns)
+        together = first.folder == second.folder and bool((first.numbers == second.numbers).all())
+        sides = [first] if together else [first, second]
+        with suppress(KeyboardInterrupt), interruptible():
+            self._make(numbers, sides, pair)
+        for number in numbers:
+            names = [name for place in range(len(sides)) if self._file(name := _name(pair, number, place)).is_file()]
+            yield PairPicture(
+                number=number,
+                values={one.name: _value(one, number) for one in columns},
+                right=(first if first.right[number] else second).name,
+                answers=(str(first.answers[number]), str(second.answers[number])),
+                pictures=names if len(names) == len(sides) else [],
+            )
+
+    def _make(self, numbers: Sequence[int], sides: Sequence[Side], pair: int) -> None:
+        """Put the pictures of some pairs into the folder."""
+        self.interrupted = True  # unless it comes to its end
+        missing: list[tuple[Side, int, Path]] = []
+        for place, side in enumerate(sides):
+            for number in numbers:
+                file = self._file(_name(pair, number, place))
+                kept = thumbnails.path_of(side.folder, int(side.numbers[number]))
+                if kept.is_file():
+                    write_bytes(file, kept.read_bytes(), durable=False)
+                elif not file.is_file():
+                    missing.append((side, int(side.numbers[number]), file))
+        if missing:
+            self.progress.stage("rendering pictures again", len(missing), hint="`pictures` says how many")
+        for side, number, file in sorted(missing, key=lambda one: (str(one[0].folder), one[1])):
+            batches = self._batches(side)
+            if batches is not None:
+                picture = batches.pictures(range(number, number + 1))[0]
+                write_bytes(file, thumbnails.thumbnail(picture), durable=False)
+                self.rendered += 1
+            self.progress.advance(1)
+        self.interrupted = False
+
+    def _batches(self, side: Side) -> Batches | None:
+        """What renders pictures of a sweep as it did; None where scene or model are not to be had any more."""
+        if side.folder not in self.batches:
+            self.batches[side.folder] = None
+            try:
+                job = job_of(side.config)
+                self.batches[side.folder] = Batches(job, check_all(job)[0].count)
+            except (InputError, ModelError) as error:
+                self.warnings.append(f"Pictures of {side.folder.name} are not shown: {error}")
+        return self.batches[side.folder]
+
+    def _file(self, name: str) -> Path:
+        return self.folder / name
+
+
+def _name(pair: int, number: int, place: int) -> str:
+    """The file of a picture of a pair, in the folder of the run."""
+    return f"images/pair-{pair}-{number}-{'ab'[place]}.jpg"
+
+
+def _value(column: Column, number: int) -> str | float:
+    value = column.data[number]
+    return column.levels[int(value)] if column.levels is not None else float(f"{float(value):.6g}")

@@ -1,0 +1,248 @@
+"""What is compared, read from stored sweeps: for every side its rows, in the order of the pictures.
+
+Pictures of a sweep are numbered, and the draw of a picture follows from its number. So sweeps with the same seed, grid
+and controls have the same draws, and pictures with the same number are a pair, whatever else differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.config import SweepConfig
+from advsearch.errors import FileFormatError, InputError
+from advsearch.explanations.observations import Factor, Observations
+from advsearch.report.wording import short_names
+from advsearch.runs.directory import CONFIG
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.store import NAME, Store
+from advsearch.runs.summary import read_result
+from advsearch.viewer.columns import KIND, Column, read_columns
+
+DRAWS = ("grid", "controls", "samples", "sampler", "seed")
+"""The settings that decide what is drawn."""
+
+OF_THE_SIDE = ("object", "model", "answer")
+"""What may tell sides apart, as rows have it."""
+
+FOLLOWS = (*DRAWS, "label", "labels", "prompt", "up", "batch", "keep_pictures", "trials", "verify_spp", "specialise")
+"""Settings that do not tell sweeps apart: of draws, along with object and model, or of no answer."""
+
+TOLERANCE = 1e-4
+"""Of a value, relative to the largest in its column: values come from single precision."""
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the things that are compared.
+
+    Attributes:
+        name: what tells it from the others.
+        folder: of its sweep.
+        config: of its sweep.
+        summary: of its sweep.
+        named: object, model and answer.
+        numbers: (n,) of the pictures in its sweep.
+        right: (n,) whether the model is right.
+        margin: (n,) float32, over 0 where the answer is wrong; NaN where there was none.
+        answers: (n,) in words.
+        columns: of the parameters, each with n rows; without what names the side.
+        seconds: of an answer.
+    """
+
+    name: str
+    folder: Path
+    config: SweepConfig
+    summary: SweepSummary
+    named: dict[str, str]
+    numbers: npt.NDArray[np.int64]
+    right: Mask
+    margin: npt.NDArray[np.float32]
+    answers: npt.NDArray[np.str_]
+    columns: tuple[Column, ...]
+    seconds: float
+
+    def __len__(self) -> int:
+        return len(self.right)
+
+
+def read_sides(folders: Sequence[Path]) -> list[Side]:
+    """Return what the sweeps in some folders compare, each side with a name of its own.
+
+    A sweep has a side for each of its models. The sweep of an answer has these without the answer and with it; beside
+    other sweeps, only with it.
+
+    Raises:
+        FileFormatError: a folder has another run, or a sweep that has not ended.
+        InputError: there is nothing to compare, or sweeps are of other draws.
+    """
+    sides = [side for folder in folders for side in _sides_of(folder, alone=len(folders) == 1)]
+    if len(sides) < 2:
+        raise InputError(
+            f"compared: expected a sweep of several models, or several sweeps, got {folders[0]}, a sweep of one model; "
+            "name another sweep of the same draws beside it, or give `model` two models when you sweep"
+        )
+    for side in sides[1:]:
+        _check_pair(sides[0], side)
+    return _with_names(sides)
+
+
+def differing(sides: Sequence[Side]) -> list[str]:
+    """Return the settings in which the sweeps of some sides differ and that decide answers."""
+    given = [side.config.deciding() for side in sides]
+    several = {name for name in OF_THE_SIDE if len({side.named[name] for side in sides}) > 1}
+    names = {name for one in given[1:] for name in one if one[name] != given[0][name]}
+    files = {name for name in ("object", "model") if len({getattr(side.config, name) for side in sides}) > 1}
+    return sorted((names | several | files) - {*FOLLOWS, "answer_of"})
+
+
+def shared_columns(first: Side, second: Side) -> list[Column]:
+    """Return the parameters in which both sides have the same values, and that vary."""
+    others = {one.name: one for one in second.columns}
+    return [one for one in varying(first.columns) if one.name in others and _same(one, others[one.name])]
+
+
+def varying(columns: Sequence[Column]) -> list[Column]:
+    """Return those of some columns that have more than one value."""
+    return [one for one in columns if len(np.unique(_values(one))) > 1]
+
+
+def observations(columns: Sequence[Column], right: Mask) -> Observations | None:
+    """Return parameters and a verdict (n,) as rules are sought in them; None where nothing varies."""
+    factors, values = [], []
+    for one in columns:
+        numbers = one.data.astype(np.float64)
+        if one.levels is None and np.isnan(numbers).any():
+            continue
+        if one.levels is not None:
+            names = sorted(one.levels)
+            factors.append(Factor(one.name, "", tuple(names)))
+            numbers = np.array([names.index(level) for level in one.levels], np.float64)[one.data]
+        else:
+            factors.append(Factor(one.name, one.unit))
+        values.append(numbers)
+    return Observations(tuple(factors), np.stack(values, axis=1), right) if values else None
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+def _sides_of(folder: Path, *, alone: bool) -> list[Side]:
+    summary = read_result(folder)
+    if not isinstance(summary, SweepSummary):
+        raise FileFormatError(f"{folder}: expected the run of a sweep, got one of {summary.command}; sweep first")
+    if summary.goes_on or summary.configurations != summary.planned:
+        raise FileFormatError(
+            f"{folder}: expected a sweep that has ended, got one with {summary.configurations} of {summary.planned} "
+            f"answers; go on with it: advsearch resume {folder}"
+        )
+    config, found = SweepConfig.from_yaml(folder / CONFIG), read_columns(folder)
+    if len(found.step) != summary.planned or len(np.unique(found.step)) != summary.planned:
+        raise FileFormatError(
+            f"{folder}: expected {summary.planned} rows, as its summary says, got {len(found.step)}; sweep again"
+        )
+    order, models = np.argsort(found.step), len(config.models)
+    pictures = summary.planned // models
+    halves = [range(pictures)]
+    if config.answer_of is not None:
+        halves = [range(pictures // 2), range(pictures // 2, pictures)][0 if alone else 1 :]
+    seconds, sides = _seconds(folder), []
+    for half in halves:
+        numbers = np.arange(half.start, half.stop)
+        for model in range(models):
+            rows = order[numbers * models + model]
+            columns = tuple(replace(one, data=one.data[rows]) for one in found.parameters)
+            named = {one.name: _together(one) for one in columns if one.name in OF_THE_SIDE}
+            named.setdefault("object", summary.object)
+            named.setdefault("model", config.models[model])
+            named.setdefault("answer", "")
+            side = Side(
+                name="",
+                folder=folder,
+                config=config,
+                summary=summary,
+                named=named,
+                numbers=numbers,
+                right=found.right[rows] == 1,
+                margin=found.margin[rows],
+                answers=np.array(found.answers)[found.answer[rows]],
+                columns=tuple(one for one in columns if one.name not in ("model", "answer")),
+                seconds=seconds,
+            )
+            sides.append(side)
+    return sides
+
+
+def _seconds(folder: Path) -> float:
+    """Mean seconds of an answer; NaN where rows do not say it."""
+    with Store(folder / NAME, read_only=True) as store:
+        known = [row.seconds for row in store.rows(KIND) if row.seconds is not None]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def _together(column: Column) -> str:
+    """The names in a column, in their order."""
+    levels = column.levels or ()
+    return ",".join(levels[number] for number in dict.fromkeys(column.data.tolist()) if number < len(levels))
+
+
+# ---- comparing ------------------------------------------------------------------------------------------------------
+
+
+def _check_pair(first: Side, other: Side) -> None:
+    """Refuse sides whose pictures are no pairs."""
+    if first.folder == other.folder:
+        return
+    where = f"{first.folder} and {other.folder}"
+    for name in DRAWS:
+        one, two = (side.config.deciding()[name] for side in (first, other))
+        if one != two:
+            raise InputError(
+                f"compared: expected sweeps of the same draws, got {where}, whose `{name}` differ; sweep one of them "
+                "again with the settings of the other"
+            )
+    if len(first) != len(other):
+        raise InputError(
+            f"compared: expected sweeps with as many pictures, got {len(first)} and {len(other)} in {where}; sweep as "
+            "many objects and environments in both"
+        )
+    if first.named["object"] != other.named["object"]:
+        return  # ranges may follow from the object
+    others = {one.name: one for one in other.columns}
+    for column in first.columns:
+        if column.name not in (*OF_THE_SIDE, "environment") and column.name in others:
+            if not _same(column, others[column.name]):
+                raise InputError(
+                    f"compared: expected sweeps of the same draws, got {where} with other values of {column.name}; "
+                    "sweep both again"
+                )
+
+
+def _values(column: Column) -> npt.NDArray[np.generic]:
+    return column.data if column.levels is None else np.array(column.levels)[column.data]
+
+
+def _same(one: Column, other: Column) -> bool:
+    if (one.levels is None) != (other.levels is None):
+        return False
+    if one.levels is not None:
+        return bool((_values(one) == _values(other)).all())
+    scale = float(np.nanmax(np.abs(one.data), initial=0.0))
+    return bool(np.allclose(one.data, other.data, rtol=0.0, atol=TOLERANCE * scale, equal_nan=True))
+
+
+def _with_names(sides: Sequence[Side]) -> list[Side]:
+    """The sides, each called what tells it from the others."""
+    told = [name for name in OF_THE_SIDE if len({side.named[name] for side in sides}) > 1]
+    names = [", ".join(short_names(side.named[name]) or "as it is" for name in told) for side in sides]
+    if len(set(names)) < len(names):
+        names = [", ".join(filter(None, (side.folder.name, name))) for side, name in zip(sides, names, strict=True)]
+    if len(set(names)) < len(names):
+        names = [f"{number + 1}: {name}" for number, name in enumerate(names)]
+    return [replace(side, name=name) for side, name in zip(sides, names, strict=True)]

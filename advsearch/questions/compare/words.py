@@ -1,0 +1,194 @@
+"""What `compare` found, in sentences and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from advsearch.questions.compare.answer import (
+    ComparedPair,
+    CompareResult,
+    CountOf,
+    PairCounts,
+    PairPart,
+    PairPicture,
+    PairRule,
+)
+from advsearch.report import wording
+from advsearch.report.explanations import conditions_text
+from advsearch.report.phrases import percent, percent_number
+from advsearch.runs.results.base import Interval
+from advsearch.runs.results.evidence import Claim, Extent
+from advsearch.runs.results.sweep import AxisValue
+
+SIDE_HEADS = ("", "right in", "accuracy", "95 % interval", "time an answer")
+"""Of the table of sides."""
+
+LEVEL = 0.05
+"""A p-value up to this is called a difference."""
+
+
+def side_rows(result: CompareResult) -> list[list[str]]:
+    """Return a row for each side."""
+    return [
+        [
+            one.name,
+            f"{one.correct} of {one.configurations}",
+            percent(one.accuracy),
+            wording.interval_text(one.interval),
+            cost_text(one.seconds),
+        ]
+        for one in result.sides
+    ]
+
+
+def cost_text(seconds: float) -> str:
+    """Return what an answer took: ``31 ms``; empty where that is not known."""
+    if seconds != seconds:
+        return ""
+    return f"{1000.0 * seconds:.2g} ms" if seconds < 0.1 else wording.seconds_text(seconds)
+
+
+def headline(pair: ComparedPair) -> str:
+    """Return the first thing that a reader should know of two sides, in a sentence."""
+    n, (before, after) = pair.pairs, pair.right
+    return (
+        f"{pair.first} is right in {percent(before / n)} and {pair.second} in {percent(after / n)} of the same "
+        f"{wording.count(n, 'picture')}: a difference of {100.0 * pair.difference:+.1f} points "
+        f"(95 % interval {points_text(pair.interval)})."
+    )
+
+
+def alone_text(pair: ComparedPair) -> str:
+    """Return what the pairs say that one side alone gets right, in a sentence."""
+    if not pair.first_only and not pair.second_only:
+        return "Both are right about the same pictures."
+    shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
+    return (
+        f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
+        f"(exact McNemar test, p {p_text(pair.p)}){shown}."
+    )
+
+
+def points_text(interval: Interval) -> str:
+    """Return an interval of a difference: ``-25.2 to -8.1``."""
+    return " to ".join(f"{100.0 * end:+.1f}" for end in interval)
+
+
+def p_text(p: float) -> str:
+    """Return a p-value: ``= 0.012``, or ``< 0.0001``."""
+    return f"= {p:.2g}" if p >= 0.0001 else "< 0.0001"
+
+
+def paired_rows(pair: ComparedPair) -> list[list[str]]:
+    """Return the pairs as a table of two by two, with its head."""
+    return [
+        ["", f"{pair.second} right", f"{pair.second} wrong"],
+        [f"{pair.first} right", str(pair.both), str(pair.first_only)],
+        [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
+    ]
+
+
+def rules_texts(pair: ComparedPair) -> list[str]:
+    """Return where each side alone is right, in sentences; none where it was not looked for."""
+    found = []
+    ways = (
+        (pair.worse, pair.first_only, pair.first, pair.second),
+        (pair.better, pair.second_only, pair.second, pair.first),
+    )
+    for rules, alone_right, alone, other in ways:
+        if rules is None or not alone_right:
+            continue
+        if not rules:
+            found.append(f"Where {other} is worse than {alone}: no values stand out from chance.")
+        found += [f"Where {other} is worse than {alone}: {_rule_text(one, n)}" for n, one in enumerate(rules)]
+    return found
+
+
+def _rule_text(rule: PairRule, number: int) -> str:
+    rest = "elsewhere" if number == 0 else "in what no rule before covers"
+    return f"{conditions_text(rule.conditions)}, in {_share(rule)} pairs; {rest} in {_share(rule.elsewhere)}."
+
+
+def _share(counted: CountOf) -> str:
+    if not counted.total:
+        return "none of 0"
+    low, high = map(percent_number, counted.interval)
+    return f"{percent(counted.count / counted.total)} ({low} to {high}) of {counted.total:,}"
+
+
+def parts_of(pair: ComparedPair) -> dict[str, list[PairPart]]:
+    """Return the parts by parameter, called with its unit."""
+    found: dict[str, list[PairPart]] = {}
+    for one in pair.parts:
+        unit = f", {one.unit}" if one.unit not in ("", "1", "name") else ""
+        found.setdefault(f"{one.parameter}{unit}", []).append(one)
+    return found
+
+
+def telling(tables: dict[str, list[PairPart]], most: int) -> dict[str, list[PairPart]]:
+    """Return so many of the parameters, those whose differences are farthest apart, in the order in which they come."""
+
+    def spread(name: str) -> float:
+        differences = [one.difference for one in tables[name]]
+        return max(differences) - min(differences)
+
+    chosen = sorted(tables, key=spread, reverse=True)[:most]
+    return {name: parts for name, parts in tables.items() if name in chosen}
+
+
+def part_heads(pair: ComparedPair, name: str) -> list[str]:
+    """Return the heads of the table of one parameter."""
+    return [
+        name,
+        "pairs",
+        pair.first,
+        pair.second,
+        "difference, points (95 % interval)",
+        f"{pair.first} alone",
+        f"{pair.second} alone",
+    ]
+
+
+def part_rows(parts: Sequence[PairPart]) -> list[list[str]]:
+    """Return a row for each value of a parameter."""
+    return [[value_text(one.value), *_count_cells(one)] for one in parts]
+
+
+def _count_cells(one: PairCounts) -> list[str]:
+    first, second = (percent(right / one.pairs) for right in one.right)
+    difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
+    return [str(one.pairs), first, second, difference, str(one.first_only), str(one.second_only)]
+
+
+def value_text(value: AxisValue) -> str:
+    """Return a value of a parameter, or the ends of a part of its range."""
+    if isinstance(value, tuple):
+        return " to ".join(value_text(end) for end in value)
+    return f"{value:.4g}" if isinstance(value, float) else wording.short_name(value)
+
+
+def picture_text(one: PairPicture, pair: ComparedPair) -> str:
+    """Return what both sides say of a pair, and where it is."""
+    said = ", ".join(f"{name}: {text}" for name, text in zip((pair.first, pair.second), one.answers, strict=True))
+    return f"{said}; {values_text(one)}"
+
+
+def values_text(one: PairPicture) -> str:
+    """Return the values of a pair on one line."""
+    return ", ".join(
+        f"{name} {value if isinstance(value, str) else format(value, '.3g')}" for name, value in one.values.items()
+    )
+
+
+def claims(result: CompareResult) -> Iterator[Claim]:
+    """Yield what the run stands for: what was counted of each pair of sides."""
+    for pair in result.pairs:
+        text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is Newcombe's, of pairs."
+        side = next(one for one in result.sides if one.name == pair.second)
+        extent = Extent(
+            what=f"configurations in which {pair.second} is right",
+            count=side.correct,
+            total=side.configurations,
+            interval=side.interval or (0.0, 1.0),
+        )
+        yield Claim(kind="measured", statement=text, extent=extent)

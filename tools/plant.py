@@ -1,0 +1,472 @@
+"""Plants forty faults, each alone, in a copy of the checkout, and shows which test finds it.
+
+    python tools/plant.py [NAME ...] [--all-tests] [--list]
+
+A fault is a text that stands exactly once in a file, and what it becomes. The tests that should find it run until the
+first failure; that test then has to pass without the fault, or else it does not count. Where no test finds a fault, one
+is missing. `tests/test_plant.py` holds the list to the source.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PATIENCE = 900.0
+"""Seconds after which tests that do not end have found a fault too."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A mistake that anybody could make.
+
+    Attributes:
+        name: of the fault; begins with the room.
+        file: in which it is, from the root of the checkout.
+        before: a text that stands there exactly once.
+        after: what comes in its place.
+        tests: files, or node ids, of which one should fail.
+    """
+
+    name: str
+    file: str
+    before: str
+    after: str
+    tests: tuple[str, ...]
+
+    def planted(self, root: Path) -> str:
+        """Return the text of the file with the fault in it.
+
+        Raises:
+            ValueError: the text before is not there exactly once.
+        """
+        text = (root / self.file).read_text("utf-8")
+        if text.count(self.before) != 1:
+            count = text.count(self.before)
+            raise ValueError(f"{self.name}: expected its text once in {self.file}, got {count} times; renew the fault")
+        return text.replace(self.before, self.after)
+
+
+FAULTS = (
+    Fault(
+        "scene: the exposure is left out",
+        "advsearch/scene/formation.py",
+        "return linear_to_srgb(radiance * self.gain)",
+        "return linear_to_srgb(radiance)",
+        ("tests/scene/test_renderer.py",),
+    ),
+    Fault(
+        "scene: gradients have the noise of the picture",
+        "advsearch/scene/renderer.py",
+        'seeds.stream(renderer.root_seed, "gradient", ctx.seed)',
+        'seeds.stream(renderer.root_seed, "primal", ctx.seed)',
+        ("tests/scene/test_renderer.py",),
+    ),
+    Fault(
+        "mitsuba_backend: the V axis is flipped",
+        "advsearch/scene/mitsuba_backend/meshes.py",
+        "np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)",
+        "np.stack([mesh.uvs[:, 0], mesh.uvs[:, 1]], axis=1)",
+        ("tests/scene/test_emission.py",),
+    ),
+    Fault(
+        "mitsuba_backend: an sRGB colour is taken for a linear one",
+        "advsearch/scene/mitsuba_backend/meshes.py",
+        '"base_color": _texture(srgb_to_linear(part.base_color)),',
+        '"base_color": _texture(part.base_color),',
+        ("tests/scene/test_renderer.py", "tests/scene/test_exposure.py"),
+    ),
+    Fault(
+        "importing: a link is followed outside",
+        "advsearch/scene/importing/references.py",
+        "path = os.path.realpath(os.path.join(self._folder, name))",
+        "path = os.path.normpath(os.path.join(self._folder, name))",
+        ("tests/scene/test_importing.py",),
+    ),
+    Fault(
+        "importing: the stride of a buffer is ignored",
+        "advsearch/scene/importing/gltf_buffers.py",
+        "data, step = self.view(view), stride or shape[1] * kind.itemsize",
+        "data, step = self.view(view), shape[1] * kind.itemsize",
+        ("tests/scene/test_gltf.py",),
+    ),
+    Fault(
+        "exporting: normals are flipped",
+        "advsearch/scene/exporting/gltf.py",
+        "_y_up(_unit(mesh.normals))",
+        "_y_up(_unit(-mesh.normals))",
+        ("tests/api/test_export_scene.py",),
+    ),
+    Fault(
+        "exporting: degrees for radians",
+        "advsearch/scene/exporting/cycles.py",
+        '"fov": math.radians(fov),',
+        '"fov": fov,',
+        ("tests/scene/test_cycles.py",),
+    ),
+    Fault(
+        "controls: the exposure counts twice",
+        "advsearch/controls/camera.py",
+        'values["exposure"] - scene.number("camera.exposure")',
+        'values["exposure"]',
+        ("tests/controls/test_clean.py",),
+    ),
+    Fault(
+        "controls: a diameter for a radius",
+        "advsearch/controls/light.py",
+        'radius = values["size"] / 2.0',
+        'radius = values["size"]',
+        ("tests/controls/test_control_light.py",),
+    ),
+    Fault(
+        "models: a limit is not applied",
+        "advsearch/models/archive.py",
+        "if unpacked > files.scaled(LARGEST_RATIO) * size + SLACK:",
+        "if unpacked > files.scaled(LARGEST):",
+        ("tests/models/test_hostile_models.py",),
+    ),
+    Fault(
+        "models: labels are off by one",
+        "advsearch/models/labels.py",
+        'stored["coco90"] = stored["coco91"][1:]',
+        'stored["coco90"] = stored["coco91"][:-1]',
+        ("tests/cli/test_labels.py",),
+    ),
+    Fault(
+        "models: the gradient of all models but the first is lost",
+        "advsearch/models/ensemble.py",
+        "return [model(images) for model in self.models]",
+        "return [model(images.detach() if number else images) for number, model in enumerate(self.models)]",
+        ("tests/tasks/test_together.py",),
+    ),
+    Fault(
+        "tasks: a mask is inverted",
+        "advsearch/tasks/segmentation.py",
+        "chosen = output.permute(0, 2, 3, 1)[:, mask]",
+        "chosen = output.permute(0, 2, 3, 1)[:, ~mask]",
+        ("tests/tasks/test_segmentation.py",),
+    ),
+    Fault(
+        "tasks: the axes of a box are swapped",
+        "advsearch/tasks/boxes.py",
+        "return boxes[..., [1, 0, 3, 2]]",
+        "return boxes",
+        ("tests/tasks/test_detector_answers.py",),
+    ),
+    Fault(
+        "attacks: a projection is left out",
+        "advsearch/attacks/domain.py",
+        "project_l2_box(u[part], self.start[part], block.epsilon, block.low, block.high)",
+        "u[part].clamp(block.low, block.high)",
+        ("tests/attacks/test_attacks_domain.py",),
+    ),
+    Fault(
+        "attacks: an interval has one side",
+        "advsearch/attacks/trials.py",
+        "tail = (1.0 - confidence) / 2.0",
+        "tail = 1.0 - confidence",
+        ("tests/attacks/test_attacks_verification.py",),
+    ),
+    Fault(
+        "attacks: trials of the wrong group count",
+        "advsearch/attacks/verification.py",
+        "self.conditional or clean.successes >= self.needed(clean.trials)",
+        "self.conditional or adversarial.successes >= self.needed(adversarial.trials)",
+        ("tests/attacks/test_attacks_verification.py",),
+    ),
+    Fault(
+        "policies: every generation has the same noise",
+        "advsearch/attacks/policies/nes.py",
+        "seeded(state.seed, state.generation * (state.population // 2) + pair)",
+        "seeded(state.seed, pair)",
+        ("tests/attacks/policies/test_policy_evolution.py",),
+    ),
+    Fault(
+        "policies: a mean keeps its bias",
+        "advsearch/attacks/policies/adam.py",
+        "mean = state.mean / (1.0 - self.beta1**state.taken)",
+        "mean = state.mean",
+        ("tests/attacks/policies/test_policy_adam.py",),
+    ),
+    Fault(
+        "engine: a run that goes on evaluates again",
+        "advsearch/engine/journal.py",
+        "return self._trials.get((query.kind, query.number))",
+        "return None",
+        ("tests/engine/test_resume.py",),
+    ),
+    Fault(
+        "engine: answers of workers come as they are done",
+        "advsearch/engine/sharing.py",
+        "number = done.numbers.start",
+        "number = turn + len(early)",
+        ("tests/engine/test_attack_workers.py",),
+    ),
+    Fault(
+        "sweeps: a rate of another group",
+        "advsearch/engine/sweeps/summary.py",
+        "answer=rate(both + answer_only, len(before)),",
+        "answer=rate(both + clean_only, len(before)),",
+        ("tests/engine/test_sweep.py",),
+    ),
+    Fault(
+        "runs: two processes may hold a lock",
+        "advsearch/runs/lock.py",
+        "fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)",
+        "fcntl.flock(self._descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)",
+        ("tests/engine/test_resume.py", "tests/runs/test_runs.py"),
+    ),
+    Fault(
+        "runs: the last row is dropped",
+        "advsearch/runs/store.py",
+        "if expected < count:",
+        "if expected < count - 1:",
+        ("tests/runs/test_runs.py", "tests/engine/test_sweep.py"),
+    ),
+    Fault(
+        "runs: an export has no metrics",
+        "advsearch/runs/export.py",
+        "return [*OWN, *metrics, *seen, *AFTER]",
+        "return [*OWN, *seen, *AFTER]",
+        ("tests/runs/test_runs.py",),
+    ),
+    Fault(
+        "report: a page escapes nothing",
+        "advsearch/report/markup.py",
+        "part if isinstance(part, Html) else escape(part)",
+        "part",
+        ("tests/viewer/test_attack_page.py",),
+    ),
+    Fault(
+        "report: the bleed is printed as a part of the size",
+        "advsearch/report/sheets.py",
+        "(width - 2 * self.bleed[0]) * self.pixel[0], (height - 2 * self.bleed[1]) * self.pixel[1]",
+        "width * self.pixel[0], height * self.pixel[1]",
+        ("tests/report/test_sheets.py",),
+    ),
+    Fault(
+        "viewer: any name leads to the server",
+        "advsearch/viewer/server.py",
+        "if not self._is_own(host):",
+        "if not host:",
+        ("tests/viewer/test_server.py",),
+    ),
+    Fault(
+        "viewer: the best pictures come first",
+        "advsearch/viewer/thumbnails.py",
+        "np.argsort(-np.nan_to_num(columns.margin, nan=-np.inf)",
+        "np.argsort(np.nan_to_num(columns.margin, nan=-np.inf)",
+        ("tests/viewer/test_columns.py",),
+    ),
+    Fault(
+        "cluster: a worker may take a hundred times as long",
+        "advsearch/cluster/coordinator.py",
+        "if now - worker.since > deadline:",
+        "if now - worker.since > 100.0 * deadline:",
+        ("tests/cluster/test_coordinator.py",),
+    ),
+    Fault(
+        "cluster: any version may work",
+        "advsearch/cluster/worker.py",
+        "if version() != asked:",
+        "if not asked:",
+        ("tests/cluster/test_coordinator.py",),
+    ),
+    Fault(
+        "cli: a terminal gets control characters",
+        "advsearch/cli/output.py",
+        'sign if sign.isprintable() or sign == "\\n" else _json_escape(sign)',
+        "sign",
+        ("tests/cli/test_hostile_texts.py",),
+    ),
+    Fault(
+        "cli: an interrupted command says that all is well",
+        "advsearch/cli/output.py",
+        "return INTERRUPTED if stopped else OK",
+        "return OK",
+        ("tests/cli/test_cli.py",),
+    ),
+    Fault(
+        "config: a default is the other one's",
+        "advsearch/config/attack.py",
+        "TRIALS_OVER if self.over else TRIALS",
+        "TRIALS if self.over else TRIALS_OVER",
+        ("tests/config/test_config.py",),
+    ),
+    Fault(
+        "explanations: a rule is counted on the rows that chose it",
+        "advsearch/explanations/rules.py",
+        "rule = _counted(conditions, counting.right[inside], counting.right[~inside])",
+        "rule = _counted(conditions, *(choosing.right[covered(conditions, choosing) == one] for one in (True, False)))",
+        ("tests/explanations/test_explanations.py",),
+    ),
+    Fault(
+        "explanations: what chance adds is not taken off",
+        "advsearch/explanations/importance.py",
+        "share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1)",
+        "share = counted",
+        ("tests/explanations/test_explanations.py",),
+    ),
+    Fault(
+        "recipes: right and wrong are mixed up",
+        "advsearch/recipes/figures/agreement.py",
+        "right_wrong=counts[True, False],",
+        "right_wrong=counts[False, True],",
+        ("tests/recipes/test_recipes.py",),
+    ),
+    Fault(
+        "hardening: what judges is trained on",
+        "advsearch/engine/hardening/training.py",
+        "own = [copy.copy(one) for one in held_back]",
+        "own = list(held_back)",
+        ("tests/engine/test_hardening.py",),
+    ),
+    Fault(
+        "hardening: plain pictures may be lost",
+        "advsearch/engine/hardening/rounds.py",
+        "return clean >= self.done[0].clean - self.course.config.clean_loss - 1e-9",
+        "return True",
+        ("tests/engine/test_hardening.py",),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What tests said.
+
+    Attributes:
+        failed: the first test that failed, by its node id; None where none did.
+        seconds: that it took.
+        late: whether they did not end.
+    """
+
+    failed: str | None
+    seconds: float
+    late: bool = False
+
+
+def copied(folder: Path) -> Path:
+    """Copy the files of the checkout, as they are now, into a folder and return it; links stay what they are."""
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(os.path.lexists, (ROOT / one for one in names.split("\0") if one)):
+        target = folder / name.relative_to(ROOT)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(name, target, follow_symlinks=False)
+    return folder
+
+
+def write(path: Path, text: str) -> None:
+    """Write a module, and remove what Python has compiled of it: it goes by the second of a change and the length."""
+    path.write_text(text, "utf-8")
+    for old in path.parent.glob(f"__pycache__/{path.stem}.*"):
+        old.unlink()
+
+
+def answer(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> Answer:
+    """Run tests in a copy, without some of them, until the first failure.
+
+    Raises:
+        RuntimeError: none of them ran.
+    """
+    left_out = [word for one in without for word in ("--deselect", one)]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "--tb=no", *tests, *left_out]
+    begun = time.perf_counter()
+    try:
+        ran = subprocess.run(
+            command,
+            cwd=root,
+            env={**os.environ, "PYTHONPATH": str(root)},
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+        )
+    except subprocess.TimeoutExpired:
+        return Answer(None, time.perf_counter() - begun, late=True)
+    seconds = time.perf_counter() - begun
+    found = re.search(r"^(?:FAILED|ERROR) (\S+)", ran.stdout, re.MULTILINE)
+    if ran.returncode == 0:
+        return Answer(None, seconds)
+    if found is None:
+        raise RuntimeError(f"pytest ended with {ran.returncode} and no failed test:\n{ran.stdout}{ran.stderr}")
+    return Answer(found[1], seconds)
+
+
+def found_by(root: Path, fault: Fault, failing: set[str], *, all_tests: bool = False) -> str | None:
+    """Plant a fault in a copy, and return what finds it, in words; None where nothing does. The copy is as before then.
+
+    Args:
+        root: the copy.
+        fault: what is planted.
+        failing: tests that fail without a fault too, and find nothing; those that are met are added.
+        all_tests: run all tests where those of the fault do not find it.
+    """
+    for tests in (fault.tests, ("tests",)) if all_tests else (fault.tests,):
+        while True:
+            said = planted_answer(root, fault, tests, failing)
+            if said.late:
+                return f"tests that did not end within {PATIENCE:.0f} s"
+            if said.failed is None:
+                break
+            test = said.failed.partition("[")[0]
+            if answer(root, [test]).failed is None:
+                return f"{said.failed} ({said.seconds:.0f} s)"
+            failing.add(test)
+    return None
+
+
+def planted_answer(root: Path, fault: Fault, tests: Sequence[str], failing: Collection[str]) -> Answer:
+    """Return what tests say of a copy with a fault in it."""
+    path = root / fault.file
+    whole = path.read_text("utf-8")
+    try:
+        write(path, fault.planted(root))
+        return answer(root, tests, failing)
+    finally:
+        write(path, whole)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Plant faults, and return 1 if one of them was not found."""
+    parser = argparse.ArgumentParser(prog="python tools/plant.py", description=__doc__.partition("\n")[0])
+    parser.add_argument("name", nargs="*", help="faults, by the beginning of their names, such as scene (default: all)")
+    parser.add_argument("--all-tests", action="store_true", help="run all tests where those that should find it do not")
+    parser.add_argument("--list", action="store_true", help="list the faults and plant none")
+    args = parser.parse_args(argv)
+    chosen = [one for one in FAULTS if not args.name or one.name.startswith(tuple(args.name))]
+    if not chosen:
+        parser.error(f"no fault is called so; the rooms are {', '.join(rooms())}")
+    if args.list:
+        print("\n".join(f"{one.name}   ({one.file})" for one in chosen))
+        return 0
+    missed, failing = 0, set[str]()
+    with tempfile.TemporaryDirectory(prefix="plant-") as folder:
+        root = copied(Path(folder))
+        for fault in chosen:
+            by = found_by(root, fault, failing, all_tests=args.all_tests)
+            missed += by is None
+            print(f"{fault.name}: {'NOT FOUND' if by is None else f'found by {by}'}", flush=True)
+    print(f"{len(chosen) - missed} of {len(chosen)} faults found")
+    if failing:
+        print(f"These tests fail without a fault too: {', '.join(sorted(failing))}")
+    return int(missed > 0)
+
+
+def rooms() -> list[str]:
+    """Return the rooms that have faults, in their order."""
+    return list(dict.fromkeys(one.name.partition(":")[0] for one in FAULTS))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
