@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from advsearch import losses as losses
+    from advsearch import testing as testing
     from advsearch.api.attack import attack as attack
     from advsearch.api.check import check as check
     from advsearch.api.explain import explain as explain
@@ -67,7 +68,7 @@ _HOMES = {
 }
 """The public names, and the module of each."""
 
-_MODULES = ("losses",)
+_MODULES = ("losses", "testing")
 """Public modules."""
 
 __all__ = [*_HOMES, *_MODULES]

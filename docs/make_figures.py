@@ -27,6 +27,7 @@ from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
 from advsearch.questions.compare.answer import CompareResult
+from advsearch.questions.test.answer import SuiteResult
 from advsearch.recipes.description import recipe_names as recipe_names
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
@@ -470,6 +471,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("explain.md", "explain-fields"): result_fields(ExplainResult),
     ("compare.md", "compare-fields"): result_fields(CompareResult),
     ("harden.md", "harden-fields"): result_fields(HardenResult),
+    ("testing.md", "test-fields"): result_fields(SuiteResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,
     ("recipe-results.md", "recipe-results"): recipe_results,

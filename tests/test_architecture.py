@@ -88,11 +88,12 @@ RULES = {
     "losses": Rule({"attacks", "engine"}, {"torch"}),
     "questions": Rule(
         {"api", "attacks", "config", "engine", "explanations", "recipes", "report", "runs", "settings", "viewer"},
-        {"numpy", "pydantic", "typing_extensions"},
+        {"numpy", "pydantic", "torch", "typing_extensions"},
     ),
+    "testing": Rule({"questions", "engine", "config"}, set()),
     "api": Rule(None),
     "cli": Rule(None),
-    "": Rule({"api", "engine", "losses", "models", "questions"}, set()),
+    "": Rule({"api", "engine", "losses", "models", "questions", "testing"}, set()),
 }
 """As in docs/design.md, "Rooms, and who may know whom". The empty name is `advsearch/__init__.py`."""
 

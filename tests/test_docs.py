@@ -51,6 +51,8 @@ from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.files import MESHES
 from advsearch.questions.compare.settings import CompareConfig
+from advsearch.questions.test.settings import SuiteConfig
+from advsearch.questions.test.suite import read_suite
 from advsearch.recipes.description import read_recipe
 from advsearch.recipes.description import recipe_names as recipes
 from advsearch.recipes.parts import planned
@@ -141,6 +143,9 @@ def check_names(config: Config) -> None:
     if isinstance(config, ExplainConfig):
         assert config.confirm >= 0
         return
+    if isinstance(config, SuiteConfig):
+        assert config.suite
+        return
     if isinstance(config, ReplayConfig):
         assert set(config.chosen) <= set(WAYS)
         return
@@ -219,9 +224,20 @@ def test_every_command_in_an_example_is_one_that_the_tools_take(page: Path, tmp_
 @every_page_with["yaml"]
 def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> None:
     for block in blocks(page, "yaml"):
+        if re.search(r"^ *(runs-on|script):", block, re.M):  # of a machine that runs jobs
+            commands = re.findall(r"^.*?(?:- |run: )(advsearch .*)$", block, re.M)
+            assert commands
+            for one in commands:
+                check_advsearch(shlex.split(one)[1:], tmp_path)
+            continue
         named = re.match(r"# (\S+\.yaml)\n", block)  # others on the page may build on it
         path = tmp_path / (named[1] if named else "example.yaml")
         path.write_text(block, encoding="utf-8")
+        if "claims" in read_yaml(path):
+            suite = read_suite(path)
+            for name in suite.claims:
+                check_names(AttackConfig.of(suite.config_of(name)))
+            continue
         if "parts" in read_yaml(path):
             read_recipe(str(path))
             continue

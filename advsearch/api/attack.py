@@ -249,6 +249,15 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
 
+def parts_of(config: AttackConfig) -> AttackParts:
+    """Find and load everything that a configuration names; nothing is rendered.
+
+    Raises:
+        InputError: as for `attack_from_config`.
+    """
+    return _job(config)
+
+
 def parts_in(run: Path) -> AttackParts:
     """Find and load everything that the run of an attack was asked with, as its answer is judged.
 

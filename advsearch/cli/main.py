@@ -46,6 +46,7 @@ GROUPS = {
         "labels": "advsearch.cli.labels",
     },
     "trust: does an answer hold, and is the tool right?": {
+        "test": "advsearch.questions.test.command",
         "replay": "advsearch.cli.replay",
         "check": "advsearch.cli.check",
         "plan": "advsearch.cli.plan",

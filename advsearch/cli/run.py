@@ -18,7 +18,7 @@ HELP = "do what a YAML file describes; the run.yaml of a run repeats it"
 
 COMMANDS = (
     *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden", "explain"),
-    "compare",
+    *("compare", "test"),
 )
 """What the `command` of a file may say."""
 

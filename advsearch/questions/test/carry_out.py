@@ -1,0 +1,277 @@
+"""`test`: the claims of a suite one after the other, counterexamples first."""
+
+from __future__ import annotations
+
+import json
+import math
+import secrets
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from advsearch.api.attack import check_from_config
+from advsearch.config import AttackConfig, SceneConfig
+from advsearch.engine.measuring import Results
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.interrupts import interruptible
+from advsearch.progress import NullProgress, Progress
+from advsearch.questions.test import words
+from advsearch.questions.test.answer import FAILED, UNDECIDED, ClaimAnswer, SuiteResult, verdict
+from advsearch.questions.test.claims import Trial
+from advsearch.questions.test.counterexamples import (
+    Counterexample,
+    add,
+    counterexamples,
+    read_expected,
+    remove,
+    write_expected,
+)
+from advsearch.questions.test.settings import SuiteConfig
+from advsearch.questions.test.suite import COUNTEREXAMPLES, NotBrokenClaim, NoWorseClaim, Suite, read_suite, suite_of
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
+from advsearch.viewer.pages import write_page
+
+NOTE = "suite"
+"""Under which a run's store keeps the suite with its seed, so that it goes on as it began."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A claim or a counterexample, and what it is tried with."""
+
+    name: str
+    kind: str
+    config: SceneConfig
+    one: Counterexample | None = None
+
+
+def test_from_config(
+    config: SuiteConfig, *, progress: Progress | None = None, resumed: Path | None = None, suite: Suite | None = None
+) -> SuiteResult:
+    """Try the claims of the suite that a configuration names; what is decided is not tried again.
+
+    Args:
+        config: what.
+        progress: told how far it is.
+        resumed: folder of the run to go on with.
+        suite: in place of the file's.
+
+    Raises:
+        InputError: the suite names something that is not there, contradicts itself, or could not be judged; nothing is
+            rendered then.
+    """
+    begun, progress = time.perf_counter(), progress or NullProgress()
+    progress.stage("reading the suite")
+    noted = None if resumed is None else _noted(resumed)
+    described = (suite or _seeded(read_suite(config.suite), config)) if noted is None else noted
+    seconds = config.seconds or described.seconds or math.inf
+    added = None if config.add is None else add(config.suite, config.add)
+    try:
+        planned = _planned(described, config, added)
+        _check(planned, described)
+    except InputError as error:
+        if added is not None:
+            remove(added)
+        raise InputError(f"{config.suite}: {error}") from None
+
+    def left() -> float:
+        return max(0.001, seconds - (time.perf_counter() - begun))
+
+    with RunDirectory.of(config, resumed) as run:
+        run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
+        trial = Trial(
+            run,
+            described.confidence,
+            lambda: time.perf_counter() - begun >= seconds,
+            left,
+            config.workers,
+            config.cluster,
+            progress,
+        )
+        suite_run = _SuiteRun(config, described, planned, trial, read_expected(config.suite))
+        ending = suite_run.carry_out()
+        if added is not None and suite_run.answers[0].answer != FAILED:
+            remove(added)
+            raise InputError(f"add: the answer of {config.add} is not kept: {suite_run.answers[0].reason}")
+        result = suite_run.result(ending, time.perf_counter() - begun, added)
+        run.write_summary(result)
+        write_page(run.path, result)
+        return result
+
+
+@dataclass
+class _SuiteRun:
+    """A suite on its way."""
+
+    config: SuiteConfig
+    suite: Suite
+    planned: Sequence[Planned]
+    trial: Trial
+    expected: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        self.answers: list[ClaimAnswer] = []
+
+    def carry_out(self) -> str:
+        """Try what is planned, and return how it ended."""
+        results, begun = Results(self.trial.run), time.perf_counter()
+        try:
+            with interruptible():
+                for number, one in enumerate(self.planned):
+                    self._add(one, self._tried(one, results))
+                    progress = f"{one.name}: {self.answers[-1].answer}: {self.answers[-1].reason}"
+                    self.trial.progress.message(progress)
+                    if number + 1 < len(self.planned):
+                        seconds = time.perf_counter() - begun
+                        self.trial.run.write_summary(self.result(INTERRUPTED, seconds, None))  # what a kill leaves
+        except KeyboardInterrupt:
+            for one in self.planned[len(self.answers) :]:
+                self._add(one, self._not_tried(one, words.STOPPED))
+            return INTERRUPTED
+        if any(one.reason == words.NOT_TRIED for one in self.answers):
+            self.trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
+        return OUT_OF_TIME if any(words.TIME_OVER in one.reason for one in self.answers) else "done"
+
+    def _tried(self, one: Planned, results: Results) -> ClaimAnswer:
+        """What a claim says; what is decided, or has used its pictures, is stored."""
+        key = f"claim {one.name}"
+        if (stored := results.stored(key)) is not None:
+            return ClaimAnswer.of(stored)
+        failed = [known for known in self.answers if known.kind == "counterexample" and not known.accepted]
+        if failed and one.one is None and not self.config.all:
+            return self._not_tried(one, words.NOT_TRIED)
+        if self.trial.late():
+            return self._not_tried(one, f"{words.TIME_OVER} before it began")
+        if one.one is None:
+            found = self.trial.claim(one.name, self.suite.claims[one.name], one.config)
+        else:
+            assert isinstance(one.config, AttackConfig)
+            found = self.trial.counterexample(one.one, one.config)
+        if words.TIME_OVER not in found.reason and found.reason != words.STOPPED:
+            results.put(key, found.to_dict())
+        if found.reason == words.STOPPED:
+            raise KeyboardInterrupt
+        return found
+
+    def _not_tried(self, one: Planned, reason: str) -> ClaimAnswer:
+        claim = self.suite.claims.get(one.name)
+        said = "" if claim is None or one.one is not None else words.statement(claim, one.config)
+        return ClaimAnswer(name=one.name, kind=one.kind, statement=said, answer=UNDECIDED, reason=reason)
+
+    def _add(self, one: Planned, found: ClaimAnswer) -> None:
+        only = {"only": one.name, "seed": self.suite.seed, "fresh": False, "add": None, "update": False, "run": None}
+        files = {"junit": None, "sarif": None, "markdown": None, "overwrite": False}
+        again = self.config.model_copy(update={**only, **files}).with_only_here(self.config.only_here)
+        expected = self.expected.get(one.name, "held")
+        self.answers.append(found.model_copy(update={"expected": expected, "repeat": again.command_line()}))
+
+    def result(self, ending: str, seconds: float, added: Counterexample | None) -> SuiteResult:
+        """Return what the claims so far come to."""
+        configs = [one.config for one in self.planned]
+        changes: list[str] = []
+        answers = self.answers
+        if self.config.update and ending == "done":
+            now = {one.name: one.answer for one in answers if words.NOT_TRIED not in one.reason}
+            changes = write_expected(self.config.suite, now)
+            answers = [one.model_copy(update={"expected": now.get(one.name, one.expected)}) for one in answers]
+        return SuiteResult(
+            run=str(self.trial.run.path),
+            suite=self.config.suite,
+            title=self.suite.title,
+            object=",".join(dict.fromkeys(one.object for one in configs)),
+            model=",".join(dict.fromkeys(one.model for one in configs)),
+            environment=",".join(dict.fromkeys(one.lit_by for one in configs)),
+            controls=list(dict.fromkeys(name for one in configs for name in one.controls)),
+            answer=verdict(answers),
+            confidence=self.suite.confidence,
+            claims=answers,
+            ending=ending,
+            added=None if added is None else str(added.path),
+            changes=changes,
+            warnings=list(dict.fromkeys(self.trial.warnings)),
+            seconds={"total": seconds},
+            seed=self.suite.seed,
+            command_line=self.config.model_copy(update={"seed": self.suite.seed, "fresh": False})
+            .with_only_here(self.config.only_here)
+            .command_line(),
+        )
+
+
+def _noted(path: Path) -> Suite | None:
+    """The suite that a run began with; None of one that was stopped at once."""
+    if not (path / STORE).is_file():
+        return None
+    with Store(path / STORE, read_only=True) as store:
+        noted = store.noted(NOTE)
+    return None if noted is None else suite_of(noted, f"{path}: the suite that it began with")
+
+
+def _seeded(suite: Suite, config: SuiteConfig) -> Suite:
+    """The suite with the seed that the command says, or a fresh one."""
+    seed = secrets.randbelow(2**31) if config.fresh else suite.seed if config.seed is None else config.seed
+    return suite.model_copy(update={"seed": seed})
+
+
+def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[Planned]:
+    """What is tried, counterexamples first."""
+    changes = {"model": config.model, "threads": config.threads, "deterministic": config.deterministic or None}
+    kept = counterexamples(config.suite) if added is None else [added]
+    first = [Planned(one.name, "counterexample", one.config_for(suite, changes), one) for one in kept]
+    if twice := [one.name for one in first if one.name in suite.claims]:
+        raise InputError(f"claims.{twice[0]}: a counterexample is called so, too; call the claim something else")
+    if added is not None:
+        return first
+    rest = [
+        Planned(name, one.claim, suite.config_of(name, **changes).with_only_here(config.only_here))
+        for name, one in suite.claims.items()
+    ]
+    chosen, planned = config.chosen, [*first, *rest]
+    known = [one.name for one in planned]
+    for name in chosen:
+        if name not in (*known, COUNTEREXAMPLES):
+            raise UnknownNameError("claim in `only`", name, [*known, COUNTEREXAMPLES])
+    if not chosen:
+        return planned
+    return [one for one in planned if one.name in chosen or (one.one is not None and COUNTEREXAMPLES in chosen)]
+
+
+def _check(planned: Sequence[Planned], suite: Suite) -> None:
+    """Load everything that claims name; a wrong name would end minutes of rendering.
+
+    Raises:
+        InputError: something is not there, contradicts itself, or could not be judged.
+    """
+    known: list[AttackConfig] = []
+    for one in planned:
+        if one.one is not None:
+            continue  # what is beside the suite is loaded when it is tried, at once
+        claim = suite.claims[one.name]
+        if isinstance(claim, NotBrokenClaim):
+            _check_search(one.name, one.config)
+        whole = one.config if isinstance(one.config, AttackConfig) else AttackConfig.of(one.config)
+        wanted = [whole]
+        if isinstance(claim, NoWorseClaim):
+            wanted.append(whole.model_copy(update={"model": claim.than}))
+        for config in wanted:
+            if config not in known:
+                try:
+                    check_from_config(config)
+                except InputError as error:
+                    raise InputError(f"claims.{one.name}: {error}") from None
+                known.append(config)
+
+
+def _check_search(name: str, config: SceneConfig) -> None:
+    assert isinstance(config, AttackConfig)
+    for setting, wrong, why in (
+        ("object", config.is_study, "one object, one epsilon and one model; make a claim of each"),
+        ("smallest", config.smallest, "a budget, which the claim is about; leave it out"),
+        ("minimise", config.minimise, "a search that makes the model wrong; leave it out"),
+        ("target", config.target is not None, "any wrong answer; leave it out"),
+    ):
+        if wrong:
+            raise InputError(f"claims.{name}.settings: {setting}: expected {why}")

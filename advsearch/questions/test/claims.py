@@ -1,0 +1,308 @@
+"""How each kind of claim is tried: drawn pictures, a search, or the trials of a counterexample."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import islice
+
+import torch
+
+from advsearch import seeds
+from advsearch.api.attack import executor_for, parts_of, problem_of
+from advsearch.api.subruns import carry_out_part
+from advsearch.attacks import Evaluation
+from advsearch.attacks.evaluation import Query
+from advsearch.attacks.sequential import ConfidenceSequence
+from advsearch.config import AttackConfig, SceneConfig
+from advsearch.engine.journal import Journal
+from advsearch.engine.problem import Problem
+from advsearch.engine.sharing import Shared
+from advsearch.engine.verifier import ladder_of
+from advsearch.progress import Progress
+from advsearch.questions.test import words
+from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer
+from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
+from advsearch.questions.test.settings import DrawnConfig
+from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
+from advsearch.report.wording import number_text
+from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
+from advsearch.runs.results.attack import AttackSummary
+
+MANY = 4
+"""Values of a configuration that are said in words, at most."""
+
+MOST_KEPT = 64
+"""Of a configuration with more numbers, a picture's row does not hold the values."""
+
+AHEAD = 2
+"""Pictures that are asked for at once, for each worker."""
+
+
+@dataclass
+class Trial:
+    """What claims are tried with.
+
+    Attributes:
+        run: keeps every answer.
+        confidence: of each claim that pictures decide.
+        late: whether the time of the suite is over.
+        left: seconds until then; infinite without a limit.
+        workers, cluster: who shares the pictures of a claim.
+        progress: told how far it is.
+        warnings: gets sentences that a reader has to know.
+    """
+
+    run: RunDirectory
+    confidence: float
+    late: Callable[[], bool]
+    left: Callable[[], float]
+    workers: int | None
+    cluster: str | None
+    progress: Progress
+    warnings: list[str] = field(default_factory=list)
+
+    def claim(self, name: str, claim: AnyClaim, config: SceneConfig) -> ClaimAnswer:
+        """Try a claim; what was asked before is read back."""
+        begun = time.perf_counter()
+        asked = ClaimAnswer(
+            name=name, kind=claim.claim, statement=words.statement(claim, config), answer=UNDECIDED, reason=""
+        )
+        if isinstance(claim, RightClaim):
+            found = self._right(asked, claim, config)
+        elif isinstance(claim, NoWorseClaim):
+            found = self._no_worse(asked, claim, config)
+        else:
+            assert isinstance(config, AttackConfig)
+            found = self._not_broken(asked, config)
+        return found.model_copy(update={"seconds": time.perf_counter() - begun})
+
+    # ---- a share ----------------------------------------------------------------------------------------------------
+
+    def _right(self, asked: ClaimAnswer, claim: RightClaim, config: SceneConfig) -> ClaimAnswer:
+        problem, shared = self._problem(config), self._shared(config)
+        sequence, right = ConfidenceSequence(self.confidence), 0
+        wrong: list[tuple[float, Query, str]] = []
+        self.progress.stage(asked.name, claim.pictures, hint="`pictures` of the claim shortens it", at_most=True)
+        with executor_for(shared, "advsearch.api.attack:answering_of", self.progress) as executor:
+            journal = Journal(self.run, Shared(problem, executor))
+            queries = drawn(problem, f"claim {asked.name}", claim.pictures, spp_of(config))
+            answer = UNDECIDED
+            for query, evaluation in self._answers(journal, queries):
+                said = evaluation.said
+                sequence.add(1.0 if said.right else 0.0)
+                right += said.right
+                if not said.right:
+                    score = said.score if math.isfinite(said.score) else -math.inf
+                    wrong = sorted([*wrong, (score, query, said.answer.label)], key=lambda one: -one[0])[:1]
+                answer = decided(sequence, claim.at_least)
+                if answer != UNDECIDED:
+                    break
+        worst, picture = "", None
+        if wrong:
+            _, query, label = wrong[0]
+            worst = f"most wrong where it says {label}: {self._described(problem, query)}"
+            picture = self._picture(asked.name, problem, query)
+        reason = words.right_reason(answer, right, sequence.count, sequence.interval, worst)
+        return self._decided(asked, answer, reason, sequence, config, picture, (0.0, 1.0))
+
+    # ---- two models -------------------------------------------------------------------------------------------------
+
+    def _no_worse(self, asked: ClaimAnswer, claim: NoWorseClaim, config: SceneConfig) -> ClaimAnswer:
+        problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
+        sequence, ours, theirs = ConfidenceSequence(self.confidence), 0, 0
+        same, shown = other.renderer.formation == problem.renderer.formation, Shown()
+        self.progress.stage(asked.name, claim.pictures, hint="`pictures` of the claim shortens it", at_most=True)
+        journal, beside = Journal(self.run, Shared(problem)), Journal(self.run, Shared(other))
+        kind, answer, first = f"claim {asked.name}", UNDECIDED, None
+        for query in drawn(problem, kind, claim.pictures, spp_of(config)):
+            (mine,) = journal.answers([query], lambda queries: [shown.of(problem, one) for one in queries])
+            (other_one,) = beside.answers(
+                [replace(query, kind=f"{kind} beside")],
+                lambda queries: [(shown if same else Shown()).of(other, one) for one in queries],
+            )
+            ours += mine.said.right and not other_one.said.right
+            theirs += other_one.said.right and not mine.said.right
+            if first is None and other_one.said.right and not mine.said.right:
+                first = query
+            sequence.add((mine.said.right - other_one.said.right + 1) / 2)
+            self.progress.advance(1)
+            answer = decided(sequence, 0.5 - claim.points / 200.0)
+            if answer != UNDECIDED or self.late():
+                break
+        low, high = sequence.interval
+        counts = (sequence.count, ours, theirs)
+        reason = words.difference_reason(answer, counts, (2 * low - 1, 2 * high - 1), claim.than)
+        picture = None if first is None else self._picture(asked.name, problem, first)
+        return self._decided(asked, answer, reason, sequence, config, picture, (-1.0, 2.0))
+
+    # ---- a search ---------------------------------------------------------------------------------------------------
+
+    def _not_broken(self, asked: ClaimAnswer, config: AttackConfig) -> ClaimAnswer:
+        seconds = min(self.left(), config.seconds or math.inf)
+        own = config.model_copy(
+            update={
+                "seconds": seconds if math.isfinite(seconds) else None,
+                "workers": self.workers,
+                "cluster": self.cluster,
+            }
+        ).with_only_here(config.only_here)
+        path = self.run.path / PARTS / asked.name
+        summary = carry_out_part(path, own, self.progress)
+        assert isinstance(summary, AttackSummary)
+        self.warnings += summary.warnings
+        answer, reason = words.search_answer(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
+        shown = "clean" if summary.ending == "already wrong" else "adversarial"
+        file = f"{PARTS}/{asked.name}/{IMAGES}/{shown}.png"
+        return asked.model_copy(
+            update={
+                "answer": answer,
+                "reason": reason,
+                "pictures": sum(count for name, count in summary.renders.items() if name != "products"),
+                "picture": file if answer == FAILED and (self.run.path / file).is_file() else None,
+                "part": asked.name,
+            }
+        )
+
+    # ---- a counterexample -------------------------------------------------------------------------------------------
+
+    def counterexample(self, one: Counterexample, config: AttackConfig) -> ClaimAnswer:
+        """Try a counterexample: the model should be right on it."""
+        begun = time.perf_counter()
+        asked = ClaimAnswer(
+            name=one.name,
+            kind="counterexample",
+            statement=f"{config.model} is right where it said {one.said}",
+            answer=UNDECIDED,
+            reason="",
+        )
+        parts = parts_of(config)
+        if not same_scene(one, parts.scene):
+            reason = "its scene is another one now; remove it, or add the answer of a new run"
+            return asked.model_copy(update={"reason": reason})
+        problem = problem_of(config, parts.scene, parts.loaded[0], differentiated=False)
+        u = problem.domain.project(one.configuration(problem.domain.start))
+        count, right, label, picture = TRIALS[is_over(config)], 0, "", None
+        self.progress.stage(one.name, count, at_most=True)
+        kind = f"counterexample {one.name}"
+        queries = (
+            Query(u, seeds.stream(problem.seed, kind, number), kind, number, spp=one.spp) for number in range(count)
+        )
+        tried = 0
+        for query, evaluation in self._answers(Journal(self.run, Shared(problem)), queries):
+            tried, right = tried + 1, right + evaluation.said.right
+            if not evaluation.said.right and not label:
+                label, picture = evaluation.said.answer.label, self._picture(one.name, problem, query)
+            if 0 < right < tried:
+                break  # it depends on the noise, whatever comes
+        answer, reason = words.tried_reason(right, tried - right, label)
+        if tried < count and not 0 < right < tried:
+            answer, reason = UNDECIDED, words.TIME_OVER
+        return asked.model_copy(
+            update={
+                "answer": answer,
+                "reason": reason,
+                "pictures": tried,
+                "spp": one.spp,
+                "picture": picture,
+                "seconds": time.perf_counter() - begun,
+            }
+        )
+
+    # ---- parts ------------------------------------------------------------------------------------------------------
+
+    def _problem(self, config: SceneConfig) -> Problem:
+        whole = AttackConfig.of(config)
+        parts = parts_of(whole)
+        problem = problem_of(whole, parts.scene, parts.loaded[0], differentiated=False)
+        self.warnings += [*parts.scene.description.notes, *parts.loaded[1]]
+        return problem
+
+    def _shared(self, config: SceneConfig) -> AttackConfig:
+        return AttackConfig.of(config, workers=self.workers, cluster=self.cluster)
+
+    def _answers(self, journal: Journal, queries: Iterator[Query]) -> Iterator[tuple[Query, Evaluation]]:
+        """Ask, as many at once as there are workers for, until the time is over."""
+        at_once = 1 if journal.traced.executor is None else AHEAD * (self.workers or 8)
+        while batch := list(islice(queries, at_once)):
+            for query, answer in zip(batch, journal.answers(batch), strict=True):
+                self.progress.advance(1, **journal.traced.told)
+                yield query, answer
+            if self.late():
+                return
+
+    def _picture(self, name: str, problem: Problem, query: Query) -> str:
+        """Render the picture of a query again, and return its file in the run."""
+        self.run.save_image(name, problem.picture(query.u, query.seed, query.spp, drawn=query.drawn))
+        return f"{IMAGES}/{name}.png"
+
+    def _described(self, problem: Problem, query: Query) -> str:
+        values = list(problem.describe(query.u, query.seed).items())
+        shown = [
+            f"{name} {number_text(one['value'])}" + ("" if one["unit"] in ("1", "name") else f" {one['unit']}")
+            for name, one in values[:MANY]
+        ]
+        return ", ".join([*shown, *(["..."] if len(values) > MANY else [])])
+
+    def _decided(
+        self,
+        asked: ClaimAnswer,
+        answer: str,
+        reason: str,
+        sequence: ConfidenceSequence,
+        config: SceneConfig,
+        picture: str | None,
+        scale: tuple[float, float],
+    ) -> ClaimAnswer:
+        """What drawn pictures say; `scale` has the value of a mean of 0, and how much more that of 1 is."""
+        if answer == UNDECIDED and self.late():
+            reason = f"{reason}; {words.TIME_OVER}"
+        begin, wide = scale
+        low, high = sequence.interval
+        return asked.model_copy(
+            update={
+                "answer": answer,
+                "reason": reason,
+                "pictures": sequence.count,
+                "rate": begin + wide * sequence.mean if sequence.count else None,
+                "interval": (begin + wide * low, begin + wide * high),
+                "spp": spp_of(config),
+                "picture": picture,
+            }
+        )
+
+
+@dataclass
+class Shown:
+    """The last picture that was rendered, for the next model."""
+
+    _seed: int | None = None
+    _picture: torch.Tensor | None = None
+
+    def of(self, problem: Problem, query: Query) -> Evaluation:
+        """Have a picture judged that is rendered if it is another one than the last."""
+        if self._picture is None or query.seed != self._seed:
+            self._seed, self._picture = query.seed, problem.picture(query.u, query.seed, query.spp)
+        return Evaluation.of(problem.judge(self._picture, problem.whole(query.u)))
+
+
+def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
+    """Draw configurations evenly from the whole space and budget, one after the other, each with a seed of its own."""
+    for number in range(count):
+        generator = torch.Generator().manual_seed(seeds.stream(problem.seed, f"{kind} draw", number))
+        (u,) = problem.domain.sample(generator)
+        seed = seeds.stream(problem.seed, kind, number)
+        yield Query(u, seed, kind, number, spp=spp, described=problem.domain.dim <= MOST_KEPT, sought=False)
+
+
+def decided(sequence: ConfidenceSequence, least: float) -> str:
+    """Return what draws say of the claim that their mean is at least so large."""
+    return HELD if sequence.is_over(least) else FAILED if sequence.is_under(least) else UNDECIDED
+
+
+def spp_of(config: SceneConfig) -> int:
+    """Return the samples a pixel of each picture."""
+    assert isinstance(config, DrawnConfig)
+    return ladder_of(AttackConfig.of(config, verify_spp=config.verify_spp))[0]

@@ -1,0 +1,94 @@
+"""`advsearch test`: claims about a model, each held, failed or undecided; a gate at every change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from advsearch.cli import output
+from advsearch.cli.output import as_notes
+from advsearch.cli.question import Positional, QuestionCommand
+
+if TYPE_CHECKING:
+    import argparse
+
+    from advsearch.questions.test.answer import SuiteResult
+    from advsearch.settings import Config
+
+HELP = "test claims about a model, each answered held, failed or undecided: a gate at every change"
+EXAMPLES = (
+    "test suites/mug.yaml",
+    "test suites/mug.yaml --model model.pt2 --junit junit.xml --sarif robustness.sarif",
+    "test suites/mug.yaml --only counterexamples",
+    "test suites/mug.yaml --add mug-texture-001",
+    "test suites/mug.yaml --fresh --seconds 600 --json",
+)
+
+
+class _Test(QuestionCommand):
+    """The command: its exit status is the suite's answer, and machines get their files."""
+
+    def file(self, args: argparse.Namespace) -> Path | None:
+        """Return the suite, whose Python code is imported only if it is named."""
+        return Path(args.suite)
+
+    def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+        """Try the claims, print their answers, write the files, and return the exit status."""
+        from advsearch.cli.progress import at_work
+        from advsearch.questions.test.answer import SuiteResult
+
+        _check_files(config)
+        with at_work(as_json=as_json, quiet=quiet) as progress:
+            from advsearch.api import carry_out
+
+            result = carry_out(config, progress=progress, resumed=resumed)
+        assert isinstance(result, SuiteResult)
+        write_files(config, result)
+        return output.finish(result, self.answer, as_json=as_json) or result.status
+
+
+def _files(config: Config) -> dict[str, Path]:
+    return {name: Path(given) for name in ("junit", "sarif", "markdown") if (given := getattr(config, name))}
+
+
+def _check_files(config: Config) -> None:
+    """Refuse files that cannot be written before anything is rendered.
+
+    Raises:
+        InputError: the folder of one is not there.
+    """
+    from advsearch.errors import InputError
+
+    for name, path in _files(config).items():
+        if path.is_dir() or not path.absolute().parent.is_dir():
+            raise InputError(f"{name}: expected a file in a folder that is there, got {path}; make the folder first")
+
+
+def write_files(config: Config, result: SuiteResult) -> None:
+    """Write the files for machines that a configuration asks for."""
+    from advsearch.questions.test import machines
+    from advsearch.runs.files import write_text
+
+    for name, path in _files(config).items():
+        write_text(path, getattr(machines, name)(result), durable=False)
+
+
+def answer(result: SuiteResult) -> str:
+    """Return what the suite says, a table of its claims, what repeats those that are not held, and the cost."""
+    from advsearch.questions.test.answer import HELD
+    from advsearch.questions.test.words import NOT_TRIED, TABLE_HEADS, facts, suite_text, table_rows
+    from advsearch.runs.directory import REPORT
+
+    listed = output.aligned([TABLE_HEADS, *table_rows(result)])
+    parts = [f"{result.title}\n{suite_text(result)}", listed]
+    for one in result.claims:
+        if one.answer != HELD and one.reason != NOT_TRIED:
+            rows = [["picture", f"{result.run}/{one.picture}"]] if one.picture else []
+            parts.append(f"{one.name}\n{output.aligned([*rows, ['again', one.repeat]])}")
+    parts += ["Expected from now on\n" + output.aligned([[one] for one in result.changes])] if result.changes else []
+    parts.append(output.aligned([*map(list, facts(result).items()), ["page", f"{result.run}/{REPORT}"]]))
+    parts += ["Interrupted."] if result.ending == "interrupted" else []
+    return "\n\n".join(parts) + as_notes(result.warnings)
+
+
+COMMAND = _Test("test", answer, about="suite", place=Positional("SUITE", "a suite, a YAML file"))

@@ -1,0 +1,260 @@
+"""Answers of runs that became tests: each a small file and a picture in a folder beside the suite."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import lzma
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
+
+from advsearch.api.attack import parts_in, problem_of_parts
+from advsearch.api.replay import kept_answer
+from advsearch.config import AttackConfig, SceneConfig
+from advsearch.engine.loading import Scene
+from advsearch.errors import FileFormatError, InputError
+from advsearch.files import parse_json, read_text
+from advsearch.questions.test.answer import ANSWERS, HELD
+from advsearch.questions.test.suite import OWN, Suite
+from advsearch.runs.directory import CONFIG, IMAGES, PARTS, default_name, find_run
+from advsearch.runs.files import write_bytes, write_text
+from advsearch.runs.images import smaller_png
+from advsearch.runs.summary import attack_of
+from advsearch.settings import FILES, settings
+
+FINE, COARSE, FEW = 32767, 255, 4096
+"""Steps of 1 in which a number is kept: of a few numbers, and of more than `FEW`, as the texels of a texture, where
+those of an 8-bit picture do."""
+
+LARGEST = 1 << 24
+"""Most bytes of a file, and most numbers of a configuration."""
+
+MEMORY = 1 << 27
+"""Bytes that unpacking one may take."""
+
+SIDE = 96
+"""Longest side of the picture, in pixels."""
+
+TRIALS = {False: 6, True: 20}
+"""Fresh renders that try one, and one that has to hold under many conditions."""
+
+OF_SEARCH = (
+    *(*OWN, "policy", "steps", "step_size", "objective", "metrics", "log", "average", "baseline", "trials"),
+    *("measure", "estimators", "specialise", "draws", "aov", "printable", "spp", "verify_spp"),
+)
+"""Settings of a run that say nothing of what its answer is."""
+
+OF_MODEL = ("model", "labels", "prompt", "task", "label")
+"""Settings that a suite says of the model under test, in place of the run's."""
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    schema_: int = Field(alias="schema", ge=1, le=1)
+    run: str
+    said: str
+    settings: dict[str, Any]
+    scene: str
+    spp: int = Field(ge=1, le=65536)
+    steps: int = Field(ge=1, le=32767)
+    numbers: int = Field(ge=1, le=LARGEST)
+    offsets: str
+
+
+@dataclass(frozen=True)
+class Counterexample:
+    """The answer of a run.
+
+    Attributes:
+        name: of its file.
+        path: of its file; the picture is beside it.
+        config: what it was found with.
+        said: what the model said of it.
+        scene: digest of the scene.
+        spp: samples a pixel that it was verified with.
+        offsets: (d,) int16, how far each number is from the clean scene's, in steps of 1 / `steps`.
+        steps: of 1.
+    """
+
+    name: str
+    path: Path
+    config: AttackConfig
+    said: str
+    scene: str
+    spp: int
+    offsets: np.ndarray[Any, np.dtype[np.int16]]
+    steps: int
+
+    def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
+        """Return what it is tried with: the run's scene, and the suite's model."""
+        theirs = {name: value for name, value in suite.settings.items() if name in OF_MODEL}
+        said = {name: value for name, value in changes.items() if value is not None}
+        own = {} if "model" not in {**theirs, **said} else {name: None for name in ("labels", "prompt")}
+        return AttackConfig(**{**self.config.plain(), "run": None, **own, **theirs, "seed": suite.seed, **said})
+
+    def configuration(self, start: Tensor) -> Tensor:
+        """Return u, (d,) float32, from that of the clean scene."""
+        if start.numel() != len(self.offsets):
+            raise InputError(
+                f"{self.path}: has {len(self.offsets)} numbers, and its scene has {start.numel()} now; remove it, or "
+                "add the answer of a new run"
+            )
+        return (start + torch.from_numpy(self.offsets.astype(np.float32)) / self.steps).clamp(0.0, 1.0)
+
+
+def folder_of(suite: str) -> Path:
+    """Return the folder of a suite's counterexamples, and of what is expected of it."""
+    return Path(suite).with_suffix(".counterexamples")
+
+
+def scene_digest(scene: Scene) -> str:
+    """Return the SHA-256 of object, environment and given values, in hexadecimal."""
+    described, digest = scene.description, hashlib.sha256()
+    mesh, light = described.object.mesh, described.environment
+    for array in (mesh.vertices, mesh.faces, mesh.uvs, described.object.base_color, light.radiance if light else None):
+        digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    digest.update(json.dumps(sorted(described.given_values.items())).encode())
+    return digest.hexdigest()
+
+
+def add(suite: str, run: str) -> Counterexample:
+    """Keep the answer of a run as a counterexample of a suite.
+
+    Raises:
+        InputError: the run found nothing, or its answer is no counterexample.
+    """
+    path = find_run(run)
+    summary, config = attack_of(path), AttackConfig.from_yaml(path / CONFIG)
+    if summary.ending != "found" or summary.verified is None:
+        raise InputError(f"add: expected a run whose answer was found, got {path}, which ended with {summary.ending!r}")
+    if summary.minimises:
+        raise InputError(f"add: expected a run that makes the model wrong, got {path}, which makes the object easier")
+    parts = parts_in(path)
+    problem, _ = problem_of_parts(parts)
+    moved = kept_answer(path, problem) - problem.domain.start
+    steps = FINE if moved.numel() <= FEW else COARSE
+    offsets = (moved * steps).round().to(torch.int16).numpy()
+    of = path.parents[1].name if path.parent.name == PARTS else ""
+    folder, name = folder_of(suite), default_name(of or path.name, (path.name,) if of else ())
+    values = {
+        "schema": 1,
+        "run": path.name,
+        "said": next(iter(summary.verified.labels), ""),
+        "settings": _settings(config),
+        "scene": scene_digest(parts.scene),
+        "spp": summary.verified.spp,
+        "steps": steps,
+        "numbers": len(offsets),
+        "offsets": base64.b85encode(lzma.compress(offsets.astype("<i2").tobytes())).decode("ascii"),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    picture = (path / IMAGES / "adversarial.png").read_bytes()
+    write_bytes(folder / f"{name}.png", smaller_png(picture, SIDE))
+    return _read(write_text(folder / f"{name}.json", json.dumps(values, indent=1) + "\n"))
+
+
+def remove(one: Counterexample) -> None:
+    """Remove the files of a counterexample."""
+    one.path.unlink(missing_ok=True)
+    one.path.with_suffix(".png").unlink(missing_ok=True)
+
+
+def _settings(config: AttackConfig) -> dict[str, Any]:
+    """What decides the scene, what may vary in it, and what is right; files below the current folder relative to it."""
+    plain, here = config.to_repeat().plain(), os.getcwd()
+    given = {
+        one.name: plain[one.name]
+        for one in settings(AttackConfig)
+        if one.name not in OF_SEARCH and getattr(config, one.field) != one.default
+    }
+    for name in FILES:
+        if isinstance(path := given.get(name), str) and os.path.isabs(path) and Path(path).is_relative_to(here):
+            given[name] = os.path.relpath(path, here)
+    return given
+
+
+def counterexamples(suite: str) -> list[Counterexample]:
+    """Return those of a suite, by name.
+
+    Raises:
+        FileFormatError: a file is damaged.
+    """
+    folder = folder_of(suite)
+    return [_read(path) for path in sorted(folder.glob("*.json")) if path.name != EXPECTED]
+
+
+def _read(path: Path) -> Counterexample:
+    try:
+        kept = _File.model_validate(parse_json(read_text(path, "a counterexample", LARGEST)))
+        unpack = lzma.LZMADecompressor(memlimit=MEMORY)
+        data = unpack.decompress(base64.b85decode(kept.offsets), 2 * kept.numbers)
+        offsets = np.frombuffer(data, "<i2").astype(np.int16)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        got = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
+        raise FileFormatError(f"{path}: expected a counterexample, got one with {got}; remove it") from None
+    except (OSError, ValueError, lzma.LZMAError) as error:
+        raise FileFormatError(f"{path}: expected a counterexample, got {str(error)[:80]}; remove it") from None
+    if len(offsets) != kept.numbers or not unpack.eof:
+        raise FileFormatError(f"{path}: expected {kept.numbers} numbers, got others; remove it")
+    try:
+        config = AttackConfig(**kept.settings)
+    except InputError as error:
+        raise FileFormatError(f"{path}: settings: {error}") from None
+    return Counterexample(path.stem, path, config, kept.said, kept.scene, kept.spp, offsets, kept.steps)
+
+
+# ---- what is expected -----------------------------------------------------------------------------------------------
+
+EXPECTED = "expected.json"
+"""What claims said when that was accepted, where they were not held."""
+
+
+def read_expected(suite: str) -> dict[str, str]:
+    """Return what is expected of each claim that is not expected to be held.
+
+    Raises:
+        FileFormatError: the file is damaged.
+    """
+    path = folder_of(suite) / EXPECTED
+    if not path.is_file():
+        return {}
+    try:
+        values = parse_json(read_text(path, "what is expected of a suite", LARGEST))
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f"{path}: expected answers by claim, got {str(error)[:80]}; remove it") from None
+    found = values.get("expected") if isinstance(values, dict) else None
+    if not isinstance(found, dict) or not set(map(str, found.values())) <= set(ANSWERS):
+        raise FileFormatError(f"{path}: expected answers by claim, got something else; remove it")
+    return {str(name): str(answer) for name, answer in found.items()}
+
+
+def write_expected(suite: str, answers: Mapping[str, str]) -> list[str]:
+    """Expect these answers from now on, and return what changes, in words."""
+    before = read_expected(suite)
+    now = {**before, **answers}
+    kept = {name: answer for name, answer in sorted(now.items()) if answer != HELD}
+    folder = folder_of(suite)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / EXPECTED, json.dumps({"schema": 1, "expected": kept}, indent=1) + "\n")
+    changed = {name: (before.get(name, HELD), answer) for name, answer in answers.items()}
+    return [f"{name}: {was} -> {now}" for name, (was, now) in changed.items() if was != now]
+
+
+def same_scene(one: Counterexample, scene: Scene) -> bool:
+    """Whether a scene is the one that a counterexample was found in."""
+    return scene_digest(scene) == one.scene
+
+
+def is_over(config: SceneConfig) -> bool:
+    """Whether an answer has to hold under many conditions."""
+    return bool(getattr(config, "over", {}))

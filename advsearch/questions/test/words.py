@@ -1,0 +1,127 @@
+"""A suite in words: what is claimed, why it is held, failed or undecided, and a table of it."""
+
+from __future__ import annotations
+
+from advsearch.config.attack import AttackConfig
+from advsearch.config.scene import SceneConfig
+from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer, SuiteResult
+from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
+from advsearch.report.phrases import percent, with_article
+from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
+from advsearch.runs.results.attack import AttackSummary
+
+TABLE_HEADS = ("claim", "answer", "pictures", "why")
+
+TIME_OVER = "the time of the suite was over"
+STOPPED = "it was interrupted"
+NOT_TRIED = "not tried, since a counterexample failed"
+
+
+def statement(claim: AnyClaim, config: SceneConfig) -> str:
+    """Return what is claimed."""
+    what = f"{short_name(config.object)}, {', '.join(config.controls)}"
+    if isinstance(claim, RightClaim):
+        return f"{short_name(config.model)} is right in at least {percent(claim.at_least)} of what spans {what}"
+    if isinstance(claim, NoWorseClaim):
+        points = f"{number_text(claim.points)} points"
+        models = f"{short_name(config.model)} is right at most {points} less often than {short_name(claim.than)}"
+        return f"{models} on the same pictures of {what}"
+    epsilon = getattr(config, "epsilon", None)
+    within = "" if epsilon is None else f" within {number_text(epsilon) if isinstance(epsilon, float) else epsilon}"
+    return f"no search finds a wrong {short_name(config.model)} over {what}{within}"
+
+
+def right_reason(answer: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
+    """Return why a claim about a share is held, failed or undecided.
+
+    Args:
+        answer: one of these.
+        right: pictures that are right.
+        pictures: of so many.
+        interval: of the share, at all times together.
+        worst: what was seen where it was most wrong; empty where it never was.
+    """
+    said = f"right in {right} of {pictures} (interval {interval_text(interval)})" if pictures else "no picture"
+    more = f"; not decided after {count(pictures, 'picture')}" if answer == UNDECIDED else ""
+    return said + more + (f"; {worst}" if worst else "")
+
+
+def difference_reason(answer: str, counts: tuple[int, int, int], interval: tuple[float, float], than: str) -> str:
+    """Return why a claim about two models is held, failed or undecided.
+
+    Args:
+        answer: one of these.
+        counts: pictures; those in which only the model is right, and those in which only the other one is.
+        interval: of the difference of shares.
+        than: the other model.
+    """
+    pictures, ours, theirs = counts
+    if not pictures:
+        return "no picture"
+    ends = " to ".join(f"{100.0 * end:+.1f}" for end in interval)
+    said = (
+        f"of {count(pictures, 'picture')} it alone is right in {ours}, {short_name(than)} alone in {theirs} "
+        f"(difference {100.0 * (ours - theirs) / pictures:+.1f} points, interval {ends})"
+    )
+    return said + (f"; not decided after {count(pictures, 'picture')}" if answer == UNDECIDED else "")
+
+
+def search_answer(summary: AttackSummary, config: AttackConfig) -> tuple[str, str]:
+    """Return what a search says of a claim that there is nothing to find, and why."""
+    verified, clean = summary.verified, summary.clean.control
+    if summary.ending == "already wrong":
+        right = "" if clean is None else f": right in {clean.correct} of {clean.trials} trials"
+        return FAILED, f"wrong on the clean scene already{right}"
+    if summary.ending == "found" and verified is not None:
+        label = next(iter(verified.labels), "")
+        called = f", most often {with_article(label)}" if label else ""
+        return FAILED, f"a verified counterexample: wrong in {verified.successes} of {verified.trials} trials{called}"
+    if summary.goes_on:
+        return UNDECIDED, STOPPED
+    if verified is not None and verified.successes:
+        return UNDECIDED, f"its answer is wrong in {verified.successes} of {verified.trials} trials, by noise"
+    asked = config.steps
+    if config.seconds is not None and asked is not None and summary.steps < asked:
+        return UNDECIDED, f"{TIME_OVER} after {summary.steps} of {asked} steps"
+    beside = "" if summary.baseline is None else ", nor by as many random renders"
+    return HELD, f"not broken by {count(summary.steps, 'step')} of {summary.policy}{beside}; this is no proof"
+
+
+def tried_reason(right: int, wrong: int, label: str) -> tuple[str, str]:
+    """Return what trials of a counterexample say, and why."""
+    if not wrong:
+        return HELD, f"right in {right} of {right} trials"
+    said = f"wrong in {wrong} of {right + wrong} trials, {with_article(label)}"
+    return (UNDECIDED, f"{said}: it depends on the noise") if right else (FAILED, said)
+
+
+def table_rows(result: SuiteResult) -> list[list[str]]:
+    """Return a row for each claim, under `TABLE_HEADS`."""
+    return [[one.name, answer_text(one), str(one.pictures or ""), one.reason] for one in result.claims]
+
+
+def answer_text(one: ClaimAnswer) -> str:
+    """Return the answer, with what was expected where that is another one."""
+    if one.expected == HELD:
+        return one.answer
+    return f"{one.answer} ({'as expected' if one.answer == one.expected else f'expected: {one.expected}'})"
+
+
+def suite_text(result: SuiteResult) -> str:
+    """Return what a suite says as a whole, in a sentence."""
+    if result.added is not None:
+        return f"Kept as {result.added}."
+    known = sum(one.answer != HELD and one.accepted for one in result.claims)
+    beside = f", {known} of them as expected" if known else ""
+    return f"{result.answer[:1].upper()}{result.answer[1:]}: {result.brief or 'no claims'}{beside}."
+
+
+def facts(result: SuiteResult) -> dict[str, str]:
+    """Return what it was done with."""
+    return {
+        "model": result.model,
+        "confidence": f"{percent(result.confidence)} for each claim that pictures decide",
+        "pictures": str(sum(one.pictures for one in result.claims)),
+        "seed": str(result.seed),
+        "time": seconds_text(result.seconds["total"]),
+    }

@@ -1,0 +1,198 @@
+"""Claims about a model as assertions, for pytest (docs/testing.md).
+
+    from advsearch.testing import assert_right
+
+    def test_the_mug_is_seen_from_all_sides():
+        assert_right("mug", "model.pt2", at_least=0.9, controls={"camera": {"azimuth": [0, 360]}})
+
+A failure shows the picture's path and what repeats it. Every call keeps a run, in `run` or under runs/.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from advsearch.engine.loading import Scene
+    from advsearch.engine.naming import AnyModel
+    from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
+
+__all__ = ["assert_no_worse", "assert_not_broken", "assert_right", "assert_suite"]
+
+
+def assert_right(
+    object: str | Path | Scene,
+    model: AnyModel = "reference",
+    *,
+    at_least: float = 0.95,
+    pictures: int = 400,
+    confidence: float = 0.95,
+    seed: int = 0,
+    run: str | Path | None = None,
+    **settings: Any,
+) -> SuiteResult:
+    """Assert that a model is right in at least a share of the pictures that the controls span.
+
+    Pictures are drawn until that is shown or refuted at the stated confidence.
+
+    Args:
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
+        at_least: the share, over 0 and under 1.
+        pictures: that are drawn, at most.
+        confidence: that an assertion that passes, or fails, is right to do so.
+        seed: root of all random numbers.
+        run: where the run is kept.
+        **settings: of a scene and its pictures, as `sweep` takes them, and `controls`.
+
+    Raises:
+        AssertionError: the share is shown to be smaller, or so many pictures do not decide it.
+        InputError: anything that the caller can put right.
+    """
+    __tracebackhide__ = True
+    claim = {"claim": "right", "at_least": at_least, "pictures": pictures}
+    return _asserted(claim, object, {"model": model}, settings, confidence, seed, run)
+
+
+def assert_not_broken(
+    object: str | Path | Scene,
+    model: AnyModel = "reference",
+    *,
+    seed: int = 0,
+    run: str | Path | None = None,
+    **settings: Any,
+) -> SuiteResult:
+    """Assert that a search finds no configuration that a model gets wrong. That it finds none is no proof.
+
+    Args:
+        object, model, seed, run: as for `assert_right`.
+        **settings: as for `attack`: `controls`, `epsilon`, `steps`, `policy`, ...
+
+    Raises:
+        AssertionError: the search found one that was verified, or the model is wrong on the clean scene already.
+        InputError: anything that the caller can put right.
+    """
+    __tracebackhide__ = True
+    return _asserted({"claim": "not_broken"}, object, {"model": model}, settings, 0.95, seed, run)
+
+
+def assert_no_worse(
+    object: str | Path | Scene,
+    model: AnyModel,
+    than: AnyModel,
+    *,
+    points: float = 2.0,
+    pictures: int = 1000,
+    confidence: float = 0.95,
+    seed: int = 0,
+    run: str | Path | None = None,
+    **settings: Any,
+) -> SuiteResult:
+    """Assert that a model is right at most so many percentage points less often than another, on the same pictures.
+
+    Args:
+        object, model, pictures, confidence, seed, run, **settings: as for `assert_right`.
+        than: the other model.
+        points: percentage points, over 0 and under 100.
+
+    Raises:
+        AssertionError: it is shown to be worse, or so many pictures do not decide it.
+        InputError: anything that the caller can put right.
+    """
+    __tracebackhide__ = True
+    claim = {"claim": "no_worse", "points": points, "pictures": pictures}
+    return _asserted(claim, object, {"model": model, "than": than}, settings, confidence, seed, run)
+
+
+def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
+    """Assert that all claims of a suite are held, or are what was expected when it was last updated.
+
+    Args:
+        suite: a YAML file.
+        **settings: of `advsearch test`: `model`, `only`, `seed`, `fresh`, `seconds`, `run`, ...
+
+    Raises:
+        AssertionError: one failed, or is undecided.
+        InputError: anything that the caller can put right.
+    """
+    __tracebackhide__ = True
+    from advsearch.engine.turn import in_turn
+    from advsearch.questions.test.carry_out import test_from_config
+    from advsearch.questions.test.settings import SuiteConfig
+
+    with in_turn():
+        result = test_from_config(SuiteConfig(**{"suite": str(suite), **settings}))
+    bad = [one for one in result.claims if not one.accepted]
+    if bad:
+        raise AssertionError("\n\n".join(_told(result, one, one.repeat) for one in bad))
+    return result
+
+
+def _asserted(
+    claim: Mapping[str, object],
+    object: str | Path | Scene,
+    models: Mapping[str, AnyModel],
+    settings: Mapping[str, Any],
+    confidence: float,
+    seed: int,
+    run: str | Path | None,
+) -> SuiteResult:
+    """Try a suite of one claim, and raise what its answer says."""
+    __tracebackhide__ = True
+    from advsearch.engine.loading import (
+        CONTROL,
+        MODEL,
+        SCENE,
+        Scene,
+        instances_in,
+        lending,
+        scene_as_settings,
+        settings_of,
+    )
+    from advsearch.engine.naming import exists_here, model_name
+    from advsearch.engine.turn import in_turn
+    from advsearch.questions.test.carry_out import test_from_config
+    from advsearch.questions.test.settings import SuiteConfig
+    from advsearch.questions.test.suite import suite_of
+
+    name = str(claim["claim"]).replace("_", "-")
+    with ExitStack() as stack:
+        stack.enter_context(in_turn())
+        given, said = dict(settings), dict(claim)
+        if isinstance(object, Scene):
+            given |= {key: value for key, value in scene_as_settings(object).items() if value is not None}
+            stack.enter_context(lending(SCENE, {given["object"]: object}))
+        else:
+            given["object"] = str(object)
+        for key, model in models.items():
+            (given if key == "model" else said)[key] = model_name(model)
+            if not isinstance(model, (str, Path)):
+                stack.enter_context(lending(MODEL, {model_name(model): model}))
+        if instances := instances_in(given.get("controls", ())):
+            stack.enter_context(lending(CONTROL, {one.name: one for one in instances}))
+            given["controls"] = settings_of(given["controls"])
+        title = f"assert_{claim['claim']}"
+        values = {"title": title, "settings": given, "seed": seed, "confidence": confidence, "claims": {name: said}}
+        suite = suite_of(values, title)
+        only_here = [f"the call of {title}", *(f"the model {model_name(m)}" for m in models.values() if exists_here(m))]
+        config = SuiteConfig(suite=title, run=None if run is None else str(run)).with_only_here(only_here)
+        result = test_from_config(config, suite=suite)
+    (answer,) = result.claims
+    if answer.answer != "held":
+        test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
+        again = f"pytest {shlex.quote(test)}" if test else "call the same function with the same arguments"
+        raise AssertionError(_told(result, answer, again))
+    return result
+
+
+def _told(result: SuiteResult, one: ClaimAnswer, again: str) -> str:
+    """What a failing test shows."""
+    run = Path(result.run or "")
+    lines = [f"{one.name}: {one.answer}: {one.reason}", f"  claimed: {one.statement}"]
+    lines += [f"  picture: {(run / one.picture).resolve()}"] if one.picture else []
+    return "\n".join([*lines, f"  run: {run}", f"  again: {again}"])

@@ -1,0 +1,74 @@
+"""Confidence sequences: right at all times together, decided as soon as draws allow, and monotone."""
+
+from __future__ import annotations
+
+import math
+import runpy
+from pathlib import Path
+
+import pytest
+
+from advsearch.attacks.sequential import STAKES, ConfidenceSequence, capital
+from advsearch.errors import InputError
+
+STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "sequential.py"
+
+
+def of(*values: float, confidence: float = 0.95) -> ConfidenceSequence:
+    sequence = ConfidenceSequence(confidence)
+    for value in values:
+        sequence.add(value)
+    return sequence
+
+
+def test_the_capital_is_that_of_the_bets_made_one_after_the_other() -> None:
+    draws, mean = [1.0, 0.0, 0.5, 1.0, 1.0], 0.4
+    made = [math.prod(1.0 - stake + stake * one / mean for one in draws) for stake in STAKES]
+    assert math.exp(capital(mean, {1.0: 3, 0.0: 1, 0.5: 1})) == pytest.approx(sum(made) / len(made))
+    assert capital(mean, {}) == 0.0, "1 before any draw"
+
+
+def test_an_interval_holds_what_is_not_excluded_and_nothing_else() -> None:
+    sequence = of(*[1.0] * 40, *[0.0] * 5)
+    low, high = sequence.interval
+    assert low < sequence.mean == 40 / 45 < high
+    assert sequence.is_over(low - 1e-6) and not sequence.is_over(low + 1e-6)
+    assert sequence.is_under(high + 1e-6) and not sequence.is_under(high - 1e-6)
+    assert of().interval == (0.0, 1.0) and math.isnan(of().mean)
+
+
+def test_right_and_wrong_change_places() -> None:
+    low, high = of(1.0, 1.0, 0.0, 0.5).interval
+    other_low, other_high = of(0.0, 0.0, 1.0, 0.5).interval
+    assert (low, high) == pytest.approx((1.0 - other_high, 1.0 - other_low))
+
+
+@pytest.mark.parametrize(("least", "most"), [(0.5, 8), (0.9, 50), (0.95, 100)])
+def test_draws_that_all_agree_decide_soon(least: float, most: int) -> None:
+    sequence, count = ConfidenceSequence(), 0
+    while not sequence.is_over(least):
+        sequence.add(1.0)
+        count += 1
+    assert math.log(2 / 0.05) / -math.log(least) <= count <= most, "never before a bet of everything would"
+
+
+def test_a_surer_interval_is_wider() -> None:
+    draws = [1.0] * 20 + [0.0] * 4
+    (low, high), (wide_low, wide_high) = of(*draws).interval, of(*draws, confidence=0.999).interval
+    assert wide_low < low < high < wide_high
+
+
+@pytest.mark.parametrize("share", [0.5, 0.95])
+def test_the_true_mean_is_excluded_at_any_time_less_often_than_the_error(share: float) -> None:
+    """A small form of the study: 400 runs of 150 draws, each looked at after every draw."""
+    study = runpy.run_path(str(STUDY))
+    missed = study["missed"](share, 0.0, runs=400, draws=150, confidence=0.8, seed=1)
+    assert missed <= 0.2 * 400, "80 % intervals, so that there is something to see"
+    assert missed > 0, "it is not merely the whole of [0, 1]"
+
+
+def test_what_is_no_share_is_refused() -> None:
+    with pytest.raises(InputError, match=r"from 0 to 1, got 1\.5"):
+        of(1.5)
+    with pytest.raises(InputError, match="confidence: expected a number between 0 and 1"):
+        ConfidenceSequence(95.0)

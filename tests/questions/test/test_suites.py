@@ -1,0 +1,329 @@
+"""`advsearch test`: claims, their answers, what machines read of them, and answers of runs that become tests."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import small_models
+import yaml
+
+import advsearch
+from advsearch.api.attack import attack_once
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
+from advsearch.engine.problem import Problem
+from advsearch.errors import AdvsearchError
+from advsearch.questions.test import machines
+from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
+from advsearch.questions.test.carry_out import test_from_config as carry_out
+from advsearch.questions.test.counterexamples import counterexamples, folder_of
+from advsearch.questions.test.settings import SuiteConfig
+from advsearch.runs.store import Store
+from advsearch.runs.summary import read_result
+from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
+
+EASY, HARD = "small_models:easy", "small_models:hard"
+SMALL: dict[str, Any] = {"resolution": 32, "denoise": "none"}
+FRONT: dict[str, Any] = {"light": {}}
+BACK: dict[str, Any] = {"camera": {"azimuth": [200, 220]}}
+SEARCH: dict[str, Any] = {
+    "controls": {"texture": {"resolution": 32}}, "steps": 4, "trials": 6, "spp": 2, "verify_spp": 2, "baseline": False,
+    "measure": "no", "specialise": False,
+}  # fmt: skip
+
+
+QUICK = {**SEARCH, "policy": "random", "steps": 8}
+"""Without derivatives, whose kernels take seconds to compile."""
+
+
+def claim(kind: str, controls: dict[str, Any] = FRONT, **more: Any) -> dict[str, Any]:
+    return {"claim": kind, "settings": {"controls": controls, "verify_spp": 2}, **more}
+
+
+def written(folder: Path, claims: dict[str, Any], **more: Any) -> str:
+    """A suite's file."""
+    values = {"settings": {"object": "mug", "model": EASY, **SMALL}, "claims": claims, **more}
+    path = folder / "suite.yaml"
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    return str(path)
+
+
+CLAIMS = {
+    "in-front": claim("right", at_least=0.5, pictures=20),
+    "behind": claim("right", BACK, at_least=0.5, pictures=20),
+    "too-few": claim("right", at_least=0.99, pictures=2),
+    "no-worse": claim("no_worse", than=HARD, points=40, pictures=20),
+}
+
+
+@pytest.fixture(scope="module")
+def tested(tmp_path_factory: pytest.TempPathFactory) -> tuple[SuiteResult, Path]:
+    """A suite with a claim of each answer, and its folder."""
+    folder = tmp_path_factory.mktemp("suite")
+    return carry_out(SuiteConfig(suite=written(folder, CLAIMS), run=str(folder / "run"))), folder
+
+
+@pytest.fixture(scope="module")
+def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose answer was found."""
+    run = tmp_path_factory.mktemp("attacked") / "found"
+    given = {**SMALL, **SEARCH, "epsilon": 0.3}
+    assert attack_once(AttackConfig(object="mug", model=EASY, **given, run=str(run))).found
+    return run
+
+
+# ---- answers --------------------------------------------------------------------------------------------------------
+
+
+def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tuple[SuiteResult, Path]) -> None:
+    result, folder = tested
+    found = {one.name: one for one in result.claims}
+    answers = {name: one.answer for name, one in found.items()}
+    assert answers == {"in-front": "held", "behind": "failed", "too-few": "undecided", "no-worse": "held"}
+    assert (result.answer, result.status, result.brief) == ("failed", 1, "2 held, 1 failed, 1 undecided")
+    assert 6 <= found["in-front"].pictures < 20 and found["in-front"].interval[0] >= 0.5  # type: ignore[index]
+    assert found["behind"].rate == 0.0 and "right in 0 of" in found["behind"].reason
+    picture = advsearch.load_run(folder / "run").run  # type: ignore[union-attr]
+    assert picture == str(folder / "run") and (folder / "run" / str(found["behind"].picture)).is_file()
+    assert "camera.azimuth 2" in found["behind"].reason, "where it is most wrong, in words"
+    with Store(folder / "run" / "results.sqlite", read_only=True) as store:
+        counts = store.counts()
+    assert counts["claim in-front"] == found["in-front"].pictures and counts["claim too-few"] == 2
+    assert counts["claim no-worse"] == counts["claim no-worse beside"] == found["no-worse"].pictures
+    assert read_result(folder / "run") == result
+    page = (folder / "run" / "report.html").read_text("utf-8")
+    assert "data:image/png" in page and "too-few" in page and "Failed: 2 held" in page
+
+
+def test_the_command_repeats_a_claim_alone(tested: tuple[SuiteResult, Path], tmp_path: Path) -> None:
+    result, _ = tested
+    first = next(one for one in result.claims if one.name == "behind")
+    assert first.repeat == f"advsearch test --suite {result.suite} --only behind --seed 0"
+    again = carry_out(SuiteConfig(suite=result.suite, only="behind", run=str(tmp_path / "run")))
+    (one,) = again.claims
+    assert (one.reason, one.interval) == (first.reason, first.interval), "the same pictures"
+    other = carry_out(SuiteConfig(suite=result.suite, only="behind", seed=1, run=str(tmp_path / "other")))
+    assert other.claims[0].reason != first.reason and other.seed == 1
+
+
+def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_safe(tmp_path: Path) -> None:
+    claims = {
+        "little": {"claim": "not_broken", "settings": {**QUICK, "controls": {"camera": {"azimuth": [-20, 20]}}}},
+        "much": {"claim": "not_broken", "settings": {**QUICK, "controls": {"camera": {"azimuth": [0, 360]}}}},
+    }
+    result = carry_out(SuiteConfig(suite=written(tmp_path, claims), run=str(tmp_path / "run")))
+    little, much = result.claims
+    assert (little.answer, much.answer) == ("held", "failed")
+    assert little.reason.startswith("not broken by 8 steps of random") and "no proof" in little.reason
+    assert "wrong in 6 of 6 trials, most often a vase" in much.reason
+    assert much.picture == "parts/much/images/adversarial.png" and (tmp_path / "run" / much.picture).is_file()
+
+
+def test_a_suite_that_was_stopped_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front,too-few", run=str(tmp_path / "run"))
+    real, done = Problem.judge, 0
+
+    def stopped(*given: Any) -> Any:
+        nonlocal done
+        done += 1
+        if done == 4:
+            raise KeyboardInterrupt
+        return real(*given)
+
+    monkeypatch.setattr(Problem, "judge", stopped)
+    first = carry_out(config)
+    assert first.goes_on and [one.reason for one in first.claims] == ["it was interrupted"] * 2
+    again = carry_out(config, resumed=tmp_path / "run")
+    assert again.ending == "done" and [one.answer for one in again.claims] == ["held", "undecided"]
+    assert done == 1 + sum(one.pictures for one in again.claims), "three were read back, one was asked twice"
+
+
+def test_what_the_time_is_over_for_is_undecided_and_can_go_on(tmp_path: Path) -> None:
+    config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="behind,in-front", seconds=1e-3, run=str(tmp_path / "r"))
+    result = carry_out(config)
+    assert (result.status, result.ending, result.goes_on) == (2, "out of time", True)
+    assert all("the time of the suite was over before it began" == one.reason for one in result.claims)
+    assert carry_out(config.model_copy(update={"seconds": None}), resumed=tmp_path / "r").brief == "1 held, 1 failed"
+
+
+# ---- counterexamples and expectations -------------------------------------------------------------------------------
+
+
+def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Path, tmp_path: Path) -> None:
+    suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
+    added = carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
+    assert added.status == 0 and added.added == str(tmp_path / "suite.counterexamples" / "found.json")
+    assert sum(path.stat().st_size for path in folder_of(suite).iterdir()) < 20_000
+    tried = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "tried")))
+    assert [(one.name, one.answer, one.pictures) for one in tried.claims] == [
+        ("found", "failed", 6),
+        ("too-few", "undecided", 0),
+    ]
+    assert tried.claims[0].reason == "wrong in 6 of 6 trials, a vase" and "counterexample failed" in tried.warnings[-1]
+    every = carry_out(SuiteConfig(suite=suite, all=True, update=True, run=str(tmp_path / "every")))
+    assert every.changes == ["found: held -> failed", "too-few: held -> undecided"] and every.status == 0
+    known = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "known")))
+    assert known.status == 0 and [one.expected for one in known.claims] == ["failed", "undecided"]
+    skipped = ElementTree.fromstring(machines.junit(known).partition("\n")[2])
+    assert (skipped.get("failures"), skipped.get("errors"), skipped.get("skipped")) == ("0", "0", "2")
+
+
+def test_an_answer_that_does_not_hold_for_the_suite_s_model_is_not_kept(attacked: Path, tmp_path: Path) -> None:
+    suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
+    always = {"object": "mug", "model": "test_suites:always", **SMALL}
+    Path(suite).write_text(yaml.safe_dump({"settings": always, "claims": {"too-few": CLAIMS["too-few"]}}))
+    with pytest.raises(AdvsearchError, match="is not kept: right in 6 of 6 trials"):
+        carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "run")))
+    assert counterexamples(suite) == [] and not list(folder_of(suite).glob("*.png"))
+
+
+def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Path, tmp_path: Path) -> None:
+    suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
+    carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
+    file = folder_of(suite) / "found.json"
+    kept = json.loads(file.read_text())
+    file.write_text(json.dumps({**kept, "settings": {**kept["settings"], "environment": "loft"}}))
+    other = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "other")))
+    assert other.claims[0].answer == "undecided" and "its scene is another one now" in other.claims[0].reason
+    for change, message in (({"offsets": "%%"}, "expected a counterexample"), ({"numbers": 3}, "expected 3 numbers")):
+        file.write_text(json.dumps({**kept, **change}))
+        with pytest.raises(AdvsearchError, match=message):
+            counterexamples(suite)
+
+
+# ---- for machines ---------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_what_machines_read_and_its_status_is_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    suite = written(tmp_path, {name: CLAIMS[name] for name in ("behind", "too-few")})
+    files = ["--junit", "out.xml", "--sarif", "out.sarif", "--markdown", "out.md"]
+    assert main(["test", suite, "--code", EASY, *files, "--json", "--quiet"]) == 1
+    said = json.loads(capsys.readouterr().out)
+    assert [one["answer"] for one in said["claims"]] == ["failed", "undecided"] and said["command"] == "test"
+    root = ElementTree.parse("out.xml").getroot()
+    cases = {one.get("name"): one for one in root.iter("testcase")}
+    assert root.get("tests") == "2" and root.get("failures") == root.get("errors") == "1"
+    failure = cases["behind"].find("failure")
+    assert failure is not None and "images/behind.png" in str(failure.text) and "--only behind" in str(failure.text)
+    log = json.loads(Path("out.sarif").read_text())
+    (run,) = log["runs"]
+    assert log["version"] == "2.1.0" and [one["level"] for one in run["results"]] == ["error", "warning"]
+    for one in run["results"]:
+        assert run["tool"]["driver"]["rules"][one["ruleIndex"]]["id"] == one["ruleId"]
+        assert one["message"]["text"] and one["baselineState"] == "new"
+        line = one["locations"][0]["physicalLocation"]["region"]["startLine"]
+        assert Path(suite).read_text().splitlines()[line - 1].strip() == f"{one['partialFingerprints']['claim/v1']}:"
+    text = Path("out.md").read_text()
+    assert "| behind | failed |" in text and "advsearch test --suite" in text
+    assert main(["show", str(said["run"])]) == 0
+    assert "too-few" in capsys.readouterr().out
+    assert main(["test", suite, "--code", EASY, "--only", "too-few", "--quiet"]) == 2
+    assert main(["test", suite, "--quiet"]) == 2, "code that a file names is not run unless it is named"
+    assert "code=small_models:easy" in capsys.readouterr().err.replace("--code ", "code=")
+
+
+def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
+    result, _ = tested
+    odd = ClaimAnswer(name="odd", kind="right", statement="<b>|`\x00", answer="failed", reason="a | b\n<script>")
+    odd_result = result.model_copy(update={"claims": [odd], "title": "T\x07 & <x>"})
+    root = ElementTree.fromstring(machines.junit(odd_result).partition("\n")[2])
+    assert root.find("testsuite") is not None and root[0].get("name") == "T? & <x>"
+    assert "| odd | failed |  | a \\| b \\<script\\> |" in machines.markdown(odd_result)
+    assert json.loads(machines.sarif(odd_result))["runs"][0]["results"][0]["ruleId"] == "right"
+
+
+# ---- bad suites -----------------------------------------------------------------------------------------------------
+
+GOOD = CLAIMS["in-front"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"claims": {}}, r"claims: expected names with a claim each, .* got none"),
+        ({"claims": {"a": {**GOOD, "at_least": 95}}}, r"claims.a.at_least: expected a share over 0 and under 1"),
+        ({"claims": {"a": {**GOOD, "claim": "rihgt"}}}, r"claims.a.claim: expected right, not_broken or no_worse, got"),
+        ({"claims": {"a": {"claim": "right", "atleast": 0.9}}}, r"claims.a.atleast: there is no such name"),
+        ({"claims": {"a": 3}}, r"claims.a: expected a claim such as"),
+        ({"claims": {"a": claim("right", {"camra": {}}, at_least=0.9)}}, r"a: unknown control 'camra'.*'camera'"),
+        ({"claims": {"a": {**GOOD, "settings": {"steps": 4}}}}, r"claims.a: unknown setting 'steps'"),
+        ({"claims": {"a": {"claim": "not_broken", "settings": {"minimise": True}}}}, r"minimise: expected a search"),
+        ({"claims": {"a": {"claim": "not_broken", "settings": {"seed": 3}}}}, r"seed is said for the whole suite"),
+        ({"claims": {"A b": GOOD}}, r"claims: expected names of small letters"),
+        ({"confidence": 95}, r"confidence: expected a number from 0.5 to 0.9999"),
+        ({"claims": {"a": claim("no_worse", than="nonesuch", points=3)}}, r"claims.a: unknown model 'nonesuch'"),
+    ],
+)
+def test_a_bad_suite_is_one_sentence_before_anything_is_rendered(
+    tmp_path: Path, change: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Problem, "judge", lambda *given: pytest.fail("rendered"))
+    suite = written(tmp_path, {"a": GOOD})
+    Path(suite).write_text(yaml.safe_dump({**yaml.safe_load(Path(suite).read_text()), **change}))
+    with pytest.raises(AdvsearchError, match=message) as caught:
+        carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "never")))
+    assert str(caught.value).startswith(suite) and "\n" not in str(caught.value)
+    assert not (tmp_path / "never").exists()
+
+
+def test_a_share_may_be_written_in_per_cent_and_an_unknown_claim_is_named(tmp_path: Path) -> None:
+    suite = written(tmp_path, {"a": {**GOOD, "at_least": "50 %"}})
+    assert carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "run"))).status == 0
+    with pytest.raises(AdvsearchError, match=r"unknown claim in `only` 'b'"):
+        carry_out(SuiteConfig(suite=suite, only="b", run=str(tmp_path / "never")))
+
+
+# ---- for pytest -----------------------------------------------------------------------------------------------------
+
+
+def always() -> advsearch.Model:
+    """Says mug to everything."""
+    return advsearch.load_model(small_models.Blue(-9.0), labels=["mug", "vase"], input_size=32, name="always")
+
+
+def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    easy, small = small_models.easy(), {**SMALL, "verify_spp": 2}
+    assert assert_right("mug", easy, at_least=0.5, pictures=20, controls=FRONT, **small).answer == "held"
+    with pytest.raises(AssertionError) as caught:
+        assert_right("mug", easy, at_least=0.5, pictures=20, controls=BACK, **small)
+    text = str(caught.value)
+    (picture,) = (line.partition(": ")[2] for line in text.splitlines() if line.startswith("  picture"))
+    assert Path(picture).is_file() and text.startswith("right: failed: right in 0 of")
+    assert "again: pytest" in text and "::test_assertions_pass_and_fail" in text
+    with pytest.raises(AssertionError, match=r"undecided: .*not decided after 2 pictures"):
+        assert_no_worse("mug", easy, always(), pictures=2, controls=FRONT, **small)
+
+
+def test_a_search_and_a_suite_can_be_asserted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert assert_not_broken(advsearch.load_scene("mug"), always(), **SMALL, **QUICK).status == 0
+    suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
+    with pytest.raises(AssertionError, match=r"too-few: undecided: .*(\n.*)*again: advsearch test"):
+        assert_suite(suite)
+
+
+def test_the_pytest_file_of_the_docs_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test in it, beside the suite of the same page; with fewer steps, and less to show, than on the page."""
+    page = (Path(__file__).resolve().parents[3] / "docs" / "testing.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    (suite,) = re.findall(r"^```yaml\n(# suite\.yaml\n.*?)^```$", page, re.M | re.S)
+    Path("suite.yaml").write_text(suite.replace("at_least: 0.95", "at_least: 0.6").replace("64", "48"))
+    (code,) = re.findall(r"^```python\n(# test_robustness\.py\n.*?)^```$", page, re.M | re.S)
+    names: dict[str, Any] = {}
+    exec(compile(code.replace("steps=20", 'steps=2, policy="random"'), "testing.md", "exec"), names)
+    tests = [one for name, one in names.items() if name.startswith("test_")]
+    assert len(tests) == 3
+    for one in tests:
+        one()
+    assert len(list(Path("runs").iterdir())) == 3, "each keeps its run"
