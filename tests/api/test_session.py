@@ -214,6 +214,7 @@ def test_every_setting_takes_each_value_that_it_is_given_or_none(command: str) -
         "recipe": "a.yaml",
         "sweeps": "run",
         "compared": "run,b",
+        "suite": "a.yaml",
     }
     needed = {name: value for name, value in needed.items() if name in {one.field for one in settings(config)}}
     taken = 0

@@ -60,9 +60,15 @@ class SuiteConfig(Config):
         le=1e9,
     )
     model: str | None = setting_as_in(SceneConfig, "model", default=None, otherwise="what the suite says, or reference")
-    junit: str | None = setting(None, "files", "write JUnit XML, a test case for each claim", "a file")
-    sarif: str | None = setting(None, "files", "write SARIF 2.1.0, a result for each claim that is not held", "a file")
-    markdown: str | None = setting(None, "files", "write a Markdown table, for the summary of a job", "a file")
+    junit: str | None = setting(
+        None, "files", "write JUnit XML, a test case for each claim", "a file", otherwise="none"
+    )
+    sarif: str | None = setting(
+        None, "files", "write SARIF 2.1.0, a result for each claim that is not held", "a file", otherwise="none"
+    )
+    markdown: str | None = setting(
+        None, "files", "write a Markdown table, for the summary of a job", "a file", otherwise="none"
+    )
     seed: int | None = setting_as_in(SceneConfig, "seed", default=None, otherwise="what the suite says, or 0")
     threads: int | None = setting_as_in(SceneConfig, "threads")
     deterministic: bool = setting_as_in(SceneConfig, "deterministic")
