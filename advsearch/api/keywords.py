@@ -118,22 +118,27 @@ class AttackKeywords(SearchKeywords, total=False):
     overwrite: bool
 
 
-class SweepKeywords(PictureKeywords, total=False):
-    """Of `sweep`."""
+class SampledKeywords(PictureKeywords, total=False):
+    """Of what sweeps."""
 
     spp: int | None
     sampler: Literal["sobol", "random"]
     batch: int
     keep_pictures: Literal["all", "wrong", "none"]
     specialise: bool
+    workers: int | None
+    cluster: str | None
+    overwrite: bool
+
+
+class SweepKeywords(SampledKeywords, total=False):
+    """Of `sweep`."""
+
     aov: str | None
     surface: bool
     log: Literal["mlflow", "tensorboard", "wandb"] | None
-    workers: int | None
-    cluster: str | None
     trials: int
     verify_spp: int | None
-    overwrite: bool
 
 
 class GapKeywords(SearchKeywords, NamedKeywords, total=False):

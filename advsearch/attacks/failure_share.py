@@ -4,13 +4,12 @@ that holds at any number of draws."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from advsearch.attacks.trials import CONFIDENCE
+from advsearch.attacks.trials import CONFIDENCE, edge_of
 
 LEAST_EFFECTIVE = 10.0
 """With fewer failures than so many, each of equal weight, no estimate is stated."""
@@ -70,18 +69,5 @@ def failure_share(weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tens
     total = float(low.sum())
     effective = total**2 / float(low.square().sum()) if total else 0.0
     stated = effective >= LEAST_EFFECTIVE and not bool(unknown.any())
-    ends = _edge(lambda p: not against_low(p)), _edge(against_high)
+    ends = edge_of(lambda p: not against_low(p)), edge_of(against_high)
     return FailureShare(min(1.0, total / len(low)) if stated else None, ends, effective, len(low))
-
-
-def _edge(beyond: Callable[[float], bool]) -> float:
-    """Return where in (0, 1) a condition begins to hold, 0 or 1 where it holds everywhere or nowhere."""
-    low, high = 1e-9, 1.0 - 1e-9
-    if beyond(low):
-        return 0.0
-    if not beyond(high):
-        return 1.0
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if beyond(middle) else (middle, high)
-    return high

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from itertools import pairwise, product
 
 from scipy.special import stdtrit
+from torch import Tensor
 
+from advsearch.attacks.evaluation import Evaluate, Query
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.errors import InputError
 from advsearch.seeds import stream
@@ -36,6 +38,28 @@ LOOKS = 2
 
 MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
 """(spp, seeds) -> margins in logits, one of each render."""
+
+
+def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, sought: bool = True) -> MarginsOf:
+    """Return the margins of one configuration under the conditions that the scene comes with; the rows of all sample
+    counts are numbered together.
+
+    Args:
+        evaluate: answers the queries.
+        kind: of the rows.
+        u: (d,) the configuration.
+        sought: as for `Query`.
+    """
+    count = 0
+
+    def margins(spp: int, seeds: Sequence[int]) -> list[float]:
+        nonlocal count
+        first, count = count, count + len(seeds)
+        asked = enumerate(seeds, first)
+        queries = [Query(u, seed, kind, number, spp=spp, drawn=False, sought=sought) for number, seed in asked]
+        return [answer.said.score for answer in evaluate(queries)]
+
+    return margins
 
 
 @dataclass(frozen=True)

@@ -343,10 +343,7 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     nothing = Candidate(log.domain.start, math.nan, False)
     answer = best(log.pool) if log.pool else nothing
     found = answer.rate >= 0.5 and stopped is not Ending.INTERRUPTED
-    if stopped is Ending.FOUND and not found:
-        ending = Ending.BUDGET_SPENT
-    else:
-        ending = Ending.FOUND if found else stopped
+    ending = Ending.FOUND if found else stopped
     policy, state = (log.policy, log.state) if log.state is not None else (None, None)
     if policy is not None and log.told:  # a batch that was cut
         state = policy.update(state, log.told)

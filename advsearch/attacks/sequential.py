@@ -14,20 +14,17 @@ Whoever stops as soon as the interval decides something is right as often as tha
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.attacks.trials import CONFIDENCE
+from advsearch.attacks.trials import CONFIDENCE, edge_of
 from advsearch.errors import InputError
 
 STAKES = np.array([1.0, 0.9, 0.75, 0.5, 0.25, 0.125, 0.0625, 0.03125])
 """Among which the capital is shared equally. Large ones decide soon where nearly all draws agree."""
-
-NEAR = 1e-9
-"""How near to 0 and 1 an end of the interval is looked for."""
 
 
 @dataclass
@@ -72,12 +69,7 @@ class ConfidenceSequence:
     @property
     def interval(self) -> tuple[float, float]:
         """Both ends of the means that are not excluded; `is_over` and `is_under` are monotone in the mean."""
-        low, high = 0.0, 1.0
-        if self.is_over(NEAR):
-            low = _edge(self.is_over)
-        if self.is_under(1.0 - NEAR):
-            high = 1.0 - _edge(lambda mean: self.is_under(1.0 - mean))
-        return low, high
+        return edge_of(lambda mean: not self.is_over(mean)), edge_of(self.is_under)
 
     def _won(self, mean: float, counts: Mapping[float, int]) -> bool:
         return bool(capital(mean, counts) >= np.log(2.0 / (1.0 - self.confidence)))
@@ -90,12 +82,3 @@ def capital(mean: float, counts: Mapping[float, int]) -> float:
         for value, count in counts.items():
             total += count * np.log(1.0 - STAKES + STAKES * (value / mean))
     return float(np.logaddexp.reduce(total) - np.log(len(STAKES)))
-
-
-def _edge(excluded: Callable[[float], bool]) -> float:
-    """Return the largest number in (0, 1) that is excluded, to within 1e-9, where `NEAR` is."""
-    low, high = NEAR, 1.0 - NEAR
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if excluded(middle) else (low, middle)
-    return low

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from scipy.special import bdtr, betaincinv, ndtri
@@ -127,3 +128,16 @@ class Trials:
     def interval(self) -> tuple[float, float]:
         """95 % Clopper-Pearson interval of the rate."""
         return clopper_pearson(self.successes, self.trials)
+
+
+def edge_of(beyond: Callable[[float], bool]) -> float:
+    """Return where in (0, 1) a condition begins to hold, 0 or 1 where it holds everywhere or nowhere."""
+    low, high = 1e-9, 1.0 - 1e-9
+    if beyond(low):
+        return 0.0
+    if not beyond(high):
+        return 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if beyond(middle) else (middle, high)
+    return high

@@ -228,7 +228,7 @@ class Bank(Predictor):
         return Query(whole, seeds.stream(self.problem.seed, "bank matrix", number), spp=SPP, wanted="light")
 
     def _condition(self, number: int) -> Condition:
-        problem, u, numbers, asked = self.problem, self._place(number), self._numbers(number), self._query(number)
+        problem, u, asked = self.problem, self._place(number), self._query(number)
         made = problem.linearised(asked.u, asked.seed, SPP, next(self._coming).light)
         self._made += 1
         with torch.no_grad():
@@ -238,7 +238,7 @@ class Bank(Predictor):
             if name in self._there and torch.equal(self._there[name], there):
                 made.there[name] = self._there[name]
         self._there = dict(made.there)
-        return Condition(number, numbers, made, alone)
+        return Condition(number, asked.u[u.numel() :], made, alone)
 
     def _compare(self, u: Tensor, index: int) -> None:
         """Look at unseen conditions, and let the bank grow while they are clearly better for the model."""

@@ -100,11 +100,14 @@ class Journal:
             self.lost += sum(judgement.answer.label == LOST for judgement in stored.values())
         return self._trials[kind]
 
+    def _holds(self, query: Query) -> bool:
+        """Whether an evaluation of a search had its row when the run was opened."""
+        return query.number < self._counts.get(query.kind, 0)
+
     def _read(self, query: Query) -> Evaluation | None:
         if query.phase is None:
             return self._trials_of(query.kind).get(query.number)
-        stored = self.run is not None and query.number < self._counts.get(query.kind, 0)
-        told = self.run.store.told(query.kind, query.number) if self.run is not None and stored else None
+        told = self.run.store.told(query.kind, query.number) if self.run is not None and self._holds(query) else None
         if told is None:
             return None
         row, beside = told
@@ -163,7 +166,7 @@ class Journal:
                 gradient=None if answer.gradient is None else answer.gradient.detach().numpy(),
                 picture=None if answer.picture is None else levels_of(answer.picture).numpy(),
             )
-        if query.phase is not None and query.number < self._counts.get(query.kind, 0):  # of a run that was done
+        if query.phase is not None and self._holds(query):  # of a run that was done
             return
         if self.run is None:
             self.rows.append(replace(row, id=len(self.rows) + 1, time=time.time()))

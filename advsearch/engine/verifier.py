@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from advsearch import seeds
 from advsearch.attacks import Evaluation, SearchResult, Verification, choose_spp, run_trials, verify
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.product import batches
-from advsearch.attacks.sample_count import LADDER, most_samples
+from advsearch.attacks.sample_count import LADDER, margins_of, most_samples
 from advsearch.config import AttackConfig, RegionConfig, SweepConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
@@ -54,14 +55,14 @@ class Verifier:
     def __post_init__(self) -> None:
         self.problem: Problem = self.journal.problem
 
-    def answers(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Answer trials, keep their pictures, and count each once."""
+    def answers(self, queries: Sequence[Query], *, in_samples: bool = False) -> Iterator[Evaluation]:
+        """Answer trials, keep their pictures, and count each once; the bar counts them, or their samples a pixel."""
         for query, answer in zip(queries, self.journal.answers(queries), strict=True):
             if answer.picture is not None:
                 self.findings.pictures[query.kind, query.number] = answer.picture
             self._asked.add((query.kind, query.number))
             self.findings.verification_renders = len(self._asked)
-            self.stages.progress.advance(1, **self.journal.traced.told)
+            self.stages.progress.advance(query.spp if in_samples else 1, **self.journal.traced.told)
             yield answer
 
     def choose_spp(self, candidates: dict[str, Tensor]) -> None:
@@ -77,26 +78,9 @@ class Verifier:
                 "pixel); `verify_spp=NUMBER` leaves it out",
                 at_most=True,
             )
-        margins = {name: self._probe(name, u) for name, u in candidates.items()}
+        answers = partial(self.answers, in_samples=True)
+        margins = {name: margins_of(answers, f"sample count {name}", u) for name, u in candidates.items()}
         self.findings.sample_count = choose_spp(margins, seed=self.problem.seed, ladder=ladder)
-
-    def _probe(self, name: str, u: Tensor) -> Callable[[int, Sequence[int]], list[float]]:
-        """Margins of one configuration by sample count and seeds; all rungs number their rows together."""
-        count = 0
-
-        def margins(spp: int, seeds: Sequence[int]) -> list[float]:
-            nonlocal count
-            kind, first, count = f"sample count {name}", count, count + len(seeds)
-            queries = [Query(u, seed, kind, first + k, spp=spp, drawn=False) for k, seed in enumerate(seeds)]
-            found = []
-            for query, answer in zip(queries, self.journal.answers(queries), strict=True):
-                found.append(answer.said.score)
-                self._asked.add((kind, query.number))
-                self.stages.progress.advance(spp)
-            self.findings.verification_renders = len(self._asked)
-            return found
-
-        return margins
 
     def try_clean(self) -> None:
         """The control group: the clean configuration under the seeds that every other group gets.

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from torch import Tensor
 
 from advsearch.attacks import Evaluation, Query, Trials, choose_spp, run_trials
-from advsearch.attacks.sample_count import most_samples
+from advsearch.attacks.sample_count import margins_of, most_samples
 from advsearch.engine.journal import Journal
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import rate_of
@@ -70,28 +71,18 @@ def check_worst(
         at_most=True,
     )
     problem: Any = OneModel(view, model)
-    journal, number = Journal(run, Shared(problem)), 0
+    journal = Journal(run, Shared(problem))
 
-    def margins(spp: int, seeds: Sequence[int]) -> list[float]:
-        nonlocal number
-        first, number = number, number + len(seeds)
-        asked = enumerate(seeds, first)
-        queries = [Query(u, seed, PROBES, place, spp=spp, drawn=False, sought=False) for place, seed in asked]
-        found = []
-        for answer in journal.answers(queries):
-            found.append(answer.said.score)
-            stages.progress.advance(spp)
-        return found
+    def answers(queries: Sequence[Query], *, in_samples: bool = False) -> Iterator[Evaluation]:
+        asked = [replace(one, drawn=False, sought=False) for one in queries]
+        for query, answer in zip(asked, journal.answers(asked), strict=True):
+            stages.progress.advance(query.spp if in_samples else 1)
+            yield answer
 
+    margins = margins_of(partial(answers, in_samples=True), PROBES, u, sought=False)
     count = choose_spp({"worst": margins}, seed=seed, ladder=ladder)
     hint = f"{config.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
     stages.begin("verification", "checking the worst configuration with fresh renders", config.trials, hint=hint)
-
-    def answers(queries: Sequence[Query]) -> Iterator[Evaluation]:
-        for answer in journal.answers([replace(one, drawn=False, sought=False) for one in queries]):
-            stages.progress.advance(1)
-            yield answer
-
     tried = run_trials(answers, u, spp=count.spp, seed=seed, trials=config.trials)
     settled = count.converged or len(ladder) == 1
     renders = count.renders + len(tried)

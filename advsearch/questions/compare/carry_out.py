@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from advsearch.api.keywords import Named, Names, PictureKeywords, asks, configured
+from advsearch.api.keywords import Named, Names, SampledKeywords, asks, configured
 from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
@@ -38,7 +38,7 @@ SWEEP = "sweep"
 """The part that holds the sweep of models."""
 
 
-class CompareKeywords(PictureKeywords, total=False):
+class CompareKeywords(SampledKeywords, total=False):
     """Of `compare`."""
 
     object: Names
@@ -46,16 +46,8 @@ class CompareKeywords(PictureKeywords, total=False):
     grid: dict[str, object]
     controls: Controls
     samples: int | None
-    sampler: Literal["sobol", "random"]
-    batch: int
-    keep_pictures: Literal["all", "wrong", "none"]
-    specialise: bool
-    spp: int | None
-    workers: int | None
-    cluster: str | None
     pictures: int
     run: str | Path | None
-    overwrite: bool
 
 
 @asks(CompareConfig, CompareKeywords)
