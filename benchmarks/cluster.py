@@ -43,12 +43,13 @@ from simulated_cluster import Simulated, coordinator  # noqa: E402
 from sweep import ConstantRenderer, resident  # noqa: E402
 
 from advsearch.api.sweep import job_of  # noqa: E402
+from advsearch.attacks import Evaluation  # noqa: E402
 from advsearch.cluster.coordinator import DEPTH  # noqa: E402
 from advsearch.cluster.pool import Event  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
-from advsearch.described import Value  # noqa: E402
+from advsearch.engine.sharing import Sent  # noqa: E402
 from advsearch.engine.sweeps import swept_scene  # noqa: E402
-from advsearch.engine.sweeps.batch import KIND, Batch  # noqa: E402
+from advsearch.engine.sweeps.job import KIND  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
@@ -171,16 +172,14 @@ def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float,
     grid = {"pose.yaw": f"0:360:{side}", "camera.elevation": "5:60:10"}
     config = SweepConfig(object="mug", grid=grid, trials=0, resolution=64)
     answer = Judgement(-3.2, -3.2, right=True, answer=Answer("mug", 3, 0.93))
-    values: dict[str, Value] = {
-        "pose.yaw": {"value": 12.5, "unit": "degrees"},
-        "camera.elevation": {"value": 5.0, "unit": "degrees"},
-    }
 
-    def seen(numbers: range) -> Batch:
-        told: list[dict[str, Value]] = [dict(values) for _ in numbers]
-        return Batch([[answer] * len(numbers)], [told], [[(False, 1)] * len(numbers)], 0.03, [None], False, 1)
+    def seen(sent: Sequence[Sent]) -> list[Evaluation]:
+        return [Evaluation.of(answer, seconds=0.03) for _ in sent]
 
-    pool = Timed(call=seen, seconds=lambda number: drawn[number % len(drawn)], load=0.0, lag=LAG, again=None)
+    def seconds_of(sent: Any) -> float:
+        return drawn[(sent if isinstance(sent, int) else sent[2].number) % len(drawn)]
+
+    pool = Timed(call=seen, seconds=seconds_of, load=0.0, lag=LAG, again=None)
     pool.add(workers)
     with tempfile.TemporaryDirectory() as folder, RunDirectory.create(Path(folder) / "run") as run:
         sweep = Sweep(job_of(config), run, watch or NullProgress(), coordinator(pool))

@@ -18,6 +18,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from unittest import mock
 
 from advsearch import threads
@@ -27,7 +28,7 @@ threads.configure()
 from advsearch.api.sweep import job_of  # noqa: E402
 from advsearch.attacks.draws import Seeds  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
-from advsearch.engine.sweeps.batch import KIND  # noqa: E402
+from advsearch.engine.sweeps.job import KIND  # noqa: E402
 from advsearch.engine.sweeps.swept_scene import SweptScene  # noqa: E402
 from advsearch.tasks import Judgement  # noqa: E402
 
@@ -121,7 +122,6 @@ class Looks:
 
     def __init__(self, view: SweptScene, rows: Sequence[int], root: int = 0) -> None:
         seeds = Seeds(root, KIND)
-        points = next(iter(view.points.values()))
         self.judgements: list[Judgement] = []
         model, begun = 0.0, time.perf_counter()
 
@@ -135,8 +135,9 @@ class Looks:
         with mock.patch.object(view, "_judged", judged):
             for first in range(0, len(rows), BATCH):
                 part = rows[first : first + BATCH]
-                seen = view.look(points.picks(part[0], len(part)), [seeds(one) for one in part])
-                self.judgements += seen.judgements[0]
+                asked = view.job.queries(range(part[0], part[0] + len(part)))
+                queries = [replace(query, seed=seeds(query.number)) for _, _, query in asked]
+                self.judgements += [one.said for one in view.answers(queries)]
         spent = time.perf_counter() - begun
         self.seconds, self.without = spent / len(rows), (spent - model) / len(rows)
 

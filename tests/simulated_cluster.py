@@ -34,12 +34,12 @@ class Simulated:
         now: the time.
         link: of no page.
         where: how it is called.
-        given: ranges that were given to a worker, in order.
+        given: batches that were given to a worker, in order.
         most: calls that were under way at once.
     """
 
-    call: Callable[[range], Any] = list
-    seconds: Callable[[int], float] = lambda number: 0.5
+    call: Callable[[Any], Any] = list
+    seconds: Callable[[Any], float] = lambda number: 0.5
     load: float = 5.0
     lag: float = 0.0
     again: float | None = 1.0
@@ -50,7 +50,7 @@ class Simulated:
     now: float = 0.0
     link: str = ""
     where: str = "simulated"
-    given: list[range] = field(default_factory=list)
+    given: list[Any] = field(default_factory=list)
     most: int = 0
     _events: list[tuple[float, int, Any]] = field(default_factory=list)
     _free_at: dict[str, float] = field(default_factory=dict)
@@ -108,18 +108,17 @@ class Simulated:
             self._free_at[worker] = begin + self.load
             self._later(begin + self.load - self.now, self._answer(ticket, told))
             return
-        _, first, last, *given = args
-        numbers = range(first, last)
-        self.given.append(numbers)
-        seconds = sum(map(self.seconds, numbers))
+        _, items = args
+        self.given.append(items)
+        seconds = sum(map(self.seconds, items))
         self._free_at[worker] = begin + seconds
-        if any(number in self.kill for number in numbers):
+        if any(number in self.kill for number in items):
             self._later(begin - self.now, lambda: self.end(worker))
-        elif any(number in self.hang for number in numbers):
+        elif any(number in self.hang for number in items):
             self._free_at[worker] = float("inf")
         elif begin + seconds < float("inf"):
-            until, asked = begin + seconds + self.lag - self.now, given[0] if given else numbers
-            self._later(until, self._answer(ticket, lambda: Carried(self.call(asked), seconds)))
+            until = begin + seconds + self.lag - self.now
+            self._later(until, self._answer(ticket, lambda: Carried(self.call(items), seconds)))
 
     def _answer(self, ticket: int, value: Any) -> Any:
         def answer() -> Event | None:

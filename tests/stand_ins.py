@@ -183,14 +183,13 @@ class StandInWorkers:
     given: list[int] = field(default_factory=list)
     facts: Workforce | None = field(default_factory=lambda: Workforce(workers=2, most=2, busy=1.0, alive=2.0))
 
-    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
         """The latest comes first."""
-        assert given is not None
-        first = len(self.given)
-        for place, done in enumerate(self.made.results(reversed(list(ranges)), given)):
-            self.given.append(done.numbers.start)
+        first, listed = len(self.given), list(batches)
+        for place, done in enumerate(self.made.results(reversed(listed))):
+            self.given.append(len(listed) - 1 - place)
             away = "it died" if first + place in self.lost else ""
-            yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
+            yield Done(done.items, None if away else done.value, "tcp://1", "ab12" if place else None, away)
 
 
 def shared(

@@ -21,7 +21,7 @@ from advsearch.cli.flags import with_flags
 from advsearch.cli.plan import answer as plan_text
 from advsearch.config import AttackConfig, PlanConfig, PrecisionConfig, RegionConfig, SweepConfig
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.sweeps.swept_scene import SweptScene
+from advsearch.engine.sweeps.worst import OneModel
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config
 
@@ -244,7 +244,7 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
     config = SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=14, run=str(tmp_path / "whole"))
     whole = sweep_from_config(config)
     rendered, stop = 0, 5
-    once = SweptScene.trial
+    once = OneModel.evaluate
 
     def trial(self: Any, *given: Any) -> Any:
         nonlocal rendered
@@ -253,7 +253,7 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
             raise KeyboardInterrupt
         return once(self, *given)
 
-    monkeypatch.setattr(SweptScene, "trial", trial)
+    monkeypatch.setattr(OneModel, "evaluate", trial)
     cut = sweep_from_config(config.model_copy(update={"run": str(tmp_path / "run")}))
     assert cut.summary.ending == "interrupted"
     stop, rendered = 0, 0

@@ -23,8 +23,8 @@ from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
 from advsearch.config import ExplainConfig, SweepConfig
 from advsearch.config.explain import FEWEST_ROWS
-from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import check_all
+from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.explanations.clusters import find_clusters
 from advsearch.explanations.envelope import Envelope, find_envelope
@@ -391,10 +391,10 @@ def pictures_again(config: SweepConfig, numbers: Sequence[int], progress: Progre
     job = job_of(config)
     if job.tasks[0].varies:
         raise InputError(f"task {config.task_name}: features are read of classifiers")
-    count, pictures = check_all(job)[0].count, []
-    batches = Batches(job, count)
+    check_all(job)
+    scenes, pictures = Scenes(job), []
     for number in numbers:
-        pictures.append(batches.pictures(range(number, number + 1))[0])
+        pictures.append(scenes.picture(number))
         progress.advance(1)
     return torch.stack(pictures), features_of(job.models[0])
 

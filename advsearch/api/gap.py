@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -403,7 +404,7 @@ def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[
 def models_answering(settings: JsonObject) -> Call:
     """Return what answers queries of the models of a configuration: what a worker does."""
     config = AttackConfig(**settings)
-    return answering(lambda name: problem_from_config(_alone(config, name))[0])
+    return answering(cache(lambda name: problem_from_config(_alone(config, name))[0]))
 
 
 def _alone(config: AttackConfig, name: str) -> AttackConfig:

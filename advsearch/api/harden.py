@@ -244,12 +244,14 @@ class Hardening:
         Raises:
             ClusterError: workers died of one.
         """
-        for done in self._executor.results((range(place, place + 1) for place in range(len(wanted))), wanted):
+        places = {id(one): place for place, one in enumerate(wanted)}
+        for done in self._executor.results([one] for one in wanted):
+            (one,) = done.items
             if done.lost:
-                raise ClusterError(f"harden, scene {wanted[done.numbers.start].number}: {done.lost}")
+                raise ClusterError(f"harden, scene {one.number}: {done.lost}")
             facts = self._executor.facts
             self.progress.advance(1, **({} if facts is None else facts.told))
-            yield done.numbers.start, done.value[0]
+            yield places[id(one)], done.value[0]
 
     # ---- lessons ----------------------------------------------------------------------------------------------------
 

@@ -118,10 +118,10 @@ def attacks_of(settings: JsonObject) -> Call:
     assert isinstance(config, AttackConfig)
     chains = chains_of(config)
 
-    def call(numbers: range) -> list[tuple[str, str, dict[str, bytes]]]:
+    def call(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
         found, clean = [], CleanMatrix()
         with tempfile.TemporaryDirectory(prefix="advsearch-part-") as folder:
-            for part in chains[numbers.start]:
+            for part in chains[numbers[0]]:
                 path = Path(folder) / part.name
                 own = part.config.model_copy(update={"run": str(path), "overwrite": True})
                 ending = attack_once(own, clean=clean).summary.ending
@@ -156,9 +156,9 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
         if executor is None:
             return
         progress.stage("attacks on workers", len(left))
-        for done in executor.results(range(number, number + 1) for number in left):
+        for done in executor.results([number] for number in left):
             if done.lost:
-                title = chains[done.numbers.start][0].title
+                title = chains[done.items[0]][0].title
                 raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
             for name, place, files in done.value:
                 _place(run / PARTS, name, place, files)

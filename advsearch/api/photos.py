@@ -24,8 +24,8 @@ from advsearch.engine.answers import facts_of
 from advsearch.engine.metrics import judgements
 from advsearch.engine.naming import load_models, scene_of
 from advsearch.engine.rows import judged
-from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import check_all
+from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.engine.turn import in_turn
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
@@ -230,18 +230,15 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
 def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
     """Who judges by the configurations of a sweep."""
     job = job_of(config)
-    count = check_all(job)[0].count
-    batches = Batches(job, count)
+    check_all(job)
+    scenes = Scenes(job)
 
     def truth(model: int, rendering: str, name: str) -> Truth:
-        scene, local = divmod(int(rendering), count)
-        if scene >= len(job.places):
+        number = int(rendering)
+        if number >= job.per_scene * len(job.places):
             raise InputError(f"rendering: the sweep has no picture {rendering}; it belongs to another run")
-        view = batches.open(scene)
-        points = view.points[job.sizes[model]]
-        picks = points.picks(local, 1, scene * count)
-        u = points.configurations(picks)
-        return view.truth(model, u[0], points.values(u, picks)[0])
+        scene, _, query = job.queries(range(number, number + 1))[model]
+        return scenes.named(scene).truth(model, query.u, query.values)
 
     return [
         _PhotoJudge(config.objects[0], model, task, size, len(job.models), partial(truth, number))

@@ -174,7 +174,7 @@ def _executor(config: PrecisionConfig, progress: Progress) -> Iterator[Executor 
     with executor_for(config, "advsearch.api.precision:references_of", progress, ahead=False) as executor:
         if executor is not None:
             progress.stage("workers load the scene and the model")
-            for _ in executor.results([range(1)], [None]):
+            for _ in executor.results([[None]]):
                 pass
         yield executor
 

@@ -33,11 +33,12 @@ from advsearch.engine.naming import (
     scene_of,
     several,
 )
+from advsearch.engine.sharing import answering
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
-from advsearch.engine.sweeps.batch import Batches
-from advsearch.engine.sweeps.job import Job, NamedScene, check_all, check_scenes
+from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
+from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -59,7 +60,7 @@ if TYPE_CHECKING:
 OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
-BATCHES = "advsearch.api.sweep:batches_of"
+ANSWERING = "advsearch.api.sweep:answering_of"
 """What a worker does."""
 
 CLEAN = "clean"
@@ -166,7 +167,7 @@ def sweep(
         job = replace(job, metrics=load_metrics(config.metrics, metrics))
         if config.run is not None:
             return _kept(config, job, progress, folder)
-        with executor_for(config, BATCHES, progress) as executor:
+        with executor_for(config, ANSWERING, progress) as executor:
             return carry_out(job, None, progress, executor)
 
 
@@ -351,7 +352,7 @@ def _stopped(config: SweepConfig) -> Path | None:
 
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
-    with RunDirectory.of(config, resumed) as run, executor_for(config, BATCHES, progress) as executor:
+    with RunDirectory.of(config, resumed) as run, executor_for(config, ANSWERING, progress) as executor:
         functions = {f"metric {name}": one for name, one in job.metrics.items()}
         check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
         return carry_out(job, run, progress, executor)
@@ -360,8 +361,6 @@ def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | Non
 # ---- who does it ----------------------------------------------------------------------------------------------------
 
 
-def batches_of(settings: JsonObject) -> Call:
-    """Return what carries out batches of the sweep that the settings describe: what a worker does."""
-    job = job_of(SweepConfig(**settings))
-    points, _ = check_all(job)
-    return Batches(job, points.count)
+def answering_of(settings: JsonObject) -> Call:
+    """Return what answers the queries of the sweep that the settings describe: what a worker does."""
+    return answering(Scenes(job_of(SweepConfig(**settings))).named)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from advsearch.described import Value
 from advsearch.tasks import Judgement
 
 Wanted = bool | Literal["free"]
@@ -44,11 +45,11 @@ class Query:
             many times its renders: samples * (1 + gradient_cost) with a gradient, samples without.
         spp: of a trial: samples a pixel.
         drawn: of a trial: whether conditions are drawn; otherwise the scene has those it comes with.
-        described: of a trial: whether its row says u, which trials of one kind may have in common.
+        values: of a trial: what its row says of the configuration, which trials of one kind may have in common.
         sought: of a trial: whether a search seeks some answer there, so that there is a success.
         wanted: what the answer is: a judgement; a picture alone; or "light", from which pictures can be predicted
             (`advsearch.scene.transport`), at u of the whole space.
-        keep: whether the answer has the picture, too.
+        keep: whether the answer has the picture, too; of a row of a sweep, the bytes of a small one.
     """
 
     u: Tensor
@@ -60,7 +61,7 @@ class Query:
     samples: int = 1
     spp: int = 1
     drawn: bool = True
-    described: bool = False
+    values: Mapping[str, Value] = field(default_factory=dict)
     sought: bool = True
     wanted: Literal["judgement", "picture", "light"] = "judgement"
     keep: bool = False
@@ -76,10 +77,15 @@ class Evaluation:
         success: the model's answer is what is sought, by the task. Never derived from the objective.
         non_finite: gradient elements that were NaN or infinite and were set to zero where they arose.
         cost: pictures that were rendered for it, at least 1: one, and those that differences took, each times
-            `samples`. An adjoint is not a picture and counts 0; `SearchResult.gradients` counts it.
+            `samples`. An adjoint is not a picture and counts 0; `SearchResult.gradients` counts it. 0 of a row of a
+            sweep whose picture was predicted, or rendered for another model.
         judgement: what the task says of it, for the log; None where there is no task. No policy looks at it.
         picture: (H, W, 3) 8-bit values in [0, 1], where it was asked for.
-        light: what was asked for as "light".
+        light: what was asked for as "light"; of the last row of a batch of a sweep, what was predicted so far.
+        predicted: whether the picture was put together from others, not rendered.
+        small: JPEG file of the picture of a row of a sweep, where it is kept.
+        layers: ground truth of it by name, and notes, where they are kept.
+        seconds: that it took; None where whoever asks has to look at the clock.
         machine: on which it was made, by its name among the workers' machines; None where that is like this one.
         lost: whether nobody could answer, since every worker that tried died.
     """
@@ -92,6 +98,10 @@ class Evaluation:
     judgement: Judgement | None = None
     picture: Tensor | None = None
     light: Any = None
+    predicted: bool = False
+    small: bytes | None = None
+    layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None
+    seconds: float | None = None
     machine: str | None = None
     lost: bool = False
 

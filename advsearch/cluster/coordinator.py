@@ -1,8 +1,8 @@
-"""Gives ranges to workers and takes what comes of them, whatever happens to the workers.
+"""Gives batches to workers and takes what comes of them, whatever happens to the workers.
 
-Every range is pinned to one worker, which has `DEPTH` of them at most. A range whose worker died is given to another,
+Every batch is pinned to one worker, which has `DEPTH` of them at most. A batch whose worker died is given to another,
 from then on as the only one that a worker has, so that it is known what it died of: after `DEATHS` such deaths the
-range is cut in halves, and a single number that has as many is given up in words. A worker that takes far longer than
+batch is cut in halves, and a single item that has as many is given up in words. A worker that takes far longer than
 the median counts as dead. Answers that come later than that change nothing: their tickets are not known any more.
 """
 
@@ -19,26 +19,26 @@ from advsearch.cluster.executor import Done, Work, Workforce
 from advsearch.cluster.inputs import Files
 from advsearch.cluster.machine import MachineInfo, machine_name
 from advsearch.cluster.pool import Disconnected, Dropped, Ended, Event, Joined, Left, Pool
-from advsearch.cluster.worker import Carried, Failure, Ready, carry_out_range, prepare
+from advsearch.cluster.worker import Carried, Failure, Ready, carry_out_batch, prepare
 from advsearch.errors import ClusterError
 
 DEPTH = 2
-"""Ranges that a worker has at once: the one it is at, and the next (`Work.ahead`), so that it never waits."""
+"""Batches that a worker has at once: the one it is at, and the next (`Work.ahead`), so that it never waits."""
 
 DEATHS = 3
-"""Workers that may die of a range before it is cut in halves or given up."""
+"""Workers that may die of a batch before it is cut in halves or given up."""
 
 LOADS = 5
 """Times that as many workers as there are may die while they get ready, and none gets ready, before all is given up."""
 
 SLOW, LEAST_DEADLINE, FIRST_DEADLINE = 10.0, 60.0, 900.0
-"""Times the median that a range may take, least seconds of that, and seconds before there is a median."""
+"""Times the median that a batch may take, least seconds of that, and seconds before there is a median."""
 
 MEDIAN_OF = 101
-"""Ranges, the last ones, of which the median is taken."""
+"""Batches, the last ones, of which the median is taken."""
 
 ENOUGH = 5
-"""Ranges that a median takes."""
+"""Batches that a median takes."""
 
 PATIENCE, LESS_PATIENCE = 300.0, 15.0
 """Seconds without any worker after which there is no hope; where those that are there are refused, fewer."""
@@ -48,8 +48,8 @@ POLL = 0.5
 
 
 @dataclass(eq=False)
-class _Range:
-    numbers: range
+class _Batch:
+    items: Sequence[Any]
     alone: bool = False
     deaths: int = 0
     wanted: bool = True
@@ -70,7 +70,7 @@ class Coordinator:
 
     Args:
         pool: the workers.
-        work: what ranges are of.
+        work: what batches are of.
         key: of the work, by its content.
         files: that it needs.
         version: of advsearch.
@@ -98,18 +98,17 @@ class Coordinator:
         self._machines: dict[str, MachineInfo] = {}
         self._workers: dict[str, _Worker] = {}
         self._refused: dict[str, str] = {}
-        self._tickets: dict[int, tuple[_Worker, _Range | None]] = {}
+        self._tickets: dict[int, tuple[_Worker, _Batch | None]] = {}
         self._next_ticket = self._under_way = 0
-        self._todo: deque[_Range] = deque()
-        self._given: Sequence[Any] | None = None
+        self._todo: deque[_Batch] = deque()
         self._call = 0
         self._events: deque[Event] = deque()
         self._free: deque[_Worker] = deque()
-        self._per_number: deque[float] = deque(maxlen=MEDIAN_OF)
+        self._per_item: deque[float] = deque(maxlen=MEDIAN_OF)
         self._load_deaths = self._seen = 0
         self._counted_at = self._alone_since = self._looked_at = clock()
 
-    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
         """See `Executor.results`.
 
         Raises:
@@ -117,8 +116,8 @@ class Coordinator:
         """
         self._let_go()  # what an earlier call has left under way
         self._call += 1
-        call, source, self._given = self._call, iter(ranges), given
-        self._per_number.clear()  # those before may have taken other times
+        call, source = self._call, iter(batches)
+        self._per_item.clear()  # those before may have taken other times
         if not self._workers:
             self._alone_since = self._clock()
         try:
@@ -127,10 +126,10 @@ class Coordinator:
                     raise RuntimeError("these results were given up when others were asked for")
                 self._give_out(source)
                 if not self._todo and not self._under_way:
-                    numbers = next(source, None)  # there may be more, and nobody yet who is ready for it
-                    if numbers is None:
+                    items = next(source, None)  # there may be more, and nobody yet who is ready for it
+                    if items is None:
                         return
-                    self._todo.append(_Range(numbers))
+                    self._todo.append(_Batch(items))
                 if not self._events:
                     self._events.extend(self._pool.events(POLL))
                 while self._events:
@@ -150,17 +149,17 @@ class Coordinator:
 
     # ---- giving out -------------------------------------------------------------------------------------------------
 
-    def _give_out(self, source: Iterator[range]) -> None:
+    def _give_out(self, source: Iterator[Sequence[Any]]) -> None:
         while self._free:
             worker = self._free[0]
             if not self._is_there(worker):
                 self._free.popleft()
                 continue
             if not self._todo:
-                numbers = next(source, None)
-                if numbers is None:
+                items = next(source, None)
+                if items is None:
                     return
-                self._todo.append(_Range(numbers))
+                self._todo.append(_Batch(items))
             one = self._todo.popleft()
             if one.alone:
                 idle = next((free for free in self._free if not free.tickets and self._is_there(free)), None)
@@ -176,8 +175,8 @@ class Coordinator:
     def _is_there(self, worker: _Worker) -> bool:
         return self._workers.get(worker.address) is worker
 
-    def _submit(self, worker: _Worker, one: _Range | None, *, send: bool = False) -> None:
-        """Give a worker a range, or have it get ready; `send` it the files then, which it may have already."""
+    def _submit(self, worker: _Worker, one: _Batch | None, *, send: bool = False) -> None:
+        """Give a worker a batch, or have it get ready; `send` it the files then, which it may have already."""
         ticket, self._next_ticket = self._next_ticket, self._next_ticket + 1
         if not worker.tickets:
             worker.since = self._clock()
@@ -188,9 +187,7 @@ class Coordinator:
             files = self._files if send else self._files.named_only
             self._pool.submit(ticket, worker.address, prepare, self._key, self._work, files, self._version)
         else:
-            first, last = one.numbers.start, one.numbers.stop
-            given = () if self._given is None else (self._given[first:last],)
-            self._pool.submit(ticket, worker.address, carry_out_range, self._key, first, last, *given)
+            self._pool.submit(ticket, worker.address, carry_out_batch, self._key, one.items)
 
     # ---- what happens -----------------------------------------------------------------------------------------------
 
@@ -231,10 +228,10 @@ class Coordinator:
         elif isinstance(value, Carried) and one is not None:
             self.facts.batches += 1
             self.facts.busy += value.seconds
-            self._per_number.append(value.seconds / max(1, len(one.numbers)))
+            self._per_item.append(value.seconds / max(1, len(one.items)))
             self._set_free(worker, self._depth if one.alone else 1)
             if one.wanted:
-                yield Done(one.numbers, value.value, worker.address, worker.machine)
+                yield Done(one.items, value.value, worker.address, worker.machine)
         elif isinstance(value, Failure):
             if one is not None and one.wanted and (value.unfit or value.forgotten):
                 self._todo.appendleft(one)
@@ -271,7 +268,7 @@ class Coordinator:
         self._set_free(worker, self._depth)
 
     def _set_free(self, worker: _Worker, places: int) -> None:
-        """Note places for ranges: the first one of a worker that has nothing to do in front of all others."""
+        """Note places for batches: the first one of a worker that has nothing to do in front of all others."""
         idle = not worker.tickets
         self._free.extendleft([worker] * idle)
         self._free.extend([worker] * (places - idle))
@@ -309,13 +306,13 @@ class Coordinator:
         if suspect.deaths < DEATHS:
             return
         self._todo.remove(suspect)
-        numbers = suspect.numbers
-        if len(numbers) > 1:
-            half = numbers.start + len(numbers) // 2
-            self._todo.appendleft(_Range(range(half, numbers.stop), alone=True))
-            self._todo.appendleft(_Range(range(numbers.start, half), alone=True))
+        items = suspect.items
+        if len(items) > 1:
+            half = len(items) // 2
+            self._todo.appendleft(_Batch(items[half:], alone=True))
+            self._todo.appendleft(_Batch(items[:half], alone=True))
         else:
-            yield Done(numbers, None, address, lost=f"no answer: {suspect.deaths} workers died of it")
+            yield Done(items, None, address, lost=f"no answer: {suspect.deaths} workers died of it")
 
     def _forget(self, worker: _Worker) -> None:
         self._count_time()
@@ -348,14 +345,14 @@ class Coordinator:
         if now - self._looked_at < POLL:
             return
         self._looked_at = now
-        median = statistics.median(self._per_number) if len(self._per_number) >= ENOUGH else None
+        median = statistics.median(self._per_item) if len(self._per_item) >= ENOUGH else None
         for worker in list(self._workers.values()):
             if not worker.tickets:
                 continue
             one = self._tickets[worker.tickets[0]][1]
             deadline = FIRST_DEADLINE
             if one is not None and median is not None:
-                deadline = max(LEAST_DEADLINE, SLOW * median * len(one.numbers))
+                deadline = max(LEAST_DEADLINE, SLOW * median * len(one.items))
             if one is not None and self._work.seconds is not None:
                 deadline = max(deadline, self._work.seconds)
             if now - worker.since > deadline:

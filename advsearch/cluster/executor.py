@@ -1,4 +1,4 @@
-"""What carries out index ranges: in this process (`InProcess`), or on workers (`coordinator.Coordinator`)."""
+"""What carries out batches of work: in this process (`InProcess`), or on workers (`coordinator.Coordinator`)."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from typing import Any, Protocol
 
 from advsearch.files import JsonObject
 
-Call = Callable[[Any], Any]
-"""What carries out one range, or what its numbers stand for where that is given along; a pure function of it."""
+Call = Callable[[Sequence[Any]], Any]
+"""What carries out one batch; a pure function of it."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """What ranges are of, so that another process can carry them out.
+    """What batches are of, so that another process can carry them out.
 
     Attributes:
         function: ``"package.module:function"``; it takes the settings and returns a `Call`.
         settings: JSON values that decide everything.
         files: names of those settings that may hold paths, separated by commas. Files go along with the work.
         threads: processor threads of a worker.
-        seconds: that a range may take at least, where that is known beforehand; None goes by the median.
-        ahead: whether a worker has its next range before it is done with one; not where ranges take long.
+        seconds: that a batch may take at least, where that is known beforehand; None goes by the median.
+        ahead: whether a worker has its next batch before it is done with one; not where batches take long.
     """
 
     function: str
@@ -35,17 +35,17 @@ class Work:
 
 @dataclass(frozen=True, eq=False)
 class Done:
-    """What came of one range.
+    """What came of one batch.
 
     Attributes:
-        numbers: the range.
+        items: the batch, or a part of one that workers died of.
         value: what the call returned; None where nothing came back.
         worker: who carried it out; empty in this process.
         machine: what that is, by its name among `Workforce.machines`; None where it is like this machine.
-        lost: why nothing came back, in words; only of ranges of one number.
+        lost: why nothing came back, in words; only of batches of one item.
     """
 
-    numbers: range
+    items: Sequence[Any]
     value: Any
     worker: str = ""
     machine: str | None = None
@@ -61,9 +61,9 @@ class Workforce:
         most: that were ready at once.
         lost: that went away before they were told to.
         refused: that cannot do the work, and why, in words.
-        retried: ranges that were given out again.
-        batches: ranges that came back.
-        busy: seconds that workers spent on ranges.
+        retried: batches that were given out again.
+        batches: that came back.
+        busy: seconds that workers spent on batches.
         loading: seconds that they spent on getting ready.
         alive: seconds that they were there and ready.
         machines: name to description of those that are not like this one.
@@ -90,29 +90,25 @@ class Workforce:
 
 
 class Executor(Protocol):
-    """Carries out ranges."""
+    """Carries out batches."""
 
     @property
     def facts(self) -> Workforce | None:
         """How the workers do; None where there are none."""
 
-    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
-        """Carry out ranges, and yield what comes of them, in any order, each once.
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+        """Carry out batches, and yield what comes of them, in any order, each once.
 
-        Only a few are taken from `ranges` before their results are asked for. Where nobody goes on asking, what is
-        under way comes to nothing, and other ranges may follow.
-
-        Args:
-            ranges: of numbers.
-            given: what each number stands for, where the work's settings do not say it; it may grow.
+        Only a few are taken from `batches` before their results are asked for. Where nobody goes on asking, what is
+        under way comes to nothing, and other batches may follow.
 
         Raises:
-            AdvsearchError: what a range raises, or there is nobody who can carry it out.
+            AdvsearchError: what a batch raises, or there is nobody who can carry it out.
         """
 
 
 class InProcess:
-    """Carries out one range after the other in this process.
+    """Carries out one batch after the other in this process.
 
     Args:
         call: carries out one.
@@ -123,7 +119,7 @@ class InProcess:
     def __init__(self, call: Call) -> None:
         self._call = call
 
-    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
         """See `Executor.results`; they come in order."""
-        for numbers in ranges:
-            yield Done(numbers, self._call(numbers if given is None else given[numbers.start : numbers.stop]))
+        for items in batches:
+            yield Done(items, self._call(items))

@@ -1,4 +1,4 @@
-"""What runs on a worker. It gets ready for a work once, then carries out ranges of it; it never sees the store.
+"""What runs on a worker. It gets ready for a work once, then carries out batches of it; it never sees the store.
 
 Errors go back as values: an exception of ours may not survive being pickled, and says more than its class.
 """
@@ -50,7 +50,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class Carried:
-    """A range was carried out.
+    """A batch was carried out.
 
     Attributes:
         value: what came of it.
@@ -109,15 +109,14 @@ def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
     return Ready(machine, time.perf_counter() - begun)
 
 
-def carry_out_range(key: str, first: int, last: int, given: Sequence[Any] | None = None) -> Carried | Failure:
-    """Carry out the range from `first` to before `last` of a work that this worker is ready for, or what is given for
-    its numbers."""
+def carry_out_batch(key: str, items: Sequence[Any]) -> Carried | Failure:
+    """Carry out a batch of a work that this worker is ready for."""
     begun = time.perf_counter()
     try:
         with _one_at_a_time:
             if key not in _known:
                 return Failure("it is not ready", forgotten=True)
-            value = _load(key, _known[key])(range(first, last) if given is None else given)
+            value = _load(key, _known[key])(items)
     except Exception as error:
         return _failure(error, unfit=isinstance(error, (OSError, StorageError)))
     return Carried(value, time.perf_counter() - begun)

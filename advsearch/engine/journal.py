@@ -29,6 +29,7 @@ from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
+from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 
 PLAN = "gradient plan"
 """The note under which the store keeps how derivatives are obtained."""
@@ -86,7 +87,8 @@ class Journal:
             begun = time.perf_counter()
             if known is None:
                 known = next(asked)
-                self._write(query, known, time.perf_counter() - begun)
+                seconds = None if query.phase is None else time.perf_counter() - begun
+                self.keep([(query, replace(known, seconds=seconds))])
             elif query.phase is not None:
                 passed(query)
             yield known
@@ -129,49 +131,69 @@ class Journal:
             picture=None if beside.picture is None else torch.from_numpy(beside.picture.copy()).float() / 255.0,
         )
 
-    def _write(self, query: Query, answer: Evaluation, seconds: float) -> None:
-        """Keep an answer as a row, and what a search was told beside it."""
-        problem, told = self.problem, None
-        self.lost += answer.lost
-        if answer.machine is not None:
-            self.machines.meet(answer.machine, self.traced.facts)
-        if query.phase is None:
-            self._trials_of(query.kind)[query.number] = replace(answer, picture=None)
-            values = problem.describe(query.u, query.seed) if query.described else {}
-            values |= problem.conditions_of(query.u, query.seed) if query.drawn else {}
-            sought, machine = query.sought, answer.machine
-            row = trial_row(
-                query.kind, query.number, query.seed, query.spp, answer.said, values, sought=sought, machine=machine
-            )
-        else:
-            row = Row(
-                kind=query.kind,
-                step=query.number,
-                seed=query.seed,
-                spp=problem.spp * query.samples,
-                objective=answer.objective if (finite := answer.finite) else math.nan,
-                success=answer.success and finite,
-                values=problem.describe(query.u),
-                seconds=seconds,
-                renders=answer.cost * problem.draws,
-                phase=query.phase,
-                machine=answer.machine,
-            )
-            row = row if answer.judgement is None else judged(row, answer.judgement)
-            told = Told(
-                number=query.number,
-                u=_digest(query.u),
-                non_finite=answer.non_finite,
-                cost=answer.cost,
-                gradient=None if answer.gradient is None else answer.gradient.detach().numpy(),
-                picture=None if answer.picture is None else levels_of(answer.picture).numpy(),
-            )
-        if query.phase is not None and self._holds(query):  # of a run that was done
-            return
+    def keep(self, answered: Sequence[tuple[Query, Evaluation]], *, numbered: bool = False) -> list[Row]:
+        """Write answers in one transaction, a row each; what a search was told goes beside it.
+
+        Args:
+            answered: queries with their answers; of a search one at a time.
+            numbered: whether the place of a row in the store is the query's number, in whatever order they come.
+
+        Returns:
+            The rows.
+        """
+        rows, told = list[Row](), None
+        for query, answer in answered:
+            self.lost += answer.lost
+            if answer.machine is not None:
+                self.machines.meet(answer.machine, self.traced.facts)
+            if query.phase is None:
+                row = self._row_of_trial(query, answer)
+                if not numbered:
+                    self._trials_of(query.kind)[query.number] = replace(answer, picture=None)
+            elif self._holds(query):  # of a run that was done
+                continue
+            else:
+                row, told = self._row_of_search(query, answer)
+            rows.append(replace(row, id=query.number + 1) if numbered else row)
         if self.run is None:
-            self.rows.append(replace(row, id=len(self.rows) + 1, time=time.time()))
-        else:
-            self.run.record(row, told=told)
+            for row in rows:
+                self.rows.append(replace(row, id=row.id or len(self.rows) + 1, time=time.time()))
+        elif rows:
+            self.run.record(*rows, told=told)
+        return rows
+
+    def _row_of_trial(self, query: Query, answer: Evaluation) -> Row:
+        values = dict(query.values)
+        if query.drawn:
+            values |= self.problem.conditions_of(query.u, query.seed)
+        seed, spp = (None, BASIS_SPP) if answer.predicted else (query.seed, query.spp)  # it has no noise of its own
+        said, told = answer.said, {"machine": answer.machine, "renders": answer.cost, "seconds": answer.seconds}
+        return trial_row(query.kind, query.number, seed, spp, said, values, sought=query.sought, **told)
+
+    def _row_of_search(self, query: Query, answer: Evaluation) -> tuple[Row, Told]:
+        problem = self.problem
+        row = Row(
+            kind=query.kind,
+            step=query.number,
+            seed=query.seed,
+            spp=problem.spp * query.samples,
+            objective=answer.objective if (finite := answer.finite) else math.nan,
+            success=answer.success and finite,
+            values=problem.describe(query.u),
+            seconds=answer.seconds,
+            renders=answer.cost * problem.draws,
+            phase=query.phase,
+            machine=answer.machine,
+        )
+        told = Told(
+            number=query.number,
+            u=_digest(query.u),
+            non_finite=answer.non_finite,
+            cost=answer.cost,
+            gradient=None if answer.gradient is None else answer.gradient.detach().numpy(),
+            picture=None if answer.picture is None else levels_of(answer.picture).numpy(),
+        )
+        return row if answer.judgement is None else judged(row, answer.judgement), told
 
     def clock(self, kind: str, seconds: float | None) -> Callable[[int], bool] | None:
         """Return what says whether the time of a search is over, that of its earlier lives included.

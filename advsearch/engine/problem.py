@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -123,7 +123,9 @@ class Problem:
         return Prepared(self.spp, self.search_depth, self.plan)
 
     @prepared.setter
-    def prepared(self, found: Prepared) -> None:
+    def prepared(self, found: Prepared | None) -> None:
+        if found is None:
+            return
         self.spp, self.search_depth = found.spp, found.search_depth
         if self.plan != found.plan:
             self.plan = found.plan
@@ -241,6 +243,10 @@ class Problem:
         return self.space.describe(self.whole(u, draw), self.space.controls[self.searched :])
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
+
+    def answers(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Answer queries, each when it is asked for: see `advsearch.attacks.evaluation.Evaluate`."""
+        return map(self.evaluate, queries)
 
     def evaluate(self, query: Query) -> Evaluation:
         """Answer one query: the only place where a run renders, asks and judges."""

@@ -36,7 +36,7 @@ def lost_remarks(lost: int) -> list[str]:
 def trial_row(
     kind: str,
     number: int,
-    seed: int,
+    seed: int | None,
     spp: int,
     trial: Judgement,
     values: Mapping[str, Value] | None = None,
@@ -49,7 +49,7 @@ def trial_row(
     Args:
         kind: of the rows.
         number: among these.
-        seed: of its render.
+        seed: of its render; None of a picture that was predicted.
         spp: samples a pixel.
         trial: what came out.
         values: that describe it.

@@ -6,7 +6,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from itertools import groupby
+from typing import Any, Protocol, TypeAlias
 
 import torch
 
@@ -17,8 +18,17 @@ from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.rows import no_answer
 from advsearch.errors import ClusterError
 
-Sent: TypeAlias = tuple[str, Prepared, Query]
+Sent: TypeAlias = tuple[str, Prepared | None, Query]
 """The name of the problem, what it has been prepared with, and what is asked."""
+
+
+class Answering(Protocol):
+    """What answers queries: a `Problem`, or a scene of a sweep."""
+
+    prepared: Any
+
+    def answers(self, queries: Sequence[Query]) -> Iterable[Evaluation]:
+        """See `advsearch.attacks.evaluation.Evaluate`."""
 
 
 @dataclass
@@ -55,10 +65,11 @@ class Shared:
         """What workers say, each when it is its turn."""
         sent: list[Sent] = [(self.name, self.problem.prepared, query) for query in queries]
         early, turn = dict[int, Evaluation](), 0
-        results: Any = executor.results((range(number, number + 1) for number in range(len(sent))), sent)
+        numbers = {id(one): number for number, one in enumerate(sent)}
+        results: Any = executor.results([one] for one in sent)
         with closing(results):
             for done in results:
-                number = done.numbers.start
+                number = numbers[id(done.items[0])]
                 answer = lost(queries[number], done.lost) if done.lost else done.value[0]
                 early[number] = replace(answer, machine=done.machine)
                 while turn in early:
@@ -67,17 +78,19 @@ class Shared:
                     turn += 1
 
 
-def answering(problem_of: Callable[[str], Problem]) -> Call:
-    """Return what answers queries of problems, by their names: what a worker does."""
-    held: dict[str, Problem] = {}
+def answering(named: Callable[[str], Answering]) -> Call:
+    """Return what answers queries that were sent: what a worker does.
+
+    Args:
+        named: returns what answers the queries to a name; it keeps what it has loaded.
+    """
 
     def call(sent: Sequence[Sent]) -> list[Evaluation]:
-        found = []
-        for name, prepared, query in sent:
-            if name not in held:
-                held[name] = problem_of(name)
-            held[name].prepared = prepared
-            found.append(held[name].evaluate(query))
+        found = list[Evaluation]()
+        for name, some in groupby(sent, lambda one: one[0]):
+            listed, asked = list(some), named(name)
+            asked.prepared = listed[0][1]  # the same of all that are sent together
+            found += asked.answers([query for _, _, query in listed])
         return found
 
     return call
@@ -93,4 +106,5 @@ def lost(query: Query, why: str) -> Evaluation:
         what = "a picture" if query.wanted == "picture" else "the light of a condition"
         raise ClusterError(f"{what}: {why}; `advsearch resume RUN workers=null` makes it here")
     gradient = torch.zeros_like(query.u) if query.gradient else None
-    return Evaluation(math.nan, gradient, False, cost=query.samples, judgement=no_answer(why), lost=True)
+    cost = 0 if query.phase is None else query.samples
+    return Evaluation(math.nan, gradient, False, cost=cost, judgement=no_answer(why), lost=True)

@@ -128,18 +128,11 @@ class Verifier:
 
     def trials(self, kind: str, configurations: Mapping[int, Tensor], *, sought: bool = True) -> Iterator[Judgement]:
         """Try configurations once each, every one with a seed of its own, by their numbers among those of a kind."""
-        queries = [
-            Query(
-                u,
-                seeds.stream(self.problem.seed, kind, number),
-                kind,
-                number,
-                spp=self.findings.spp,
-                described=self.problem.domain.dim <= MANY,
-                sought=sought,
-            )
-            for number, u in configurations.items()
-        ]
+        problem, queries = self.problem, list[Query]()
+        for number, u in configurations.items():
+            seed = seeds.stream(problem.seed, kind, number)
+            values = problem.describe(u, seed) if problem.domain.dim <= MANY else {}
+            queries.append(Query(u, seed, kind, number, spp=self.findings.spp, values=values, sought=sought))
         for answer in self.answers(queries):
             yield answer.said
 

@@ -293,16 +293,16 @@ def _other() -> Callable[..., float]:
 
 
 def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
-    from advsearch.api.sweep import batches_of
+    from advsearch.api.sweep import answering_of, job_of
     from advsearch.config import SweepConfig
     from advsearch.engine.metrics import metrics_as_settings, only_here
 
     named = metrics_as_settings({"red": red, "own": lambda image, output, truth: 0.0})
     assert named == {"red": f"{__name__}:red", "own": "<lambda>"}
     assert only_here(named) == ["own"]
-    settings = SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, metrics={"red": "math:hypot"}, **PICTURE).plain()
+    config = SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, metrics={"red": "math:hypot"}, **PICTURE)
     with pytest.raises(ValueError, match="only one element tensors"):  # a worker has math.hypot from its name
-        batches_of(settings)(range(1))
+        answering_of(config.plain())(job_of(config).queries(range(1)))
     refused: list[tuple[Any, str]] = [
         ({"f": 3}, "f: expected a function"),
         ({"f": lambda image, output: 0.0}, r"f: expected a function of \(image, output, truth\): too many"),

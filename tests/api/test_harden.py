@@ -151,8 +151,7 @@ def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]
     shared = config.model_copy(update={"workers": 1})
     with executor_for(shared, "advsearch.api.harden_scenes:scenes_of", NullProgress()) as pool:
         assert pool is not None
-        ranges = [range(place, place + 1) for place in range(len(wanted))]
-        there = {done.numbers.start: done.value[0] for done in pool.results(ranges, wanted)}
+        there = {wanted.index(done.items[0]): done.value[0] for done in pool.results([one] for one in wanted)}
     for place, lessons in enumerate(here):
         assert isinstance(lessons, list) and len(lessons) == len(there[place])
         for one, other in zip(lessons, there[place], strict=True):

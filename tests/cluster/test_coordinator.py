@@ -14,7 +14,7 @@ from advsearch.cluster.coordinator import DEPTH, PATIENCE, Coordinator
 from advsearch.cluster.executor import Done, Work
 from advsearch.cluster.inputs import Files
 from advsearch.cluster.machine import version
-from advsearch.cluster.worker import MOST_LOADED, Carried, Ready, carry_out_range, prepare
+from advsearch.cluster.worker import MOST_LOADED, Carried, Ready, carry_out_batch, prepare
 from advsearch.errors import ClusterError
 
 COUNT, SIZE = 400, 16
@@ -27,9 +27,9 @@ def ranges(count: int = COUNT) -> Iterator[range]:
 def carried(pool: Simulated, count: int = COUNT, tell: Callable[[str], None] = lambda text: None) -> list[Done]:
     """What comes back, checked: each number once, and as it should be."""
     found = list(coordinator(pool, tell).results(ranges(count)))
-    numbers = [number for done in found for number in done.numbers]
+    numbers = [number for done in found for number in done.items]
     assert sorted(numbers) == list(range(count)), "none is lost, and none comes twice"
-    assert all(done.value == list(done.numbers) for done in found if not done.lost)
+    assert all(done.value == list(done.items) for done in found if not done.lost)
     return found
 
 
@@ -45,7 +45,7 @@ def test_ranges_are_shared_and_few_are_under_way() -> None:
 
     shared = coordinator(pool)
     for count, done in enumerate(shared.results(source()), 1):
-        assert len(taken) - count <= 4 * DEPTH and done.numbers in taken
+        assert len(taken) - count <= 4 * DEPTH and done.items in taken
     assert pool.most <= 4 * DEPTH
     facts = shared.facts
     assert facts.most == facts.workers == 4 and facts.batches == 1250 and facts.retried == facts.lost == 0
@@ -79,7 +79,7 @@ def test_a_number_of_which_every_worker_dies_is_found_and_said(lag: float) -> No
     """And no other, not even one whose answer dies with the worker that was at the next already."""
     pool = Simulated(kill={37, 212}, lag=lag)
     pool.add(2)
-    lost = {done.numbers.start: done.lost for done in carried(pool) if done.lost}
+    lost = {done.items[0]: done.lost for done in carried(pool) if done.lost}
     assert lost == {37: "no answer: 3 workers died of it", 212: "no answer: 3 workers died of it"}
 
 
@@ -89,7 +89,7 @@ def test_what_is_left_waits_for_a_worker_that_is_not_ready(deadly: int) -> None:
     pool = Simulated(kill={deadly}, load=36.0, again=8.0, lag=0.6)
     pool.add(2)
     shared = coordinator(pool).results(range(first, first + 2) for first in range(0, 400, 2))
-    found = {number: done.lost for done in shared for number in done.numbers}
+    found = {number: done.lost for done in shared for number in done.items}
     assert len(found) == 400 and [number for number, lost in found.items() if lost] == [deadly]
 
 
@@ -106,7 +106,7 @@ def test_a_worker_that_hangs_is_ended_and_its_range_done_elsewhere() -> None:
 def test_a_number_that_hangs_for_ever_is_given_up() -> None:
     pool = Simulated(hang={90})
     pool.add(2)
-    assert [done.numbers for done in carried(pool) if done.lost] == [range(90, 91)]
+    assert [done.items for done in carried(pool) if done.lost] == [range(90, 91)]
 
 
 def test_late_answers_change_nothing() -> None:
@@ -226,9 +226,9 @@ def test_an_error_of_ours_ends_the_run_with_its_words_and_a_bug_with_its_trace()
 
 def test_a_worker_that_forgot_gets_ready_again_and_is_counted_once() -> None:
     class Forgetful(Simulated):
-        def submit(self, ticket: int, worker: str, function: Callable[..., object], *args: object) -> None:
-            if function is carry_out_range and args[1] in forgotten and worker in self._free_at:
-                forgotten.remove(args[1])
+        def submit(self, ticket: int, worker: str, function: Callable[..., object], *args: Any) -> None:
+            if function is carry_out_batch and args[1].start in forgotten and worker in self._free_at:
+                forgotten.remove(args[1].start)
                 self._at[ticket] = worker
                 self._later(0.1, self._answer(ticket, Failure("it is not ready", forgotten=True)))
             else:
@@ -259,9 +259,9 @@ def test_runs_that_share_a_worker_all_get_on(monkeypatch: pytest.MonkeyPatch) ->
         for key in keys:
             assert isinstance(prepare(key, Work("cluster_work:squares", {}), Files({}, {}), version()), Ready)
         for key in keys * 2:
-            done = carry_out_range(key, 3, 5)
+            done = carry_out_batch(key, range(3, 5))
             assert isinstance(done, Carried) and done.value == [9, 16]
-        unknown = carry_out_range("another", 3, 5)
+        unknown = carry_out_batch("another", range(3, 5))
         assert isinstance(unknown, Failure) and unknown.forgotten
     finally:
         threads.configure()
@@ -276,7 +276,7 @@ def test_results_that_are_given_up_do_not_answer_what_is_asked_next() -> None:
     for _ in range(3):
         next(first)
     numbers = sorted(
-        number for done in shared.results(iter([range(900, 901), range(901, 902)])) for number in done.numbers
+        number for done in shared.results(iter([range(900, 901), range(901, 902)])) for number in done.items
     )
     assert numbers == [900, 901]
     with pytest.raises(RuntimeError, match="given up when others were asked for"):

@@ -37,7 +37,7 @@ def pieces(count: int) -> Iterator[range]:
 def check(executor: Executor | None, count: int, added: int = 0) -> None:
     """All numbers come back once and squared."""
     assert executor is not None
-    found = {n: v for done in executor.results(pieces(count)) for n, v in zip(done.numbers, done.value, strict=True)}
+    found = {n: v for done in executor.results(pieces(count)) for n, v in zip(done.items, done.value, strict=True)}
     assert found == {number: number * number + added for number in range(count)}
 
 
@@ -51,8 +51,8 @@ def test_processes_of_this_machine_are_killed_and_nothing_is_lost() -> None:
         seen: dict[int, Any] = {}
         lost: dict[int, str] = {}
         for count, done in enumerate(results):
-            seen |= dict.fromkeys(done.numbers, done.value)
-            lost |= {done.numbers.start: done.lost} if done.lost else {}
+            seen |= dict.fromkeys(done.items, done.value)
+            lost |= {done.items[0]: done.lost} if done.lost else {}
             mine = psutil.Process().children(recursive=True)
             if count == 1:
                 listening = [one for process in (psutil.Process(), *mine) for one in process.net_connections("tcp")]
@@ -84,7 +84,7 @@ def test_a_worker_that_takes_long_to_start_again_is_waited_for(tmp_path: Path) -
                 if not seen:
                     mine = psutil.Process().children(recursive=True)
                     next(one for one in mine if "spawn_main" in " ".join(one.cmdline())).kill()
-                seen |= set(done.numbers)
+                seen |= set(done.items)
             assert seen == set(range(100)) and executor.facts is not None and executor.facts.lost == 1
 
 
@@ -130,11 +130,11 @@ def test_a_scheduler_and_workers_of_their_own(tmp_path: Path) -> None:
             check(executor, 40, added=7)
             assert executor is not None
             results = executor.results(pieces(200))
-            seen = [number for _ in range(10) for number in next(results).numbers]
+            seen = [number for _ in range(10) for number in next(results).items]
             os.killpg(first.pid, signal.SIGKILL)
             first.wait()
             with started(*scheduler), started(*worker):
-                seen += [number for done in results for number in done.numbers]
+                seen += [number for done in results for number in done.items]
                 assert sorted(seen) == list(range(200))
                 assert any("the scheduler has gone" in text for text in told)
 

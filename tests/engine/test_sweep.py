@@ -43,7 +43,7 @@ from advsearch.controls.base import Parameter
 from advsearch.engine.domains import domain_of
 from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.axes import axis_values, on_grid, read_axes
-from advsearch.engine.sweeps.batch import KIND
+from advsearch.engine.sweeps.job import KIND
 from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.points import Points, parts_of_ranges
 from advsearch.errors import AdvsearchError, InputError, RunExistsError, UnknownNameError

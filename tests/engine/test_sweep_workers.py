@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -17,12 +17,13 @@ import advsearch
 from advsearch.api.sweep import job_of
 from advsearch.cli.main import main
 from advsearch.cli.sweep import answer
-from advsearch.cluster.executor import Done, Workforce
+from advsearch.cluster.executor import Call, Done, Workforce
 from advsearch.config import SweepConfig
 from advsearch.engine.rows import LOST
+from advsearch.engine.sharing import answering
 from advsearch.engine.sweeps import loop, swept_scene
-from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.loop import Sweep
+from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
@@ -45,25 +46,24 @@ def nothing_is_rendered(request: pytest.FixtureRequest, monkeypatch: pytest.Monk
 class Disorder:
     """Carries out batches in any order, with facts as of two machines."""
 
-    batches: Batches
+    call: Call
     seed: int = 0
     lose: int | None = None
     stop: int | None = None
     facts: Workforce | None = field(default_factory=lambda: Workforce(most=2, lost=1, busy=9.0, alive=10.0, retried=3))
 
-    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
-        pieces = [one for one in ranges if one is not None]
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+        pieces = list(batches)
         random.Random(self.seed).shuffle(pieces)
-        for count, numbers in enumerate(pieces):
+        for count, items in enumerate(pieces):
             if count == self.stop:
                 raise KeyboardInterrupt
-            if self.lose in numbers:
-                for number in numbers:
-                    one = range(number, number + 1)
-                    lost = "no answer: 3 workers died of it" if number == self.lose else ""
-                    yield Done(one, None if lost else self.batches(one), lost=lost)
+            if self.lose in [query.number for _, _, query in items]:
+                for one in items:
+                    lost = "no answer: 3 workers died of it" if one[2].number == self.lose else ""
+                    yield Done([one], None if lost else self.call([one]), lost=lost)
             else:
-                yield Done(numbers, self.batches(numbers), f"worker {count % 2}")
+                yield Done(items, self.call(items), f"worker {count % 2}")
 
 
 def rows(path: Path) -> list[Any]:
@@ -78,9 +78,8 @@ def summary(result: Any) -> dict[str, Any]:
 
 def shared(path: Path, resumed: bool = False, **given: Any) -> Any:
     job = job_of(CONFIG)
-    sweep = Sweep(job, None, NullProgress())
     with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
-        executor = Disorder(Batches(job, sweep.per_scene), **given)
+        executor = Disorder(answering(Scenes(job).named), **given)
         return Sweep(job, run, NullProgress(), executor).carry_out()
 
 
@@ -122,14 +121,14 @@ def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path:
 
 def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: Path) -> None:
     class Two(Disorder):
-        def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
-            for done in super().results(ranges):
-                yield Done(done.numbers, done.value, done.worker, "ab12" if done.numbers.start < 4 else None)
+        def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+            for done in super().results(batches):
+                yield replace(done, machine="ab12" if done.items[0][2].number < 4 else None)
 
     job = job_of(CONFIG)
     facts = Workforce(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
     with RunDirectory.create(tmp_path / "run") as run:
-        executor = Two(Batches(job, 6), facts=facts)
+        executor = Two(answering(Scenes(job).named), facts=facts)
         result = Sweep(job, run, NullProgress(), executor).carry_out()
         assert run.store.noted("machines") == {"ab12": {"processor": "another", "LLVM": "19.1"}}
     assert [row.machine for row in result.rows()] == ["ab12"] * 4 + [None] * 8

@@ -642,10 +642,9 @@ def test_workers_make_the_references_and_what_is_timed_stays_here(
     class Watched:
         facts = Workforce(workers=2, most=2, busy=1.0, alive=2.0)
 
-        def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
-            assert given is not None
-            for done in made.results(ranges, given):
-                (one,) = given[done.numbers.start : done.numbers.stop]
+        def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+            for done in made.results(batches):
+                (one,) = done.items
                 asked.update({} if one is None else {one: done.value[0]})
                 yield replace(done, lost="it died") if one is not None and died else done
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from advsearch.engine.sweeps.batch import KIND
+from advsearch.engine.sweeps.job import KIND
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import sweep_html
 from advsearch.report.studies import sweep_axes, sweep_figure

@@ -9,6 +9,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from advsearch.attacks import Query
+from advsearch.attacks.draws import Seeds
 from advsearch.config import SweepConfig
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
@@ -16,6 +18,7 @@ from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import Scene, framed
 from advsearch.engine.metrics import Metrics
+from advsearch.engine.sharing import Sent
 from advsearch.engine.sweeps.axes import Axis, on_grid
 from advsearch.engine.sweeps.points import Drawn, Points
 from advsearch.errors import InputError
@@ -24,6 +27,9 @@ from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.formation import next_count
 from advsearch.tasks import Facts, Task
 from advsearch.tasks.base import Truth
+
+KIND = "sweep"
+"""Rows of the sweep, and the stream of their seeds."""
 
 SAMPLES = 100
 """Draws where there is no grid and nothing is said."""
@@ -84,6 +90,7 @@ class Job:
     aovs: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
+    _bound: dict[int, dict[tuple[int, int], Points]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def samples(self) -> int:
@@ -99,6 +106,60 @@ class Job:
     def sizes(self) -> tuple[tuple[int, int], ...]:
         """(height, width) of the pictures for each model."""
         return tuple(self.config.resolution or model.input_size for model in self.models)
+
+    def is_first_of_size(self, model: int) -> bool:
+        """Whether no model before this one is shown the same pictures."""
+        return self.sizes[model] not in self.sizes[:model]
+
+    # ---- what is asked ----------------------------------------------------------------------------------------------
+
+    @cached_property
+    def per_scene(self) -> int:
+        """Pictures of a scene."""
+        return next(iter(self.bound(0).values())).count
+
+    @cached_property
+    def seeds(self) -> Seeds:
+        """Of the noise of draws."""
+        return Seeds(self.config.seed, KIND)
+
+    def bound(self, scene: int) -> dict[tuple[int, int], Points]:
+        """The configurations of a scene for each size of picture; those of the last scene are held."""
+        if scene not in self._bound:
+            self._bound.clear()
+            spaces = self.spaces(self.places[scene])
+            self._bound[scene] = {size: self.points(space) for size, space in spaces.items()}
+        return self._bound[scene]
+
+    def queries(self, numbers: range) -> list[Sent]:
+        """Ask all models about the pictures with these numbers, all of one scene, whose number is the name."""
+        scene = numbers.start // self.per_scene
+        before, models = scene * self.per_scene, len(self.models)
+        place, keep = self.places[scene], self.config.keep_pictures != "none"
+        held, found = {control.name for control in place.held}, list[Sent]()
+        picked: dict[tuple[int, int], tuple[Tensor, list[dict[str, Value]]]] = {}
+        for size, points in self.bound(scene).items():
+            picks = points.picks(numbers.start - before, len(numbers), before)
+            u = points.configurations(picks)
+            picked[size] = u, points.values(u, picks)
+        for k, number in enumerate(numbers):
+            for model, size in enumerate(self.sizes):
+                points, (u, values) = self.bound(scene)[size], picked[size]
+                said, lit_by = place.values, points.lit_by(values[k])
+                if lit_by is not None:
+                    said["environment"] = {"value": lit_by, "unit": ""}
+                said["model"] = {"value": self.models[model].name, "unit": ""}
+                said |= {name: value for name, value in values[k].items() if name.partition(".")[0] not in held}
+                seed, step = self.seeds(points.draw(number)), number * models + model
+                query = Query(
+                    u[k].clone(), seed, KIND, step, spp=self.spp, drawn=False, values=said, sought=False, keep=keep
+                )
+                found.append((str(scene), None, query))
+        return found
+
+    def spaces(self, place: NamedScene) -> dict[tuple[int, int], Space]:
+        """The controls bound to a scene for each size of picture, the first model's first."""
+        return {size: self.space(place, size) for size in dict.fromkeys(self.sizes)}
 
     def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
         """The controls, those of the grid as choices, bound to a scene.
@@ -196,7 +257,7 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     """
     bound = []
     for place in job.places:
-        spaces = [job.space(place, size) for size in dict.fromkeys(job.sizes)]
+        spaces = list(job.spaces(place).values())
         _check_draws(place, spaces[0])
         bound += [(place, job.points(space)) for space in spaces]
         job.check_truths(place)

@@ -16,7 +16,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks.product import Product
 from advsearch.engine.sweeps.axes import Axis
-from advsearch.engine.sweeps.points import Picks, Points
+from advsearch.engine.sweeps.points import Points
 from advsearch.engine.transport import CHECK_SPP, Deviation, deviation_under_light
 from advsearch.files import scaled
 from advsearch.runs.results.attack import LinearTransport, PredictionError
@@ -161,32 +161,29 @@ class SweptLight:
         return -(-CHECKS // self._groups.count)
 
     @property
-    def not_finite(self) -> bool:
-        """Whether a basis picture has values that are not finite, which were set to 0."""
-        return any(one is not None and one.non_finite > 0 for one in self._made.values())
+    def not_finite(self) -> int:
+        """How many values of basis pictures are not finite, and were set to 0."""
+        return sum(one.non_finite for one in self._made.values() if one is not None)
 
-    def show(self, picks: Picks, u: Tensor, noise: Sequence[int], before: int) -> list[Shown]:
-        """Return pictures, rendered or predicted.
+    def show(self, number: int, digits: tuple[int, ...], u: Tensor, noise: int, before: int) -> Shown:
+        """Return a picture, rendered or predicted.
 
         Args:
-            picks: n of them.
-            u: (n, d) their configurations.
-            noise: a seed for each.
+            number: of the picture in the whole sweep.
+            digits: its place on every axis of the grid.
+            u: (d,) its configuration.
+            noise: its seed.
             before: pictures of the scenes before.
         """
-        return [self._one(picks, k, one, seed, before) for k, (one, seed) in enumerate(zip(u, noise, strict=True))]
-
-    def _one(self, picks: Picks, number: int, u: Tensor, noise: int, before: int) -> Shown:
         if self.reason is not None:
             return Shown(self.renderer(u, seed=noise, spp=self.spp), predicted=False, traced=1)
-        digits = picks.digits[number]
         group = self._groups.group(digits)
         if group not in self._made:
             if len(self._made) >= self._groups.at_once:
                 self._made.pop(next(iter(self._made)))
             self._made[group] = self._make(group, digits, before)
         made = self._made[group]
-        first = picks.number + number - before == self._groups.member(digits, 0)
+        first = number - before == self._groups.member(digits, 0)
         traced = (self._lights + 2 * self._checks) * first
         if made is None:
             return Shown(self.renderer(u, seed=noise, spp=self.spp), predicted=False, traced=traced + 1)

@@ -1,4 +1,4 @@
-"""The loop of a sweep: have batches carried out (`batch`), store and count what comes of them, sum it up.
+"""The loop of a sweep: ask about every configuration, store and count what is answered, sum it up.
 
 Configurations are numbered: scenes (object, environment; beside an answer first all without it), then the grid with its
 last axis fastest, then the draws of a point of the grid, then the models. Models are shown the same pictures, so that
@@ -11,35 +11,32 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
-from advsearch.attacks.draws import Seeds
+from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.product import batches
-from advsearch.cluster.executor import Done, Executor, InProcess
-from advsearch.described import Value
+from advsearch.cluster.executor import Executor, InProcess
 from advsearch.engine.going_on import finite, same
-from advsearch.engine.journal import other_answers
+from advsearch.engine.journal import Journal, other_answers
 from advsearch.engine.loading import framed
-from advsearch.engine.machines import Machines
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
-from advsearch.engine.rows import LOST, judgement_of, lost_remarks, trial_row
+from advsearch.engine.rows import LOST, judgement_of, lost_remarks
+from advsearch.engine.sharing import Sent, Shared, answering, lost
 from advsearch.engine.sweeps.answer import SweepResult
-from advsearch.engine.sweeps.batch import KIND, Batch, Batches
-from advsearch.engine.sweeps.job import Job, check_all
+from advsearch.engine.sweeps.job import KIND, Job, check_all
 from advsearch.engine.sweeps.light import together
-from advsearch.engine.sweeps.points import Picks, Points
+from advsearch.engine.sweeps.points import Picks
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
 from advsearch.engine.sweeps.surface import map_surface
+from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.engine.sweeps.worst import check_worst
 from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
 from advsearch.report.studies import sweep_figure
 from advsearch.report.wording import count
-from advsearch.runs import store
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
@@ -53,7 +50,7 @@ from advsearch.runs.results.sweep import (
     WorstConfiguration,
     WorstVerified,
 )
-from advsearch.scene.transport.renderer import SPP as BASIS_SPP
+from advsearch.runs.store import Row
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 from advsearch.viewer.columns import EDGES
@@ -85,7 +82,7 @@ class Sweep:
         job: what is swept.
         run: open directory to keep it in, with the rows that are there already; None keeps it in memory.
         progress: told how far it is.
-        executor: carries out batches; None does it here.
+        executor: answers batches of queries; None does it here.
     """
 
     def __init__(
@@ -99,13 +96,12 @@ class Sweep:
         self.per_scene, self.models = self.points.count, len(job.models)
         self.total = len(job.places) * self.per_scene * self.models
         self.samples = job.spp
-        self._seeds = Seeds(job.config.seed, KIND)
-        self._kept: list[store.Row] = []
-        self._batches = Batches(job, self.per_scene)
-        self._executor = InProcess(self._batches) if executor is None else executor
+        self._scenes = Scenes(job)
+        self._executor = InProcess(answering(self._scenes.named)) if executor is None else executor
+        scenes: Any = self._scenes
+        self.journal = Journal(run, Shared(scenes, executor))
         self._rendered = self._traced = self._predicted = self._lost = 0
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
-        self._machines = Machines(run)
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
         self._told, self._untold, self._begun = 0.0, 0, 0.0
         self._surface: SurfaceMap | None = None
@@ -139,7 +135,7 @@ class Sweep:
         try:
             with interruptible():
                 left = [range(first, self.total)] if first is not None else self._left()
-                self._batches.open((left[0].start if left else self.total - 1) // self.models // self.per_scene)
+                self._scenes.open((left[0].start if left else self.total - 1) // self.models // self.per_scene)
                 hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
                 hint += " or fewer points shorten it"
                 if self.run is not None and self.job.config.keep_pictures != "none":
@@ -153,7 +149,7 @@ class Sweep:
                 if self.job.config.surface and self.run is not None:
                     self.stages.begin("surface", "tracing the surface that was seen", self.total)
                     rows = self.run.store.rows(KIND)
-                    self._surface = map_surface(self.job, rows, self._batches.open, self.run, self.stages.progress)
+                    self._surface = map_surface(self.job, rows, self._scenes.open, self.run, self.stages.progress)
         except KeyboardInterrupt:
             ending = INTERRUPTED
             tally = self._counted()
@@ -169,61 +165,53 @@ class Sweep:
 
     def _go_through(self, left: Sequence[range], tally: Tally) -> Tally:
         """Have what is left carried out, store and count it; return the counts."""
-        waiting: dict[int, Done] = {}  # it is counted in order: sums and the first of equals depend on that
-        expected = left[0].start // self.models if left else 0
+        waiting: dict[int, list[Judgement]] = {}  # it is counted in order: sums and the first of equals depend on that
+        expected = left[0].start if left else 0
         self._begun = time.monotonic()
         in_order = not left or (len(left) == 1 and left[0].stop == self.total)
-        for done in self._executor.results(self._pieces(left)):
-            waiting[done.numbers.start] = self._take(done)
+        for done in self._executor.results(self._asked(left)):
+            queries = [query for _, _, query in done.items]
+            answers = [lost(one, done.lost) for one in queries] if done.lost else done.value
+            self._take(queries, answers, done.worker, done.machine)
+            waiting[queries[0].number] = [one.said for one in answers]
             in_order = in_order and len(waiting) <= MOST_WAITING
             while waiting and (expected in waiting or not in_order):
-                expected = self._count_all(tally, waiting.pop(expected if in_order else next(iter(waiting))))
-            self._tell(len(done.numbers) * self.models, tally)
-        self._kept.sort(key=lambda row: row.step)
+                first = expected if in_order else next(iter(waiting))
+                expected = self._count_all(tally, first, waiting.pop(first))
+            self._tell(len(queries), tally)
+        self.journal.rows.sort(key=lambda row: row.step)
         return tally if in_order else self._counted()
 
-    def _pieces(self, left: Sequence[range]) -> Iterator[range]:
-        """Yield the pictures of batches, each of one scene."""
+    def _asked(self, left: Sequence[range]) -> Iterator[list[Sent]]:
+        """Yield what is asked in batches, each about one scene."""
         for part in left:
             first, last = part.start // self.models, -(-part.stop // self.models)
             while first < last:
-                scene = first // self.per_scene
-                before = scene * self.per_scene
+                before = first // self.per_scene * self.per_scene
                 for piece in batches(first - before, min(last - before, self.per_scene), self.job.config.batch):
-                    yield range(before + piece.start, before + piece.stop)
+                    asked = self.job.queries(range(before + piece.start, before + piece.stop))
+                    yield [one for one in asked if part.start <= one[2].number < part.stop]
                 first = before + self.per_scene
 
-    def _take(self, done: Done) -> Done:
-        """Store what came of a batch; return what is to be counted of it."""
-        numbers, batch = done.numbers, done.value if done.value is not None else self._missed(done)
-        more = {"seconds": batch.seconds, "machine": done.machine}
-        rows = [
-            self._row(number, model, batch.judgements[model][k], batch.values[model][k], batch.shown[model][k], **more)
-            for k, number in enumerate(numbers)
-            for model in range(self.models)
-        ]
-        if self.run is None:
-            self._kept += rows
-        else:
-            for number, data in batch.thumbnails.items():
-                thumbnails.keep(self.run.path, number, data)
-            for number, (layers, notes) in batch.layers.items():
-                write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", layers, notes)
-            self.run.record(*rows)
+    def _take(self, queries: Sequence[Query], answers: Sequence[Evaluation], worker: str, machine: str | None) -> None:
+        """Store what was answered in one batch."""
+        answers = [replace(one, machine=machine) for one in answers]
+        if self.run is not None:
+            for query, answer in zip(queries, answers, strict=True):
+                number = query.number // self.models
+                if answer.small is not None:
+                    thumbnails.keep(self.run.path, number, answer.small)
+                if answer.layers is not None:
+                    write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", *answer.layers)
+        rows = self.journal.keep(list(zip(queries, answers, strict=True)), numbered=True)
         self._spend(rows)
-        self._rendered += len(numbers) * batch.sizes
-        self._transport[done.worker, numbers.start // self.per_scene] = batch.light
-        if batch.not_finite and not self._not_finite:
+        scene = queries[0].number // self.models // self.per_scene
+        self._rendered += sum(self.job.is_first_of_size(query.number % self.models) for query in queries)
+        self._transport[worker, scene] = answers[-1].light or []
+        if any(one.non_finite for one in answers) and not self._not_finite:
             self._not_finite = True
             if self.run is not None:
                 self.run.store.set_note(NOT_FINITE, "yes")
-        self._machines.meet(done.machine, self._executor.facts)
-        return Done(numbers, batch.judgements, done.worker)
-
-    def _missed(self, done: Done) -> Batch:
-        """What stands for a picture that nobody could make."""
-        points, picks, _ = self._find(done.numbers.start * self.models)
-        return Batch.lost(self.models, points.values(points.configurations(picks), picks), done.lost)
 
     def _pictures_text(self) -> str:
         """What the kept pictures take, said beforehand."""
@@ -232,35 +220,6 @@ class Sweep:
         megabytes = self.total // self.models * thumbnails.BYTES * share / 1e6
         size = f"{megabytes / 1e3:.1f} GB" if megabytes >= 1e3 else f"{max(megabytes, 0.1):.1f} MB"
         return f"about {size}" if self.job.config.keep_pictures == "all" else f"at most about {size}"
-
-    def _row(
-        self,
-        number: int,
-        model: int,
-        trial: Judgement,
-        values: dict[str, Value],
-        shown: tuple[bool, int] = (False, 1),
-        **more: Any,
-    ) -> store.Row:
-        """What is stored of a configuration: what varies; a predicted picture has no seed of its own."""
-        place, (predicted, traced) = self.job.places[number // self.per_scene], shown
-        lit_by = self.points.lit_by(values)
-        named = place.values
-        if lit_by is not None:
-            named["environment"] = {"value": lit_by, "unit": ""}
-        still = {control.name for control in place.held}
-        varied = {name: value for name, value in values.items() if name.partition(".")[0] not in still}
-        named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **varied}
-        step = number * self.models + model
-        more |= {"id": step + 1, "renders": traced if self._is_first_of_size(model) else 0}
-        row = trial_row(
-            KIND, step, self._seeds(self.points.draw(number)), self.samples, trial, named, sought=False, **more
-        )
-        return replace(row, seed=None, spp=BASIS_SPP) if predicted else row
-
-    def _is_first_of_size(self, model: int) -> bool:
-        """Whether no model before it is shown the same pictures."""
-        return self.job.sizes[model] not in self.job.sizes[:model]
 
     def _check_answers(self) -> None:
         """Look again at the first picture that is stored, where there is more to come here.
@@ -272,10 +231,14 @@ class Sweep:
         if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
             return
         number, model = divmod(row.step, self.models)
-        batches = Batches(self.job, self.per_scene)  # another one: what is done here decides no row
-        look = partial(batches, range(number, number + 1))
-        now = finite(look().judgements[model][0].margin)
-        if not same([row.margin], [now]) and same([now], [finite(look().judgements[model][0].margin)]):
+        sent = self.job.queries(range(number, number + 1))
+        other = Scenes(self.job).named(sent[0][0])  # what is done here decides no row
+
+        def look() -> float | None:
+            return finite(other.answers([query for _, _, query in sent])[model].said.margin)
+
+        now = look()
+        if not same([row.margin], [now]) and same([now], [look()]):
             raise other_answers(self.run, {"margin": (row.margin, now)})
 
     def _tell(self, count: int, tally: Tally) -> None:
@@ -297,7 +260,7 @@ class Sweep:
         tally = Tally(self._outer, self.job.axes, self._shown, self._pairs)
         self._traced = self._predicted = self._lost = 0
         key, picks = (-1, -1), self.points.picks(0, 0)
-        for row in self._kept if self.run is None else self.run.store.rows(KIND):
+        for row in self.rows():
             number, model = divmod(row.step, self.models)
             scene, local = divmod(number, self.per_scene)
             block, place = divmod(local, READ_AT_ONCE)
@@ -309,22 +272,27 @@ class Sweep:
             self._spend([row])
         return tally
 
-    def _spend(self, rows: Sequence[store.Row]) -> None:
+    def rows(self) -> Iterable[Row]:
+        """Return the rows of the sweep that are there."""
+        return [one for one in self.journal.rows if one.kind == KIND] if self.run is None else self.run.store.rows(KIND)
+
+    def _spend(self, rows: Sequence[Row]) -> None:
         """Count the pictures that rows took; old ones don't say it."""
         for row in rows:
-            first = self._is_first_of_size(row.step % self.models)
+            first = self.job.is_first_of_size(row.step % self.models)
             self._traced += int(first) if row.renders is None else row.renders
             self._predicted += row.seed is None and first
             self._lost += row.label == LOST
 
-    def _count_all(self, tally: Tally, done: Done) -> int:
-        """Count a batch, of which there are the judgements; return the number after it."""
-        scene, local = divmod(done.numbers.start, self.per_scene)
-        picks = self.points.picks(local, len(done.numbers), scene * self.per_scene)
-        for k in range(len(done.numbers)):
-            for model in range(self.models):
-                self._count(tally, scene, picks, k, model, done.value[model][k])
-        return done.numbers.stop
+    def _count_all(self, tally: Tally, first: int, said: Sequence[Judgement]) -> int:
+        """Count neighbouring rows from a number on; return the number after them."""
+        scene, local = divmod(first // self.models, self.per_scene)
+        pictures = (first + len(said) - 1) // self.models - first // self.models + 1
+        picks = self.points.picks(local, pictures, scene * self.per_scene)
+        for number, judgement in enumerate(said, first):
+            picture, model = divmod(number, self.models)
+            self._count(tally, scene, picks, picture - first // self.models, model, judgement)
+        return first + len(said)
 
     def _count(self, tally: Tally, scene: int, picks: Picks, k: int, model: int, trial: Judgement) -> None:
         tally.add((picks.number + k) * self.models + model, (*self._places[scene], model), picks, k, trial)
@@ -336,19 +304,16 @@ class Sweep:
         if tally.worst is None:
             return None
         index, seen = tally.worst
-        points, picks, model = self._find(index)
-        u = points.configurations(picks)
-        values = points.values(u, picks)[0]
-        row = self._row(picks.number, model, seen, values)
-        task, scene = self.job.tasks[model], picks.number // self.per_scene
+        query, model = self._query(index)
+        task, scene = self.job.tasks[model], index // self.models // self.per_scene
         if task.varies:
-            truth = self._batches.open(scene).truth(model, u[0], values)
+            truth = self._scenes.open(scene).truth(model, query.u, query.values)
         else:
-            truth = self.job.truth(self.job.places[scene], model, values)
+            truth = self.job.truth(self.job.places[scene], model, query.values)
         return WorstConfiguration(
             configuration=index,
-            values={name: DescribedValue.of(value) for name, value in row.values.items()},
-            seed=self._seeds(points.draw(picks.number)),
+            values={name: DescribedValue.of(value) for name, value in query.values.items()},
+            seed=query.seed,
             label_set=list(task.truth_names(truth)),
             claimed=_claim_of(seen),
             verified=None,
@@ -356,9 +321,8 @@ class Sweep:
 
     def _verified(self, worst: WorstConfiguration) -> dict[str, object]:
         """What fresh renders say of it, and what the model says of the picture that is kept."""
-        points, picks, model = self._find(worst.configuration)
-        view = self._batches.open(picks.number // self.per_scene)
-        u = points.configurations(picks)[0]
+        query, model = self._query(worst.configuration)
+        view, u = self._scenes.open(worst.configuration // self.models // self.per_scene), query.u
         checked = check_worst(view, self.job, model, u, self.run, self.stages)
         if self.run is None:
             return {"verified": checked}
@@ -368,19 +332,17 @@ class Sweep:
         save_marked(self.run, "worst", picture, view.marks(model, u, picture))
         return {"verified": checked, "pictured": _claim_of(view.judge(model, u, picture))}
 
-    def _find(self, index: int) -> tuple[Points, Picks, int]:
-        """A configuration by its number: its scene's points, its picture, its model."""
+    def _query(self, index: int) -> tuple[Query, int]:
+        """What is asked about a configuration by its number, and the number of its model."""
         number, model = divmod(index, self.models)
-        scene, local = divmod(number, self.per_scene)
-        points = self.job.points(self.job.space(self.job.places[scene], self.job.sizes[model]))
-        return points, points.picks(local, 1, scene * self.per_scene), model
+        return self.job.queries(range(number, number + 1))[model][2], model
 
     # ---- the answer -------------------------------------------------------------------------------------------------
 
     def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
         """Put the summary together and write it."""
         job, seconds = self.job, self.stages.seconds
-        view, checked = self._batches.view, worst.verified if worst else None
+        view, checked = self._scenes.scene, worst.verified if worst else None
         swept = seconds.get("sweep", 0.0)
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
         gains = self._gains() if formation else {}
@@ -416,7 +378,7 @@ class Sweep:
             },
             transport=together([one for light in self._transport.values() for one in light]),
             surface=self._surface,
-            shared=SharedWork.of_facts(self._executor.facts, self._machines.known),
+            shared=SharedWork.of_facts(self._executor.facts, self.journal.machines.known),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
@@ -428,7 +390,7 @@ class Sweep:
             for suffix, data in sweep_figure(summary).items():
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
             write_sweep_page(self.run.path, summary)
-        return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
+        return SweepResult(summary, None if self.run is None else self.run.path, tuple(self.journal.rows))
 
     def _gains(self) -> dict[str, float]:
         """The gain of each scene, by object and environment, where there are not too many to meter."""
@@ -450,7 +412,7 @@ class Sweep:
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""
         remarks = lost_remarks(self._lost)
-        remarks += self._machines.remarks
+        remarks += self.journal.machines.remarks
         if tally.not_finite:
             remarks.append(f"{tally.not_finite} answers of the model are not numbers; they count as not right.")
         if self._not_finite:

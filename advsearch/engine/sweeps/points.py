@@ -206,10 +206,14 @@ class Points:
 
     def picks(self, first: int, count: int, before: int = 0) -> Picks:
         """Return the pictures from number `first` of the scene on; `before` is how many the scenes before it have."""
-        digits = [self.grid.digits(number // self.samples) for number in range(first, first + count)]
+        digits = [self.digits(number) for number in range(first, first + count)]
         shares = self._draws.points(self.draw(before + first), count)
         parts = np.minimum((shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1)
         return Picks(before + first, digits, shares, parts.tolist())
+
+    def digits(self, number: int) -> tuple[int, ...]:
+        """Return the place on every axis of the grid of the picture with this number in the scene."""
+        return self.grid.digits(number // self.samples)
 
     def draw(self, number: int) -> int:
         """Return the number of the draw, and of the noise, of the picture with this number in the whole sweep."""

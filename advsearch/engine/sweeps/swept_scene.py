@@ -1,67 +1,62 @@
-"""One scene of a sweep, ready to be rendered and shown to the models."""
+"""The scenes of a sweep: each answers queries about its pictures, rendered or predicted, by all models of the sweep.
+
+What comes of a query depends on it and on the job alone, so it may be answered anywhere, in whatever company.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
+from advsearch.attacks import Evaluation, Query
 from advsearch.described import Value
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.metrics import judgements
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.light import Shown, SweptLight
 from advsearch.engine.sweeps.points import Picks, Points
+from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Judgement, Mark
 from advsearch.tasks.base import Truth
+from advsearch.viewer import thumbnails
 
-Values = dict[str, Value]
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What models say of pictures.
-
-    Attributes:
-        judgements: for each model, of each picture.
-        values: for each model, what is stored of each picture that it was shown.
-        shown: for each model, how each picture was made.
-        pictures: (n, H, W, 3) what the first model was shown.
-    """
-
-    judgements: list[list[Judgement]]
-    values: list[list[Values]]
-    shown: list[list[Shown]]
-    pictures: Tensor
+Size = tuple[int, int]
+"""(height, width) of pictures."""
 
 
 class SweptScene:
-    """One scene, ready to be rendered and shown to the models.
+    """One scene, ready to be rendered and shown to the models: what a `Problem` is to an attack.
 
     Args:
         job: what is swept.
         number: of the scene.
 
     Attributes:
+        job, number: likewise.
         points: its configurations for each size of picture, on which what a control frames may depend.
         renderers: likewise.
         light: what predicts pictures of these that differ in light alone.
-        not_finite: whether a picture had values that are not finite, which were set to 0.
+        prepared: nothing.
     """
+
+    prepared: Any = None
 
     def __init__(self, job: Job, number: int) -> None:
         place, config = job.places[number], job.config
-        self.number, self._job = number, job
-        self.points: dict[tuple[int, int], Points] = {}
-        self.renderers: dict[tuple[int, int], Renderer] = {}
-        self._spaces = {size: job.space(place, size) for size in dict.fromkeys(job.sizes)}
+        self.number, self.job = number, job
+        self.points: dict[Size, Points] = {}
+        self.renderers: dict[Size, Renderer] = {}
+        self._spaces = job.spaces(place)
         for size, space in self._spaces.items():
             description = framed(place.scene.description, size)
             self.renderers[size] = make_renderer(
@@ -83,65 +78,97 @@ class SweptScene:
         self._truths = [None if task.varies else job.truth(place, k, {}) for k, task in enumerate(job.tasks)]
 
     @property
-    def not_finite(self) -> bool:
-        basis = any(one.not_finite for one in self.light.values())
-        return basis or any(renderer.non_finite for renderer in self.renderers.values())
+    def not_finite(self) -> int:
+        """How many values of pictures were not finite, and were set to 0."""
+        rendered = sum(renderer.non_finite for renderer in self.renderers.values())
+        return rendered + sum(light.not_finite for light in self.light.values())
 
-    def look(self, picks: Picks, noise: Sequence[int]) -> Seen:
-        """Render or predict configurations, round to 8 bits, ask and judge.
+    # ---- rows of the sweep ------------------------------------------------------------------------------------------
+
+    def answers(self, queries: Sequence[Query]) -> list[Evaluation]:
+        """Answer queries of neighbouring rows: a picture is made once for each size, and a model sees all of its own at
+        once.
 
         Args:
-            picks: n of them.
-            noise: a seed for each.
+            queries: by `Job.queries`, or some of these.
         """
-        u, shown, pictures, values = {}, {}, {}, {}
-        for size, points in self.points.items():
-            u[size] = points.configurations(picks)
+        begun, before, job = time.perf_counter(), self.not_finite, self.job
+        models = len(job.models)
+        made = {size: self._made(size, queries) for size in self.points}
+        said: dict[int, Judgement] = {}
+        for model, size in enumerate(job.sizes):
+            mine = [one for one in queries if one.number % models == model]
+            if mine:
+                shown = torch.stack([made[size][one.number // models].picture for one in mine])
+                judged = self._judged(model, shown, [(one.u, one.values) for one in mine])
+                said |= {one.number: judgement for one, judgement in zip(mine, judged, strict=True)}
+        pictures, wrong = made[job.sizes[0]], {number // models for number, one in said.items() if not one.right}
+        seconds, answers = (time.perf_counter() - begun) / len(queries), list[Evaluation]()
+        for query in queries:
+            number, model = divmod(query.number, models)
+            one, first = made[job.sizes[model]][number], job.is_first_of_size(model)
+            answer = Evaluation.of(
+                said[query.number], cost=one.traced * first, predicted=one.predicted, seconds=seconds
+            )
+            if model == 0 and query.keep and (job.config.keep_pictures == "all" or number in wrong):
+                answer = replace(answer, small=thumbnails.thumbnail(pictures[number].picture))
+            if model == 0 and job.aovs:
+                surfaces = self.renderers[job.sizes[0]].surfaces(query.u)
+                layers = {name: one.numpy() for name, one in surfaces.layers(job.aovs, OBJECT).items()}
+                answer = replace(answer, layers=(layers, surfaces.notes(job.aovs)))
+            answers.append(answer)
+        so_far = [one.summary() for one in self.light.values()]
+        return [*answers[:-1], replace(answers[-1], light=so_far, non_finite=max(0, self.not_finite - before))]
+
+    def _made(self, size: Size, queries: Sequence[Query]) -> dict[int, Shown]:
+        """The pictures of one size, rounded to 8 bits, by their numbers."""
+        job, points = self.job, self.points[size]
+        models, before = len(job.models), self.number * points.count
+        asked = {one.number // models: one for one in queries if job.sizes[one.number % models] == size}
+        found: dict[int, Shown] = {}
+        for number, query in asked.items():
+            digits = points.digits(number - before)
             with torch.no_grad():
-                shown[size] = self.light[size].show(picks, u[size], noise, self.number * points.count)
-            pictures[size] = to_8_bit(torch.stack([one.picture for one in shown[size]]))
-            values[size] = points.values(u[size], picks)
-        sizes = self._job.sizes
-        return Seen(
-            judgements=[self._judged(model, pictures[size], u[size], values[size]) for model, size in enumerate(sizes)],
-            values=[values[size] for size in sizes],
-            shown=[shown[size] for size in sizes],
-            pictures=pictures[sizes[0]],
-        )
+                shown = self.light[size].show(number, digits, query.u, query.seed, before)
+            found[number] = replace(shown, picture=to_8_bit(shown.picture))
+        return found
+
+    def pictures(self, queries: Sequence[Query]) -> Tensor:
+        """Return the pictures (n, H, W, 3) of rows as the first model sees them."""
+        shown = self._made(self.job.sizes[0], queries)
+        return torch.stack([one.picture for one in shown.values()])
+
+    # ---- single pictures --------------------------------------------------------------------------------------------
 
     def _score(self, model: int, picture: Tensor, u: Tensor) -> float:
         """The margin of one model on one picture (H, W, 3), in logits."""
-        values = self._spaces[self._job.sizes[model]].describe(u)
-        return self._judged(model, to_8_bit(picture)[None], u[None], [values])[0].margin
+        return self.judge(model, u, to_8_bit(picture)).margin
 
-    def trial(self, number: int, u: Tensor, seed: int, spp: int) -> Judgement:
-        """What one model says of one configuration."""
-        return self.judge(number, u, self.picture(number, u, seed, spp))
-
-    def judge(self, number: int, u: Tensor, picture: Tensor) -> Judgement:
+    def judge(self, model: int, u: Tensor, picture: Tensor) -> Judgement:
         """What one model says of the picture (H, W, 3) of one configuration."""
-        values = self._spaces[self._job.sizes[number]].describe(u)
-        return self._judged(number, picture[None], u[None], [values])[0]
+        return self._judged(model, picture[None], [(u, {})])[0]
 
-    def truth(self, number: int, u: Tensor, values: Mapping[str, Value]) -> Truth:
-        """What is true of a configuration, as the task of one model needs it.
+    def truth(self, model: int, u: Tensor, listed: Mapping[str, Value]) -> Truth:
+        """What is true of a configuration (d,), as the task of one model needs it.
 
         Args:
-            number: of the model.
-            u: (d,) the configuration.
-            values: as it is described.
+            model: number of it.
+            u: the configuration.
+            listed: values of the grid as they were given, in the place of what single precision makes of them.
         """
-        job = self._job
-        if not job.tasks[number].varies:
-            return self._truths[number]
-        renderer = self.renderers[job.sizes[number]]
-        return job.truth(job.places[self.number], number, values, lambda: renderer.surfaces(u))
+        job, size = self.job, self.job.sizes[model]
+        if not job.tasks[model].varies:
+            return self._truths[model]
+        place, renderer = job.places[self.number], self.renderers[size]
+        values = {name: listed.get(name, one) for name, one in self._spaces[size].describe(u).items()}
+        return job.truth(place, model, values, lambda: renderer.surfaces(u))
 
-    def picture(self, number: int, u: Tensor, seed: int, spp: int) -> Tensor:
+    def picture(self, model: int, u: Tensor, seed: int, spp: int) -> Tensor:
         """The picture (H, W, 3) that one model sees of one configuration."""
-        return self._pictures(self.renderers[self._job.sizes[number]], u[None], [seed], spp)[0]
+        with torch.no_grad():
+            return to_8_bit(self.renderers[self.job.sizes[model]](u, seed=seed, spp=spp))
 
-    def surfaces(self, picks: Picks, size: tuple[int, int] | None = None, fineness: int = 1) -> Iterator[Surfaces]:
+    def surfaces(self, picks: Picks, size: Size | None = None, fineness: int = 1) -> Iterator[Surfaces]:
         """What is seen in the pixels of pictures, one after the other.
 
         Args:
@@ -149,34 +176,54 @@ class SweptScene:
             size: (height, width) of the pictures; None for those that the first model is shown.
             fineness: parts of each side of a pixel.
         """
-        size = size or self._job.sizes[0]
+        size = size or self.job.sizes[0]
         for u in self.points[size].configurations(picks):
             yield self.renderers[size].surfaces(u, fineness)
 
-    def marks(self, number: int, u: Tensor, picture: Tensor) -> list[Mark]:
+    def marks(self, model: int, u: Tensor, picture: Tensor) -> list[Mark]:
         """What shows the answer of one model to the picture (H, W, 3) of one configuration."""
-        values = self._spaces[self._job.sizes[number]].describe(u)
         with torch.no_grad():
-            output = self._job.models[number](picture)
-            return self._job.tasks[number].marks(output, self.truth(number, u, values))[0]
-
-    @staticmethod
-    def _pictures(renderer: Renderer, u: Tensor, noise: Sequence[int], spp: int) -> Tensor:
-        with torch.no_grad():
-            return to_8_bit(
-                torch.stack([renderer(one, seed=seed, spp=spp) for one, seed in zip(u, noise, strict=True)])
-            )
+            output = self.job.models[model](picture)
+            return self.job.tasks[model].marks(output, self.truth(model, u, {}))[0]
 
     def _judged(
-        self, number: int, pictures: Tensor, u: Tensor, values: Sequence[Mapping[str, Value]]
+        self, model: int, pictures: Tensor, shown: Sequence[tuple[Tensor, Mapping[str, Value]]]
     ) -> list[Judgement]:
-        """What one model says of pictures (n, H, W, 3); a margin that is not finite becomes NaN."""
-        task, truths = self._job.tasks[number], [self._truths[number]]
+        """What one model says of pictures (n, H, W, 3) of configurations; a margin that is not finite becomes NaN."""
+        task, truths = self.job.tasks[model], [self._truths[model]]
         if task.varies:
-            truths = [self.truth(number, *one) for one in zip(u, values, strict=True)]
+            truths = [self.truth(model, *one) for one in shown]
         with torch.no_grad():
-            output = self._job.models[number](pictures)
-        said = judgements(task, output, pictures, truths, self._job.metrics)
+            output = self.job.models[model](pictures)
+        said = judgements(task, output, pictures, truths, self.job.metrics)
         return [
             replace(Judgement.of(one.score, one.margin, one.answer, one.payload), metrics=one.metrics) for one in said
         ]
+
+
+class Scenes:
+    """The scenes of a sweep in this process, of which the last one is held.
+
+    Args:
+        job: what is swept.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.scene: SweptScene | None = None
+
+    def open(self, number: int) -> SweptScene:
+        """The scene with this number; loading it lets the one before go."""
+        if self.scene is None or self.scene.number != number:
+            self.scene = None
+            self.scene = SweptScene(self.job, number)
+        return self.scene
+
+    def named(self, name: str) -> SweptScene:
+        """The same by its number as text: see `advsearch.engine.sharing.answering`."""
+        return self.open(int(name))
+
+    def picture(self, number: int) -> Tensor:
+        """Return the picture (H, W, 3) with this number as the first model sees it."""
+        sent = self.job.queries(range(number, number + 1))
+        return self.named(sent[0][0]).pictures([query for _, _, query in sent])[0]

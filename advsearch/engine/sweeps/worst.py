@@ -38,7 +38,8 @@ class OneModel:
 
     def evaluate(self, query: Query) -> Evaluation:
         """Answer one query: a trial."""
-        return Evaluation.of(self.view.trial(self.model, query.u, query.seed, query.spp))
+        picture = self.view.picture(self.model, query.u, query.seed, query.spp)
+        return Evaluation.of(self.view.judge(self.model, query.u, picture))
 
 
 def check_worst(

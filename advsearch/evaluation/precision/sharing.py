@@ -39,18 +39,11 @@ def shared_parts(executor: Executor | None, name: str, by: str, spp: int) -> Par
         return None
 
     def parts(wanted: Iterator[int]) -> Iterator[tuple[int, Array]]:
-        given: list[ReferencePart] = []
-
-        def ranges() -> Iterator[range]:
-            for seed in wanted:
-                given.append(ReferencePart(name, by, spp, seed))
-                yield range(len(given) - 1, len(given))
-
-        results: Any = executor.results(ranges(), given)
+        results: Any = executor.results([ReferencePart(name, by, spp, seed)] for seed in wanted)
         with closing(results):
             for done in results:
                 if done.lost:
                     raise ClusterError(f"{name}, a part of its reference: {done.lost}; leave `workers` out")
-                yield given[done.numbers.start].seed, done.value[0]
+                yield done.items[0].seed, done.value[0]
 
     return parts

@@ -14,8 +14,8 @@ from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
 from advsearch.engine.loading import Controls
-from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import check_all
+from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
@@ -181,7 +181,7 @@ class _Pictures:
     rendered: int = 0
     interrupted: bool = False
     warnings: list[str] = field(default_factory=list)
-    batches: dict[Path, Batches | None] = field(default_factory=dict)
+    scenes: dict[Path, Scenes | None] = field(default_factory=dict)
 
     def of(self, first: Side, second: Side, most: int, pair: int) -> Iterator[PairPicture]:
         """Yield what one side alone gets right, with pictures as far as they are to be had.
@@ -222,24 +222,24 @@ class _Pictures:
         if missing:
             self.progress.stage("rendering pictures again", len(missing), hint="`pictures` says how many")
         for side, number, file in sorted(missing, key=lambda one: (str(one[0].folder), one[1])):
-            batches = self._batches(side)
-            if batches is not None:
-                picture = batches.pictures(range(number, number + 1))[0]
-                write_bytes(file, thumbnails.thumbnail(picture), durable=False)
+            scenes = self._scenes(side)
+            if scenes is not None:
+                write_bytes(file, thumbnails.thumbnail(scenes.picture(number)), durable=False)
                 self.rendered += 1
             self.progress.advance(1)
         self.interrupted = False
 
-    def _batches(self, side: Side) -> Batches | None:
+    def _scenes(self, side: Side) -> Scenes | None:
         """What renders pictures of a sweep as it did; None where scene or model are not to be had any more."""
-        if side.folder not in self.batches:
-            self.batches[side.folder] = None
+        if side.folder not in self.scenes:
+            self.scenes[side.folder] = None
             try:
                 job = job_of(side.config)
-                self.batches[side.folder] = Batches(job, check_all(job)[0].count)
+                check_all(job)
+                self.scenes[side.folder] = Scenes(job)
             except (InputError, ModelError) as error:
                 self.warnings.append(f"Pictures of {side.folder.name} are not shown: {error}")
-        return self.batches[side.folder]
+        return self.scenes[side.folder]
 
     def _file(self, name: str) -> Path:
         return self.folder / name

@@ -294,7 +294,8 @@ def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
         generator = torch.Generator().manual_seed(seeds.stream(problem.seed, f"{kind} draw", number))
         (u,) = problem.domain.sample(generator)
         seed = seeds.stream(problem.seed, kind, number)
-        yield Query(u, seed, kind, number, spp=spp, described=problem.domain.dim <= MOST_KEPT, sought=False)
+        values = problem.describe(u, seed) if problem.domain.dim <= MOST_KEPT else {}
+        yield Query(u, seed, kind, number, spp=spp, values=values, sought=False)
 
 
 def decided(sequence: ConfidenceSequence, least: float) -> str:
