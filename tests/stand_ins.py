@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from advsearch.api import attack as attacking
-from advsearch.api.attack import answering_of, search_size
+from advsearch.api.attack import attack_answers, search_size
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
 from advsearch.cluster.executor import Done, InProcess, Work, Workforce
@@ -193,7 +193,7 @@ class StandInWorkers:
 
 
 def shared(
-    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], call: Callable[[Any], Any] = answering_of, **more: Any
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], call: Callable[[Any], Any] = attack_answers, **more: Any
 ) -> StandInWorkers:
     """Let stand-ins carry out a call wherever it is asked for of these settings; all else is done in this process."""
     ready = StandInWorkers(InProcess(call(settings)), **more)

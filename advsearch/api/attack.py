@@ -55,7 +55,7 @@ from advsearch.engine.naming import (
     scene_settings,
     several,
 )
-from advsearch.engine.objective import Wanted, objective_for, task_for
+from advsearch.engine.objective import AnyObjective, objective_for, task_for
 from advsearch.engine.outcome import summarise
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
@@ -415,7 +415,7 @@ def _controls(
     return run_settings.given_to(config, searched), run_settings.given_to(without_budget, drawn)
 
 
-def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tuple[Task, Wanted]:
+def _asked(config: AttackConfig, task: AnyTask, objective: AnyObjective | None) -> tuple[Task, AnyObjective]:
     """The task, and the objective that was asked for or else the task's own, checked before anything is loaded."""
     made = make_task(task)
     wanted = made.objective if objective is None else objective
@@ -543,7 +543,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
             functions = {f"metric {name}": one for name, one in job.metrics.items()}
             objective = {"objective": job.objective} if callable(job.objective) else {}
             check_made_of(kept, [job.loaded[0]], {**functions, **objective, "task": function_of(job.task)})
-        with executor_for(job.config, "advsearch.api.attack:answering_of", progress) as executor:
+        with executor_for(job.config, "advsearch.api.attack:attack_answers", progress) as executor:
             journal = Journal(kept, Shared(problem, executor))
             if problem.conditions is not None and None in (job.config.steps, job.config.draws):
                 progress.message(
@@ -557,7 +557,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
         return replace(found, parts=lambda: parts)
 
 
-def answering_of(settings: JsonObject) -> Call:
+def attack_answers(settings: JsonObject) -> Call:
     """Return what answers the queries of the attack that the settings describe: what a worker does."""
     problem = _problem(_job(AttackConfig(**settings)))
     return answering(lambda name: problem)

@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
-ANSWERING = "advsearch.api.sweep:answering_of"
+ANSWERING = "advsearch.api.sweep:sweep_answers"
 """What a worker does."""
 
 CLEAN = "clean"
@@ -361,6 +361,6 @@ def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | Non
 # ---- who does it ----------------------------------------------------------------------------------------------------
 
 
-def answering_of(settings: JsonObject) -> Call:
+def sweep_answers(settings: JsonObject) -> Call:
     """Return what answers the queries of the sweep that the settings describe: what a worker does."""
     return answering(Scenes(job_of(SweepConfig(**settings))).named)

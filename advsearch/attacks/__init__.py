@@ -5,7 +5,7 @@ from __future__ import annotations
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Block, Domain
 from advsearch.attacks.ending import Ending
-from advsearch.attacks.evaluation import Evaluate, Evaluation, Query, Wanted
+from advsearch.attacks.evaluation import Evaluate, Evaluation, Query, WhichGradient
 from advsearch.attacks.objectives import (
     OBJECTIVES,
     Objective,
@@ -76,7 +76,7 @@ __all__ = [
     "StepRecord",
     "Trials",
     "Verification",
-    "Wanted",
+    "WhichGradient",
     "choose_spp",
     "clopper_pearson",
     "count_right",

@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch.described import Value
 from advsearch.tasks import Judgement
 
-Wanted = bool | Literal["free"]
+WhichGradient = bool | Literal["free"]
 """Which derivative is wanted: none, all of it, or only what costs no extra render, with zeros elsewhere."""
 
 Phase = Literal["search", "ranking"]
@@ -57,7 +57,7 @@ class Query:
     kind: str = "search"
     number: int = 0
     phase: Phase | None = None
-    gradient: Wanted = False
+    gradient: WhichGradient = False
     samples: int = 1
     spp: int = 1
     drawn: bool = True

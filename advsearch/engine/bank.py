@@ -24,7 +24,7 @@ from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.domain import Domain, centre_of_option
 from advsearch.attacks.draws import Draws
-from advsearch.attacks.evaluation import Query, Wanted
+from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Conditions, Deviation, Predictor, Tick, deviation_of
 from advsearch.files import scaled
@@ -156,7 +156,7 @@ class Bank(Predictor):
         order = torch.randperm(len(rest), generator=generator).tolist()
         return new + [rest[number] for number in order[: count - len(new)]]
 
-    def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: Wanted) -> Evaluation:
+    def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
         found, total = [], None
         for begin in range(0, len(chosen), TOGETHER):
             some = chosen[begin : begin + TOGETHER]

@@ -19,7 +19,7 @@ from advsearch.scene.renderer import Renderer
 from advsearch.tasks import Task
 from advsearch.tasks.together import Together
 
-Wanted = str | Callable[..., Tensor]
+AnyObjective = str | Callable[..., Tensor]
 """An objective: its name, or the user's own function."""
 
 Way = Literal["mean", "worst"]
@@ -37,7 +37,7 @@ def task_for(task: Task, model: Model) -> Task:
 
 
 def objective_for(
-    wanted: Wanted,
+    wanted: AnyObjective,
     task: Task,
     model: Model,
     renderer: Renderer,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Domain, Evaluation, Objective
-from advsearch.attacks.evaluation import Query, Wanted
+from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.described import Value
@@ -328,7 +328,7 @@ class Problem:
         return evaluation, output
 
     def judged(
-        self, render: Callable[[Tensor], Tensor], wholes: Sequence[Tensor], u: Tensor, gradient: Wanted
+        self, render: Callable[[Tensor], Tensor], wholes: Sequence[Tensor], u: Tensor, gradient: WhichGradient
     ) -> tuple[list[tuple[Evaluation, Output]], Tensor | None]:
         """Ask the model about several pictures at once.
 

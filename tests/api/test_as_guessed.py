@@ -293,7 +293,7 @@ def _other() -> Callable[..., float]:
 
 
 def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
-    from advsearch.api.sweep import answering_of, job_of
+    from advsearch.api.sweep import job_of, sweep_answers
     from advsearch.config import SweepConfig
     from advsearch.engine.metrics import metrics_as_settings, only_here
 
@@ -302,7 +302,7 @@ def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Mod
     assert only_here(named) == ["own"]
     config = SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, metrics={"red": "math:hypot"}, **PICTURE)
     with pytest.raises(ValueError, match="only one element tensors"):  # a worker has math.hypot from its name
-        answering_of(config.plain())(job_of(config).queries(range(1)))
+        sweep_answers(config.plain())(job_of(config).queries(range(1)))
     refused: list[tuple[Any, str]] = [
         ({"f": 3}, "f: expected a function"),
         ({"f": lambda image, output: 0.0}, r"f: expected a function of \(image, output, truth\): too many"),

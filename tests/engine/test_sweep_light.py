@@ -124,6 +124,6 @@ def test_of_several_scenes_the_worst_is_told() -> None:
     def one(levels: float, seconds: float) -> LinearTransport:
         return LinearTransport(used=True, bytes=8, seconds=seconds, error=PredictionError(levels=levels, logits=0.0))
 
-    found = light.together([one(1.0, 2.0), None, one(3.0, 4.0)])
+    found = light.combined([one(1.0, 2.0), None, one(3.0, 4.0)])
     assert found is not None and found.error is not None and (found.error.levels, found.seconds) == (3.0, 6.0)
-    assert light.together([None]) is None
+    assert light.combined([None]) is None

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks.evaluation import WhichGradient
 from advsearch.attacks.policies.base import (
     NO_COUNTS,
     Counts,
@@ -68,7 +68,7 @@ class Plan:
     steps: int
     screen: int
     until: int
-    gradient: Wanted
+    gradient: WhichGradient
 
 
 @dataclass(frozen=True, eq=False)

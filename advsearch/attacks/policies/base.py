@@ -19,7 +19,7 @@ from torch import Tensor
 
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation, Wanted
+from advsearch.attacks.evaluation import Evaluation, WhichGradient
 from advsearch.attacks.failures import Failures
 from advsearch.seeds import stream
 
@@ -41,7 +41,7 @@ class Proposal:
     """
 
     u: Tensor
-    gradient: Wanted = False
+    gradient: WhichGradient = False
     step_size: float = math.nan
     samples: int = 1
 

@@ -29,7 +29,7 @@ PAYS = 2.0
 CHECKS = 3
 """Pictures of a scene that are traced to compare, spread over its groups; every group has one at least."""
 
-Score = Callable[[Tensor, Tensor], float]
+MarginOf = Callable[[Tensor, Tensor], float]
 """What a model says of a picture (H, W, 3) of a configuration, as a number of logits."""
 
 
@@ -85,7 +85,7 @@ class Groups:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class SweptPicture:
     """One picture.
 
     Attributes:
@@ -124,7 +124,7 @@ class SweptLight:
     axes: tuple[Axis, ...]
     spp: int
     seed: int
-    score: Score
+    score: MarginOf
     specialise: bool
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
@@ -165,7 +165,7 @@ class SweptLight:
         """How many values of basis pictures are not finite, and were set to 0."""
         return sum(one.non_finite for one in self._made.values() if one is not None)
 
-    def show(self, number: int, digits: tuple[int, ...], u: Tensor, noise: int, before: int) -> Shown:
+    def show(self, number: int, digits: tuple[int, ...], u: Tensor, noise: int, before: int) -> SweptPicture:
         """Return a picture, rendered or predicted.
 
         Args:
@@ -176,7 +176,7 @@ class SweptLight:
             before: pictures of the scenes before.
         """
         if self.reason is not None:
-            return Shown(self.renderer(u, seed=noise, spp=self.spp), predicted=False, traced=1)
+            return SweptPicture(self.renderer(u, seed=noise, spp=self.spp), predicted=False, traced=1)
         group = self._groups.group(digits)
         if group not in self._made:
             if len(self._made) >= self._groups.at_once:
@@ -186,8 +186,8 @@ class SweptLight:
         first = number - before == self._groups.member(digits, 0)
         traced = (self._lights + 2 * self._checks) * first
         if made is None:
-            return Shown(self.renderer(u, seed=noise, spp=self.spp), predicted=False, traced=traced + 1)
-        return Shown(made(u), predicted=True, traced=traced)
+            return SweptPicture(self.renderer(u, seed=noise, spp=self.spp), predicted=False, traced=traced + 1)
+        return SweptPicture(made(u), predicted=True, traced=traced)
 
     def _make(self, group: int, digits: tuple[int, ...], before: int) -> BasisRenderer | None:
         begun = time.perf_counter()
@@ -231,7 +231,7 @@ class SweptLight:
         )
 
 
-def together(found: Sequence[LinearTransport | None]) -> LinearTransport | None:
+def combined(found: Sequence[LinearTransport | None]) -> LinearTransport | None:
     """Return what a result holds of several scenes: the worst error, the largest memory, all seconds."""
     told = [one for one in found if one is not None]
     used = [one for one in told if one.used]

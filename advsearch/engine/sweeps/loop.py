@@ -27,7 +27,7 @@ from advsearch.engine.rows import LOST, judgement_of, lost_remarks
 from advsearch.engine.sharing import Sent, Shared, answering, lost
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.job import KIND, Job, check_all
-from advsearch.engine.sweeps.light import together
+from advsearch.engine.sweeps.light import combined
 from advsearch.engine.sweeps.points import Picks
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
 from advsearch.engine.sweeps.surface import map_surface
@@ -376,7 +376,7 @@ class Sweep:
                 "verification": checked.renders if checked else 0,
                 **({"products": self._predicted} if self._predicted else {}),
             },
-            transport=together([one for light in self._transport.values() for one in light]),
+            transport=combined([one for light in self._transport.values() for one in light]),
             surface=self._surface,
             shared=SharedWork.of_facts(self._executor.facts, self.journal.machines.known),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,

@@ -20,7 +20,7 @@ from advsearch.described import Value
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.metrics import judgements
 from advsearch.engine.sweeps.job import Job
-from advsearch.engine.sweeps.light import Shown, SweptLight
+from advsearch.engine.sweeps.light import SweptLight, SweptPicture
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
@@ -29,9 +29,6 @@ from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Judgement, Mark
 from advsearch.tasks.base import Truth
 from advsearch.viewer import thumbnails
-
-Size = tuple[int, int]
-"""(height, width) of pictures."""
 
 
 class SweptScene:
@@ -54,8 +51,8 @@ class SweptScene:
     def __init__(self, job: Job, number: int) -> None:
         place, config = job.places[number], job.config
         self.number, self.job = number, job
-        self.points: dict[Size, Points] = {}
-        self.renderers: dict[Size, Renderer] = {}
+        self.points: dict[tuple[int, int], Points] = {}
+        self.renderers: dict[tuple[int, int], Renderer] = {}
         self._spaces = job.spaces(place)
         for size, space in self._spaces.items():
             description = framed(place.scene.description, size)
@@ -120,12 +117,12 @@ class SweptScene:
         so_far = [one.summary() for one in self.light.values()]
         return [*answers[:-1], replace(answers[-1], light=so_far, non_finite=max(0, self.not_finite - before))]
 
-    def _made(self, size: Size, queries: Sequence[Query]) -> dict[int, Shown]:
+    def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
         """The pictures of one size, rounded to 8 bits, by their numbers."""
         job, points = self.job, self.points[size]
         models, before = len(job.models), self.number * points.count
         asked = {one.number // models: one for one in queries if job.sizes[one.number % models] == size}
-        found: dict[int, Shown] = {}
+        found: dict[int, SweptPicture] = {}
         for number, query in asked.items():
             digits = points.digits(number - before)
             with torch.no_grad():
@@ -168,7 +165,7 @@ class SweptScene:
         with torch.no_grad():
             return to_8_bit(self.renderers[self.job.sizes[model]](u, seed=seed, spp=spp))
 
-    def surfaces(self, picks: Picks, size: Size | None = None, fineness: int = 1) -> Iterator[Surfaces]:
+    def surfaces(self, picks: Picks, size: tuple[int, int] | None = None, fineness: int = 1) -> Iterator[Surfaces]:
         """What is seen in the pixels of pictures, one after the other.
 
         Args:

@@ -86,7 +86,7 @@ class Trial:
         sequence, right = ConfidenceSequence(self.confidence), 0
         wrong: list[tuple[float, Query, str]] = []
         self.progress.stage(asked.name, claim.pictures, hint="`pictures` of the claim shortens it", at_most=True)
-        with executor_for(shared, "advsearch.api.attack:answering_of", self.progress) as executor:
+        with executor_for(shared, "advsearch.api.attack:attack_answers", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor))
             queries = drawn(problem, f"claim {asked.name}", claim.pictures, spp_of(config))
             answer = UNDECIDED
