@@ -274,7 +274,7 @@ class Sweep:
 
     def rows(self) -> Iterable[Row]:
         """Return the rows of the sweep that are there."""
-        return [one for one in self.journal.rows if one.kind == KIND] if self.run is None else self.run.store.rows(KIND)
+        return self.journal.rows if self.run is None else self.run.store.rows(KIND)
 
     def _spend(self, rows: Sequence[Row]) -> None:
         """Count the pictures that rows took; old ones don't say it."""
