@@ -206,7 +206,7 @@ class Sweep:
         rows = self.journal.keep(list(zip(queries, answers, strict=True)), numbered=True)
         self._spend(rows)
         scene = queries[0].number // self.models // self.per_scene
-        self._rendered += sum(self.job.is_first_of_size(query.number % self.models) for query in queries)
+        self._rendered += sum(self.job.first_of_size[query.number % self.models] for query in queries)
         self._transport[worker, scene] = answers[-1].light or []
         if any(one.non_finite for one in answers) and not self._not_finite:
             self._not_finite = True
@@ -279,7 +279,7 @@ class Sweep:
     def _spend(self, rows: Sequence[Row]) -> None:
         """Count the pictures that rows took; old ones don't say it."""
         for row in rows:
-            first = self.job.is_first_of_size(row.step % self.models)
+            first = self.job.first_of_size[row.step % self.models]
             self._traced += int(first) if row.renders is None else row.renders
             self._predicted += row.seed is None and first
             self._lost += row.label == LOST
