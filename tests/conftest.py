@@ -9,6 +9,7 @@ names of those that are not quick in tests/medium.txt.
 from __future__ import annotations
 
 import gc
+import os
 import resource
 import zlib
 from collections import defaultdict
@@ -22,6 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
 """Meshes, environments and an ImageNet classifier that nobody on this project made; see README. May be absent."""
 MEDIUM = Path(__file__).with_name("medium.txt")
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    """Tests that run side by side render on one thread each: a second one polls for work, a third of the time in all."""
 QUICK, QUICKEST = 0.15, 5.0
 """CPU seconds of a quick test, at most; and of the quickest of a file, which is quick all the same."""
 
