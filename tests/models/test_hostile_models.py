@@ -459,7 +459,11 @@ def exported_program(module: nn.Module, path: Path) -> Path:
 
 @pytest.mark.parametrize(
     ("module", "save"),
-    [(NeverEnds(), scripted), (NeverEndsLoading(), scripted), (SumsForYears(), exported_program)],
+    [
+        (NeverEnds(), scripted),
+        (NeverEndsLoading(), scripted),
+        pytest.param(SumsForYears(), exported_program, marks=pytest.mark.slow),
+    ],
     ids=["loop", "loop while loading", "sum"],
 )
 def test_a_model_without_an_end_ends_with_one_sentence(
