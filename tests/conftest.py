@@ -123,3 +123,12 @@ def pytest_collection_finish() -> None:
     """Let the garbage collector, which every change of Mitsuba's scenes calls, pass over all that was imported."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, None, None]:
+    """The same after each file, of what its tests have imported."""
+    yield
+    if nextitem is not None and nextitem.path != item.path:
+        gc.collect()
+        gc.freeze()
