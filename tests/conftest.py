@@ -13,7 +13,7 @@ import os
 import resource
 import zlib
 from collections import defaultdict
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from datetime import date
 from pathlib import Path
 
@@ -24,8 +24,9 @@ DATA = ROOT.parent / "shared" / "data"
 """Meshes, environments and an ImageNet classifier that nobody on this project made; see README. May be absent."""
 MEDIUM = Path(__file__).with_name("medium.txt")
 if "PYTEST_XDIST_WORKER" in os.environ:
+    # Side by side, tests render on one thread each: a second one polls for work, which takes a third of all the time.
+    # `two_threads` is for what waits forever on one.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    """Tests that run side by side render on one thread each: a second one polls for work, a third of the time in all."""
 QUICK, QUICKEST = 0.15, 5.0
 """CPU seconds of a quick test, at most; and of the quickest of a file, which is quick all the same."""
 
@@ -36,6 +37,16 @@ def real_data() -> Path:
     if not (DATA / "models").is_dir():
         pytest.skip("the folder ../shared/data with real meshes, environments and a classifier is not here")
     return DATA
+
+
+@pytest.fixture(scope="module")
+def two_threads() -> Iterator[None]:
+    """For a file whose tests let Mitsuba load files by itself, which waits forever where Dr.Jit has one thread."""
+    from advsearch import threads
+
+    threads.configure(2)
+    yield
+    threads.configure()
 
 
 def medium() -> set[str]:

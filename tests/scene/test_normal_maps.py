@@ -29,6 +29,8 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import PointLamp
 
+pytestmark = pytest.mark.usefixtures("two_threads")
+
 SIDE = 128
 RADIUS = 0.3
 """Of the ball of which a cap stands out of the unit square; it is cut where it is 45 degrees steep."""
