@@ -44,8 +44,10 @@ def two_threads() -> Iterator[None]:
     """For a file whose tests let Mitsuba load files by itself, which waits forever where Dr.Jit has one thread."""
     from advsearch import threads
 
-    threads.configure(2)
-    yield
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(threads, "_USERS_COUNT", "2")
+        threads.configure()
+        yield
     threads.configure()
 
 
