@@ -9,10 +9,11 @@ names of those that are not quick in tests/medium.txt.
 from __future__ import annotations
 
 import gc
+import os
 import resource
 import zlib
 from collections import defaultdict
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from datetime import date
 from pathlib import Path
 
@@ -22,6 +23,10 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
 """Meshes, environments and an ImageNet classifier that nobody on this project made; see README. May be absent."""
 MEDIUM = Path(__file__).with_name("medium.txt")
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Side by side, tests render on one thread each: a second one polls for work, which takes a third of all the time.
+    # `two_threads` is for what waits forever on one.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 QUICK, QUICKEST = 0.15, 5.0
 """CPU seconds of a quick test, at most; and of the quickest of a file, which is quick all the same."""
 
@@ -32,6 +37,18 @@ def real_data() -> Path:
     if not (DATA / "models").is_dir():
         pytest.skip("the folder ../shared/data with real meshes, environments and a classifier is not here")
     return DATA
+
+
+@pytest.fixture(scope="module")
+def two_threads() -> Iterator[None]:
+    """For a file whose tests let Mitsuba load files by itself, which waits forever where Dr.Jit has one thread."""
+    from advsearch import threads
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(threads, "_USERS_COUNT", "2")
+        threads.configure()
+        yield
+    threads.configure()
 
 
 def medium() -> set[str]:
@@ -119,3 +136,12 @@ def pytest_collection_finish() -> None:
     """Let the garbage collector, which every change of Mitsuba's scenes calls, pass over all that was imported."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, None, None]:
+    """The same after each file, of what its tests have imported."""
+    yield
+    if nextitem is not None and nextitem.path != item.path:
+        gc.collect()
+        gc.freeze()

@@ -278,7 +278,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_page_about_losses_of_ones_own_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every block, after those before it, with smaller pictures and fewer steps than on the page."""
     page = DOCS / "own-loss.md"
-    small: dict[str, Any] = {"steps": 4, "trials": 6, "spp": 2, "verify_spp": 4, "denoise": "none", "measure": "no"}
+    small: dict[str, Any] = {"steps": 2, "trials": 6, "spp": 2, "verify_spp": 4, "denoise": "none", "measure": "no"}
     small |= {"baseline": False}
     names: dict[str, Any] = {}
     endings: list[str] = []

@@ -132,7 +132,7 @@ def check_outcome(summary: dict[str, Any], rows: list[Row]) -> None:
     assert summary["clean"]["correct"] and counts[0] == 6
     assert summary["ending"] == ("found" if counts[1] == 6 else "budget spent")
     assert sum(verified["labels"].values()) == counts[1]
-    scores = [row.objective for row in trials if row.objective is not None]
+    scores = [row.score for row in trials if row.score is not None]
     assert verified["margin"] == pytest.approx(sum(scores) / 6, abs=1e-3)
 
 

@@ -23,6 +23,8 @@ from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
+pytestmark = pytest.mark.usefixtures("two_threads")
+
 RED, GLOW, WIDE = "red.reflectance.value", "light.emitter.radiance.value", "camera.x_fov"
 SIZE = 16
 

@@ -92,7 +92,7 @@ def test_searches_side_by_side_have_the_rows_of_one_after_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Restarts along derivatives, by differences here, each evaluation after the one before in its restart."""
-    settings = {**SMALL, "policy": RESTARTS, "steps": 54, "average": 0, "baseline": False}
+    settings = {**SMALL, "policy": RESTARTS, "steps": 30, "average": 0, "baseline": False}
     attack_once(AttackConfig(**settings, run=str(tmp_path / "run")))
     ready, found = shared(monkeypatch, settings), rows(tmp_path / "run")
     attack_once(AttackConfig(**settings, workers=2, run=str(tmp_path / "workers")))

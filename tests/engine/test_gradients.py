@@ -268,7 +268,7 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
     )
     plain.scene._freeze = False
     generator = torch.Generator().manual_seed(0)
-    of_a_move: set[int] = set()
+    of_a_move: dict[int, Any] = {}  # by their ids, which others get when a recording is let go
     for number in range(6):
         u = torch.rand(2, generator=generator)
         if number == 3:
@@ -280,7 +280,8 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
         with torch.no_grad():
             for again in range(2):
                 assert torch.equal(recorded(u, again, 4), plain(u, again, 4)), (number, again)
-        of_a_move.add(id(recorded.scene._recorded["path", 4, recorded.scene.depth]))
+        recording = recorded.scene._recorded["path", 4, recorded.scene.depth]
+        of_a_move[id(recording)] = recording
         if number < 4:
             assert len(of_a_move) == 1 + (number == 3)  # an integrator that is new makes recordings stale
     assert len(second) == len(held)

@@ -20,6 +20,8 @@ from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.files.writing import write_scene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
+pytestmark = pytest.mark.usefixtures("two_threads")
+
 SIZE = 16
 SEEN = {"camera.azimuth": 90.0, "camera.elevation": 0.0, "ground.size": 0.0}
 

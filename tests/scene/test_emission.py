@@ -34,6 +34,8 @@ from advsearch.scene.parts import PointLamp
 from advsearch.scene.transport.lights import BasisRenderer
 from advsearch.scene.transport.renderer import LinearRenderer
 
+pytestmark = pytest.mark.usefixtures("two_threads")
+
 SIZE = 24
 SEEN = {"camera.azimuth": -90.0, "camera.elevation": 0.0, "camera.fov": 20.0, "ground.size": 0.0}
 UNIT = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])

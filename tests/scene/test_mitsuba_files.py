@@ -20,6 +20,8 @@ from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import PluginPart
 
+pytestmark = pytest.mark.usefixtures("two_threads")
+
 BOX = """<scene version="3.0.0">
   <default name="wide" value="40"/>
   <sensor type="perspective" id="front">

@@ -23,6 +23,8 @@ from advsearch.scene.mitsuba_backend.meshes import base_texture, repeating
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
+pytestmark = pytest.mark.usefixtures("two_threads")
+
 SIZE, PATCH, SAMPLES = 32, 8, 100
 CLOSE = 0.01
 """Mean absolute difference over patches, of displayed values."""

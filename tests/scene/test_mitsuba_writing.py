@@ -17,6 +17,8 @@ from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
+pytestmark = pytest.mark.usefixtures("two_threads")
+
 
 def test_a_dictionary_written_and_read_is_the_same(tmp_path: Path) -> None:
     mi = mitsuba()

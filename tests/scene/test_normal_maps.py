@@ -29,6 +29,8 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import PointLamp
 
+pytestmark = pytest.mark.usefixtures("two_threads")
+
 SIDE = 128
 RADIUS = 0.3
 """Of the ball of which a cap stands out of the unit square; it is cut where it is 45 degrees steep."""
@@ -135,7 +137,7 @@ def sides(scene: SceneDescription, x: float, z: float) -> tuple[float, float]:
     return right - left, top - bottom
 
 
-LAMPS = [(4.0, 0.0), (-4.0, 0.0), (0.0, 4.0), (0.0, -4.0)]
+LAMPS = [(4.0, 0.0), (0.0, -4.0)]
 
 
 @pytest.fixture(scope="module")
@@ -146,13 +148,13 @@ def wanted(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[float, float]
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_bump_is_lit_as_its_geometry_from_four_sides(
+def test_a_bump_is_lit_as_its_geometry_from_two_sides(
     way: str, wanted: list[tuple[float, float]], tmp_path: Path
 ) -> None:
     scene = describe(str(written(WAYS[way](), tmp_path)), "none", given=SEEN)
     assert scene.object.normal_map is not None
     found = [sides(scene, x, z) for x, z in LAMPS]
-    assert wanted[0][0] > 0.2 and wanted[1][0] < -0.2 and wanted[2][1] > 0.2 and wanted[3][1] < -0.2
+    assert wanted[0][0] > 0.2 and wanted[1][1] < -0.2
     np.testing.assert_allclose(found, wanted, atol=0.06)
 
 

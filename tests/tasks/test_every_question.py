@@ -193,7 +193,7 @@ def test_the_region_round_a_verdict(asked: list[str], capsys: pytest.CaptureFixt
     assert found["verdict"] in ("right", "wrong") and found["box"][0]["name"] == "pose.yaw"
 
 
-@ALSO_SLOWLY
+@pytest.mark.slow
 def test_the_smallest_change(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ["--epsilon", "0.3", "--smallest", "--steps", "8", "--trials", "6", "--run", str(tmp_path / "run")]
     found = answer(capsys, "attack", "--object", "mug", *asked, *SHORT, *flags)

@@ -81,12 +81,14 @@ def recorded(render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]
 
 
 def _settle(mi: ModuleType) -> None:
-    """Only warnings are logged, and Dr.Jit's pool gets the size that `advsearch.threads` chose."""
+    """Only warnings are logged, Dr.Jit's pool gets the size that `advsearch.threads` chose, and Python's garbage
+    collector, which every change of the scenes calls, passes over what has been imported by now: 0.2 s each time."""
     import drjit as dr
 
     mi.set_log_level(mi.LogLevel.Warn)
     dr.set_log_level(dr.LogLevel.Warn)
     threads.apply_to_drjit()
+    gc.freeze()
 
 
 class Population:
