@@ -42,9 +42,9 @@ def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[
     """Return the controls with what travels along the path of the configuration, and the grid with its frames last."""
     travelling = next((one for one in drawn if isinstance(one, PathControl)), None)
     if travelling is None:
-        (travelling,) = run_settings.given_to(config, {PathControl.kind: {}})
-        drawn = (*drawn, travelling)
-    assert isinstance(travelling, PathControl)
+        (added,) = run_settings.given_to(config, {PathControl.kind: {}})
+        assert isinstance(added, PathControl)
+        drawn, travelling = (*drawn, added), added
     name, seconds = f"{travelling.name}.time", travelling.seconds
     frames = f"0:{seconds:g}:{max(2, round(seconds * config.fps) + 1)}"
     return drawn, config.grid if name in config.grid else {**config.grid, name: frames}
