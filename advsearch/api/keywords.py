@@ -98,6 +98,7 @@ class SearchKeywords(DerivativeKeywords, total=False):
     step_size: float | None
     target: int | Names | None
     minimise: bool
+    path: str | None
     draws: int | None
     average: int
     baseline: bool
@@ -139,6 +140,8 @@ class SweepKeywords(SampledKeywords, total=False):
     log: Literal["mlflow", "tensorboard", "wandb"] | None
     trials: int
     verify_spp: int | None
+    path: str | None
+    fps: float | None
 
 
 class GapKeywords(SearchKeywords, NamedKeywords, total=False):

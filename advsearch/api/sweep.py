@@ -36,6 +36,7 @@ from advsearch.engine.naming import (
 from advsearch.engine.sharing import answering
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
+from advsearch.engine.sweeps.drives import with_frames
 from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
 from advsearch.engine.sweeps.swept_scene import Scenes
@@ -274,9 +275,11 @@ def job_of(config: SweepConfig) -> Job:
 def _job(
     config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:
-    run_settings.check(config)
-    drawn = run_settings.given_to(config, controls)
-    axes = read_axes(config.grid, drawn)
+    run_settings.check(config.model_copy(update={"path": None}))  # where no control travels, one is added
+    drawn, grid = run_settings.given_to(config, controls), config.grid
+    if config.path is not None:
+        drawn, grid = with_frames(config, drawn)
+    axes = read_axes(grid, drawn)
     if config.samples is not None and not drawn:
         raise InputError(
             "samples: expected `controls` beside it, which says what is drawn by chance; add `controls=pose`, say, or "

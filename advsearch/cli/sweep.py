@@ -52,7 +52,7 @@ class _Sweep(QuestionCommand):
 def answer(summary: SweepSummary) -> str:
     """Return accuracy in total and by axis, the worst configuration and the cost."""
     facts = [[name, text] for name, text in _facts(summary).items() if text]
-    parts = [_verdict(summary), *_tables(summary), "\n".join(_surface(summary)), aligned(facts)]
+    parts = [_verdict(summary), *_drives(summary), *_tables(summary), "\n".join(_surface(summary)), aligned(facts)]
     return "\n\n".join(part for part in parts if part) + as_notes(summary.warnings)
 
 
@@ -114,6 +114,13 @@ def _table(name: str, rows: Sequence[AxisRow]) -> str:
     return f"{title}\n{aligned(lines)}"
 
 
+def _drives(summary: SweepSummary) -> list[str]:
+    """What is said of whole drives, where frames of a path were swept."""
+    from advsearch.report.drives import HEADS, drive_rows, drive_title
+
+    return [f"{drive_title(one)}\n{aligned([HEADS, *drive_rows(one)])}" for one in summary.drives or ()]
+
+
 def _surface(summary: SweepSummary) -> list[str]:
     """Which parts of the surface go with wrong answers, where that was asked for."""
     if summary.surface is None:
@@ -140,6 +147,7 @@ def _facts(summary: SweepSummary) -> dict[str, str]:
         "renders": f"{summary.renders['sweep']}" + (f", {speed:.3g} a second" if speed else ""),
         "workers": wording.workers_text(summary.shared),
         "time": wording.seconds_text(summary.seconds["total"]),
+        "worst drive": f"{summary.run}/images/drive.webp" if summary.drives and summary.run else "",
         "map of the surface": f"{summary.run}/images/surface.png" if summary.surface else "",
         "kept in": summary.run or "",
     }

@@ -195,6 +195,14 @@ class AttackConfig(DerivativeConfig):
         flag="",
         min_length=None,
     )
+    path: str | None = setting(
+        None,
+        "search",
+        "the path along which the camera travels, with --over path; pictures of the answer along it are kept",
+        "approach, pass, orbit, or a .csv file",
+        otherwise="approach",
+        min_length=1,
+    )
     draws: int | None = setting(
         None,
         "search",

@@ -32,6 +32,7 @@ class SweepConfig(SceneConfig):
             lambda one: not one.controls,
             "is how `controls` are drawn, and none are; add `controls`, or leave `sampler` out",
         ),
+        Clash("fps", lambda one: one.path is None, "is of a drive; add `path`, or leave `fps` out"),
         Clash(
             "verify_spp", lambda one: one.trials == 0, "is of the trials, and `trials` is 0; leave one of the two out"
         ),
@@ -98,6 +99,16 @@ class SweepConfig(SceneConfig):
         unit="pictures",
         ge=1,
         le=1024,
+    )
+    path: str | None = setting_as_in(
+        AttackConfig,
+        "path",
+        group="sweep",
+        description="sweep the frames of a drive: the camera travels along this path",
+        otherwise="no path",
+    )
+    fps: float = setting(
+        2.0, "sweep", "frames of the drive that are looked at", unit="frames a second", gt=0.0, le=1000.0
     )
     keep_pictures: Literal["all", "wrong", "none"] = setting("none", "sweep", "keep small pictures of these answers")
     specialise: bool = setting_as_in(

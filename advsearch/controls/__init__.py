@@ -22,6 +22,7 @@ from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription
 OWN = {
     "pose": "PoseControl",
     "camera": "CameraControl",
+    "path": "PathControl",
     "texture": "TextureControl",
     "material": "MaterialControl",
     "light": "LightControl",

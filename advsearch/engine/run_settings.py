@@ -11,7 +11,7 @@ from advsearch.controls.values import is_number
 from advsearch.engine.loading import CONTROL, Controls, as_controls, controls_by_name, lent
 from advsearch.errors import InputError, UnknownNameError
 
-RUN_SETTINGS = ("epsilon", "norm", "texture_resolution")
+RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path")
 """What a configuration says for all of its controls; each control declares what it takes of it (`Choice.run_setting`).
 A configuration without such a setting counts as one that does not say it."""
 
@@ -123,6 +123,8 @@ def _not_taken(setting: str, name: str, kind: str) -> InputError:
             f"`epsilon` {name}: the control has ranges and no epsilon; give its ranges, as in "
             f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{_bounded(kind)}"
         )
+    if setting == "path":
+        return InputError(f"path: {name} does not travel; add `over=path` beside it, or `controls=path`")
     return InputError(f"{setting}: {name} has none, and no other control is there that has one; leave it out")
 
 

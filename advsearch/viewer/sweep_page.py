@@ -17,6 +17,7 @@ from pathlib import Path
 from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
+from advsearch.report.drives import HEADS, drive_rows, drive_title
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.notebook import axis_cells
 from advsearch.report.phrases import answer_text, beside_text, is_command, percent
@@ -98,6 +99,7 @@ def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: S
         element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
         *left_out,
         *(_still(path, summary) for path, summary in summaries),
+        *(_drives(path, summary) for path, summary in summaries),
         *(_surface(path, summary) for path, summary in summaries),
         *(join_html(_axes(summary), _cost(path, summary)) for path, summary in summaries),
     )
@@ -201,6 +203,19 @@ def _still(path: Path, summary: SweepSummary) -> Html:
         element("div", figure, class_="pictures", data_still="true") if figure else None,
         element("h2", "The worst configuration") if worst else None,
         element("div", worst, class_="pictures pair") if worst else None,
+    )
+
+
+def _drives(path: Path, summary: SweepSummary) -> Html:
+    """What is said of whole drives, where frames of a path were swept, with frames of the worst one."""
+    if not summary.drives:
+        return Html("")
+    said = f"Frames of the worst drive, {drive_title(summary.drives[0])}, from the first to the last"
+    figure = _figure(path / "images" / "drive.png", said, wide=True)
+    return join_html(
+        element("h2", "Whole drives"),
+        element("div", figure, class_="pictures") if figure else None,
+        *(join_html(element("p", drive_title(one)), study_table(HEADS, drive_rows(one))) for one in summary.drives),
     )
 
 

@@ -50,6 +50,11 @@ class Axis:
         return f"{self.instance}.{self.parameter.name}"
 
     @property
+    def is_time(self) -> bool:
+        """Whether its values are the frames of a drive."""
+        return (self.control, self.parameter.name) == ("path", "time")
+
+    @property
     def unit(self) -> str:
         """Unit of the values."""
         return "name" if self.parameter.options else self.parameter.unit

@@ -151,7 +151,7 @@ class Job:
                     said["environment"] = {"value": lit_by, "unit": ""}
                 said["model"] = {"value": self.models[model].name, "unit": ""}
                 said |= {name: value for name, value in values[k].items() if name.partition(".")[0] not in held}
-                seed, step = self.seeds(points.draw(number)), number * models + model
+                seed, step = self.seeds(points.noise(number)), number * models + model
                 query = Query(
                     u[k].clone(), seed, KIND, step, spp=self.spp, drawn=False, values=said, sought=False, keep=keep
                 )

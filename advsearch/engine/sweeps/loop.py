@@ -26,6 +26,7 @@ from advsearch.engine.record import Stages
 from advsearch.engine.rows import LOST, judgement_of, lost_remarks
 from advsearch.engine.sharing import Sent, Shared, answering, lost
 from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.engine.sweeps.drives import Drives, time_axis
 from advsearch.engine.sweeps.job import KIND, Job, check_all
 from advsearch.engine.sweeps.light import combined
 from advsearch.engine.sweeps.points import Picks
@@ -44,6 +45,7 @@ from advsearch.runs.results.attack import DescribedValue, LinearTransport, Share
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import (
     BesideAnswer,
+    DriveRates,
     SurfaceMap,
     SweepSummary,
     WorstClaim,
@@ -105,6 +107,7 @@ class Sweep:
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
         self._told, self._untold, self._begun = 0.0, 0, 0.0
         self._surface: SurfaceMap | None = None
+        self._drives: list[DriveRates] | None = None
         objects, environments = (
             list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
         )
@@ -150,6 +153,7 @@ class Sweep:
                     self.stages.begin("surface", "tracing the surface that was seen", self.total)
                     rows = self.run.store.rows(KIND)
                     self._surface = map_surface(self.job, rows, self._scenes.open, self.run, self.stages.progress)
+                self._drives = self._driven()
         except KeyboardInterrupt:
             ending = INTERRUPTED
             tally = self._counted()
@@ -337,6 +341,16 @@ class Sweep:
         number, model = divmod(index, self.models)
         return self.job.queries(range(number, number + 1))[model][2], model
 
+    def _driven(self) -> list[DriveRates] | None:
+        """What is said of whole drives, where frames of a path were swept; the worst of them is kept."""
+        if time_axis(self.job.axes) is None:
+            return None
+        self.stages.begin("drives", "rendering the frames of the worst drive")
+        drives = Drives(self.job, self.rows())
+        if self.run is not None:
+            drives.keep_worst(self._scenes, self.run)
+        return drives.rates()
+
     # ---- the answer -------------------------------------------------------------------------------------------------
 
     def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
@@ -378,6 +392,7 @@ class Sweep:
             },
             transport=combined([one for light in self._transport.values() for one in light]),
             surface=self._surface,
+            drives=self._drives,
             shared=SharedWork.of_facts(self._executor.facts, self.journal.machines.known),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},

@@ -141,6 +141,8 @@ class Points:
         self.samples, self.count = samples, self.grid.count * samples
         self.parts = parts_of_ranges(self.count * among)
         self._again = scenes * self.count
+        self._frames = next((place for place, axis in enumerate(axes) if axis.is_time), None)
+        self._drives = Product(tuple(len(axis.values) for axis in axes if not axis.is_time))
         self._space, self._domain, self._axes = space, domain, tuple(axes)
         self._start = domain.start.numpy().astype(np.float64)
         self._lower, self._upper = domain.lower.numpy(), domain.upper.numpy()
@@ -207,7 +209,7 @@ class Points:
     def picks(self, first: int, count: int, before: int = 0) -> Picks:
         """Return the pictures from number `first` of the scene on; `before` is how many the scenes before it have."""
         digits = [self.digits(number) for number in range(first, first + count)]
-        shares = self._draws.points(self.draw(before + first), count)
+        shares = self._drawn(self._draws, before + first, count)
         parts = np.minimum((shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1)
         return Picks(before + first, digits, shares, parts.tolist())
 
@@ -215,9 +217,28 @@ class Points:
         """Return the place on every axis of the grid of the picture with this number in the scene."""
         return self.grid.digits(number // self.samples)
 
-    def draw(self, number: int) -> int:
-        """Return the number of the draw, and of the noise, of the picture with this number in the whole sweep."""
+    def noise(self, number: int) -> int:
+        """Return the number of the noise of the picture with this number in the whole sweep."""
         return number % self._again if self._again else number
+
+    def draw(self, number: int) -> int:
+        """Return the number of the draw of the picture with this number in the whole sweep: one for all frames of a
+        drive."""
+        number = self.noise(number)
+        if self._frames is None:
+            return number
+        scene, local = divmod(number, self.count)
+        place, sample = divmod(local, self.samples)
+        digits = list(self.grid.digits(place))
+        del digits[self._frames]
+        return (scene * self._drives.count + self._drives.index(digits)) * self.samples + sample
+
+    def _drawn(self, draws: Draws, first: int, count: int) -> Doubles:
+        """The draws of neighbouring pictures of the whole sweep."""
+        if self._frames is None:
+            return draws.points(self.draw(first), count)
+        each = [draws.points(self.draw(number), 1) for number in range(first, first + count)]
+        return np.concatenate(each) if each else draws.points(0, 0)
 
     def configurations(self, picks: Picks) -> Tensor:
         """Return u of the pictures, (n, d) float32."""
@@ -227,7 +248,7 @@ class Points:
         for block, part, columns in self._small:
             u[:, part] = self._placed(block, part, picks.shares[:, columns])
         if self._large:
-            noise = self._noise.points(self.draw(picks.number), len(picks.digits))
+            noise = self._drawn(self._noise, picks.number, len(picks.digits))
             for block, part, columns in self._large:
                 u[:, part] = self._placed(block, part, noise[:, columns])
         return torch.from_numpy(np.clip(u.astype(np.float32), self._lower, self._upper))

@@ -137,6 +137,31 @@ class BesideAnswer(Fields):
     pairs: list[PairedRates] = Field(description="for each model")
 
 
+class OverDrives(Fields):
+    """A number of each drive."""
+
+    mean: float = Field(description="over drives")
+    interval: Interval | None = Field(description="of the mean, over drives; null of fewer than 5")
+    worst: float = Field(description="of the worst drive")
+
+
+class DriveRates(Fields):
+    """What a model says along whole drives; intervals are over drives, not over frames."""
+
+    model: str
+    answer: str | None = Field(description="the answer of a run that is in the scene; null without")
+    drives: int = Field(description="how many there are with all their frames")
+    frames: int = Field(description="of each drive")
+    seconds: float = Field(description="from the first frame to the last")
+    right: OverDrives = Field(description="share of frames in which the model is right")
+    longest_gap: OverDrives = Field(description="seconds of the longest run of frames in which it is not")
+    first_seen: OverDrives | None = Field(
+        description="distance at the first frame in which it is right, in object sizes, of drives that have one"
+    )
+    never_seen: int = Field(description="drives without a frame in which it is right")
+    flicker: OverDrives = Field(description="changes between right and wrong a second")
+
+
 class SweepSummary(CountedAnswers, RunResult):
     """How often the model is right over configurations that were not searched for."""
 
@@ -158,6 +183,9 @@ class SweepSummary(CountedAnswers, RunResult):
         description="the clean scene beside [an answer](#an-answer-beside-the-clean-scene); absent without",
     )
     worst: WorstConfiguration | None
+    drives: list[DriveRates] | None = Field(
+        default=None, description="of [whole drives](drives.md); absent where no frames of a path are swept"
+    )
     grid: dict[str, int] = Field(description="how many values each axis of the grid has")
     gains: dict[str, float] | None = Field(
         default=None, description="the gain of each scene, by object and environment; absent of one scene"

@@ -1,0 +1,177 @@
+"""Drives: what a sweep over the frames of a path says of whole drives, and the pictures of the worst of them.
+
+A drive is everything that varies but the time: one point of the rest of the grid, one draw. Frames of a drive are not
+independent, so intervals are over drives (a bootstrap of their mean, Efron and Tibshirani 1993, section 13.3).
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from advsearch import seeds
+from advsearch.config import SweepConfig
+from advsearch.controls import Control
+from advsearch.controls.path import PathControl
+from advsearch.engine import run_settings
+from advsearch.engine.sweeps.axes import Axis
+from advsearch.engine.sweeps.job import Job
+from advsearch.engine.sweeps.swept_scene import Scenes
+from advsearch.report.marks import marked
+from advsearch.runs.directory import IMAGES, RunDirectory
+from advsearch.runs.files import write_bytes
+from advsearch.runs.results.sweep import DriveRates, OverDrives
+from advsearch.runs.store import Row
+
+FEWEST, RESAMPLES, CONFIDENCE = 5, 2000, 0.95
+"""Drives that an interval needs, and samples of the bootstrap."""
+
+STRIP, ANIMATED, SIDE = 8, 60, 160
+"""Frames of the strip, and of the animation at most; side in pixels of a picture of the strip."""
+
+UNKNOWN = -1
+
+Flags = npt.NDArray[np.int8]
+
+
+def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[Control, ...], dict[str, object]]:
+    """Return the controls with what travels along the path of the configuration, and the grid with its frames last."""
+    travelling = next((one for one in drawn if isinstance(one, PathControl)), None)
+    if travelling is None:
+        (added,) = run_settings.given_to(config, {PathControl.kind: {}})
+        assert isinstance(added, PathControl)
+        drawn, travelling = (*drawn, added), added
+    name, seconds = f"{travelling.name}.time", travelling.seconds
+    frames = f"0:{seconds:g}:{max(2, round(seconds * config.fps) + 1)}"
+    return drawn, config.grid if name in config.grid else {**config.grid, name: frames}
+
+
+def time_axis(axes: Sequence[Axis]) -> int | None:
+    """Return the number of the axis whose values are frames; None where there is none, or one frame."""
+    return next((place for place, axis in enumerate(axes) if axis.is_time and len(axis.values) > 1), None)
+
+
+class Drives:
+    """The frames of every drive of a sweep.
+
+    Args:
+        job: what was swept.
+        rows: all that are stored.
+    """
+
+    def __init__(self, job: Job, rows: Iterable[Row]) -> None:
+        place = time_axis(job.axes)
+        assert place is not None
+        self._job, axis = job, job.axes[place]
+        sizes = [len(one.values) for one in job.axes]
+        shape = (len(job.places), *sizes, job.samples, len(job.models))
+        right: Flags = np.full(shape, UNKNOWN, np.int8)
+        away = np.full((len(job.places), sizes[place]), np.nan)
+        before = int(np.prod(sizes[place + 1 :], dtype=np.int64)) * job.samples * len(job.models)
+        name = f"{axis.instance}.distance"
+        for row in rows:
+            right.flat[row.step] = bool(row.correct)
+            if name in row.values:
+                away[row.step // len(job.models) // job.per_scene, row.step // before % sizes[place]] = float(
+                    str(row.values[name]["value"])
+                )
+        order = np.argsort([float(value) for value in axis.values])
+        self.times = np.array([float(value) for value in axis.values])[order]
+        self._numbers = np.moveaxis(np.arange(right.size).reshape(shape), place + 1, -1)[..., order]
+        self._right = np.moveaxis(right, place + 1, -1)[..., order]
+        self._away = away[:, order]
+
+    def rates(self) -> list[DriveRates]:
+        """Return what is said of the drives of each model, without and with an answer."""
+        found, places = list[DriveRates](), self._job.places
+        for answer in dict.fromkeys(one.answer for one in places):
+            mine = [number for number, one in enumerate(places) if one.answer == answer]
+            for model, network in enumerate(self._job.models):
+                right = self._right[mine][..., model, :].reshape(len(mine), -1, len(self.times))
+                whole = (right != UNKNOWN).all(axis=2)
+                away = np.repeat(self._away[mine][:, None], right.shape[1], axis=1)[whole]
+                if whole.any():
+                    found.append(self._rates(network.name, answer, right[whole] == 1, away))
+        return found
+
+    def _rates(
+        self, model: str, answer: str, right: npt.NDArray[np.bool_], away: npt.NDArray[np.float64]
+    ) -> DriveRates:
+        """What is said of drives: (n, frames) whether the model is right, and how far away it is."""
+        seconds = float(self.times[-1] - self.times[0])
+        step = seconds / (len(self.times) - 1)
+        seen = right.any(axis=1)
+        first = away[np.arange(len(right)), right.argmax(axis=1)][seen]
+        changes = (right[:, 1:] != right[:, :-1]).sum(axis=1) / seconds
+        return DriveRates(
+            model=model,
+            answer=answer or None,
+            drives=len(right),
+            frames=right.shape[1],
+            seconds=seconds,
+            right=over_drives(right.mean(axis=1), worst=min),
+            longest_gap=over_drives(np.array([longest(~one) for one in right]) * step, worst=max),
+            first_seen=over_drives(first, worst=min) if len(first) and np.isfinite(first).all() else None,
+            never_seen=int((~seen).sum()),
+            flicker=over_drives(changes, worst=max),
+        )
+
+    def keep_worst(self, scenes: Scenes, run: RunDirectory) -> None:
+        """Write a strip and an animation of the drive in which the first model is right least often, with its marks."""
+        right = self._right[..., 0, :].reshape(-1, len(self.times))
+        numbers = self._numbers[..., 0, :].reshape(-1, len(self.times)) // len(self._job.models)
+        whole = (right != UNKNOWN).all(axis=1)
+        if not whole.any():
+            return
+        worst = numbers[whole][(right[whole] == 1).mean(axis=1).argmin()]
+        frames = worst[np.unique(np.linspace(0, len(worst) - 1, min(len(worst), ANIMATED)).round().astype(int))]
+        pictures = [picture_of(scenes, int(number)) for number in frames]
+        write_drive(run, "drive", pictures, float(self.times[-1] - self.times[0]))
+
+
+def picture_of(scenes: Scenes, number: int) -> npt.NDArray[np.float32]:
+    """Return the picture (h, w, 3) with a number, with the marks of the first model's answer."""
+    sent = scenes.job.queries(range(number, number + 1))
+    view, query = scenes.named(sent[0][0]), sent[0][2]
+    picture = view.pictures([query])[0]
+    return np.asarray(marked(picture.numpy(), view.marks(0, query.u, picture)), dtype=np.float32)
+
+
+def write_drive(run: RunDirectory, name: str, pictures: Sequence[npt.NDArray[np.float32]], seconds: float) -> None:
+    """Write frames as an animation, NAME.webp, and some of them side by side, NAME.png, in the run's pictures."""
+    frames = [Image.fromarray((one * 255.0).round().clip(0, 255).astype(np.uint8)) for one in pictures]
+    file = io.BytesIO()
+    pause = max(40, round(1000.0 * seconds / len(frames)))
+    frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=pause, loop=0, quality=80)
+    write_bytes(run.path / IMAGES / f"{name}.webp", file.getvalue())
+    some = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), STRIP)).round().astype(int))
+    small = [frames[number].resize(_size(frames[number]), Image.Resampling.LANCZOS) for number in some]
+    strip = np.concatenate([np.asarray(one, dtype=np.float32) / 255.0 for one in small], axis=1)
+    run.save_image(name, strip)
+
+
+def _size(frame: Image.Image) -> tuple[int, int]:
+    return max(1, round(frame.width * SIDE / frame.height)), SIDE
+
+
+def longest(flags: npt.NDArray[np.bool_]) -> int:
+    """Return the length of the longest run of true values."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return int((ends[1::2] - ends[::2]).max(initial=0))
+
+
+def over_drives(values: npt.NDArray[np.float64], worst: Callable[..., object]) -> OverDrives:
+    """Return the mean of a number over drives, its 95 % interval by a bootstrap, and that of the worst drive."""
+    interval = None
+    if len(values) >= FEWEST:
+        rng = np.random.default_rng(seeds.stream(0, "bootstrap of drives"))
+        means = values[rng.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
+        tail = (1.0 - CONFIDENCE) / 2.0
+        low, high = np.quantile(means, [tail, 1.0 - tail])
+        interval = (float(low), float(high))
+    extreme = values.min() if worst is min else values.max()
+    return OverDrives(mean=float(values.mean()), interval=interval, worst=float(extreme))
