@@ -54,7 +54,8 @@ def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candi
     """
     for old in pool:
         if torch.equal(old.u, new.u):
-            return tuple(_looked(old, new) if c is old else c for c in pool)
+            looked = replace(old, again=(*old.again, new.objective), successes=old.successes + new.success)
+            return tuple(looked if c is old else c for c in pool)
     if len(pool) >= size and _raw(new) <= _raw(pool[-1]):
         return pool
     for old in pool:
@@ -97,10 +98,6 @@ def _worse(one: Candidate, leader: Candidate, shared: int) -> bool:
     mean = math.fsum(behind) / shared
     variance = math.fsum((each - mean) ** 2 for each in behind) / (shared - 1)
     return one.rate <= leader.rate and mean > math.sqrt(variance / shared)
-
-
-def _looked(old: Candidate, new: Candidate) -> Candidate:
-    return replace(old, again=(*old.again, new.objective), successes=old.successes + new.success)
 
 
 def best(pool: tuple[Candidate, ...]) -> Candidate:

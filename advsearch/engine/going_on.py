@@ -42,7 +42,8 @@ def check_made_of(
     Raises:
         InputError: weights, or the code of a function, are other ones now.
     """
-    networks = [one for model in models for one in _networks(model)]
+    several = [one.module.models if isinstance(one.module, Ensemble) else (one,) for one in models]
+    networks = [one for some in several for one in some]
     now: dict[str, Any] = {f"model {one.name}": {"weights": weights_digest(one)} for one in networks}
     now |= {name: _function(one) for name, one in (functions or {}).items() if one is not None}
     before = run.store.noted(NOTE)
@@ -89,10 +90,6 @@ def same(before: Sequence[float | None], now: Sequence[float | None]) -> bool:
 def finite(value: float | None) -> float | None:
     """Return a number, None where it is none."""
     return value if value is not None and math.isfinite(value) else None
-
-
-def _networks(model: Model) -> Sequence[Model]:
-    return model.module.models if isinstance(model.module, Ensemble) else (model,)
 
 
 def _function(function: Callable[..., Any]) -> dict[str, str | None]:

@@ -151,7 +151,11 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
         return
     with torch.no_grad():
         after, before = (assembly(problem.space.inputs(problem.whole(at))) for at in (u, problem.domain.start))
-    parts = [part for name, part in scene.meshes.items() if name == OBJECT or any(_of(key) == name for key in after)]
+    parts = [
+        part
+        for name, part in scene.meshes.items()
+        if name == OBJECT or any(key.partition(".")[0] == name for key in after)
+    ]
     fewer = {part.name: simpler(part.mesh, MOST_FACES // len(parts)) for part in parts}
 
     def shown(inputs: Mapping[str, Tensor]) -> list[PosedMesh]:
@@ -166,7 +170,3 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     cut = [f"{len(part.mesh.faces):,} of {part.name}" for part in parts if fewer[part.name]]
     note = f"It is shown with fewer faces than it has ({', '.join(cut)})." if cut else ""
     write_bytes(run.path / OBJECT_FILE, web_glb(shown(after), shown(before), pose, note))
-
-
-def _of(key: str) -> str:
-    return key.partition(".")[0]

@@ -65,7 +65,8 @@ def printable(run: str | Path, size: float) -> list[Piece]:
         if control.kind == "patch":
             pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
             given = config.controls.get(control.name, {}).get("size")
-            pieces.append(_patch(control.name, pixels, size * _side(control, summary, given)))
+            side = size * _side(control, summary, given)
+            pieces.append(_piece(f"{control.name}, {side:.1f} mm a side", pixels, (side / len(pixels),) * 2, None))
         elif isinstance(control, TextureControl) and picture.is_file():
             mesh, named = control.mesh_in(scene.description).mesh, control.materials_in(scene.description)
             faces = None if named is None else np.concatenate([mesh.materials[one] for one in named])
@@ -83,11 +84,6 @@ def _side(control: Control, summary: AttackSummary, given: object) -> float:
         return float(found.value)
     default = next(parameter.default for parameter in control.parameters if parameter.name == "size")
     return float(given if isinstance(given, (int, float)) else default)
-
-
-def _patch(name: str, pixels: Floats, side: float) -> Piece:
-    pixel = side / len(pixels)
-    return _piece(f"{name}, {side:.1f} mm a side", pixels, (pixel, pixel), None)
 
 
 def _charts(name: str, texture: Floats, mesh: Mesh, faces: Ints | None, scale: float) -> Iterator[Piece]:

@@ -91,7 +91,8 @@ class Searches:
         self.begin("search", f"searching with {self.policy.name}", steps, "`steps` or `seconds` shorten it")
         seed, frames = self.problem.seed, findings.frames
         findings.search = self.search("search", self.policy, steps, seed, frames, config.seconds)
-        steps = steps if config.seconds is None else _spent(findings.search)
+        if config.seconds is not None:  # renders of the search itself, without those of the ranking
+            steps = max(1, findings.search.history[-1].renders) if findings.search.history else 1
         if config.printable:
             title = "searching without print terms, to see what they cost"
             self.begin("without print terms", title, steps, "`printable=false` leaves both out")
@@ -171,8 +172,3 @@ class Searches:
         if self.findings.transport is not None:
             hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
         self.stages.begin(name, title, renders, hint=hint, at_most=True)
-
-
-def _spent(found: SearchResult) -> int:
-    """Renders of the search itself, without those of the ranking."""
-    return max(1, found.history[-1].renders) if found.history else 1

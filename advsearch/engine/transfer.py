@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from advsearch.attacks import Verification
 from advsearch.cluster.executor import Executor
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, Retrials
@@ -58,7 +57,10 @@ class Transfer:
         """
         self._begin(f"trying the answer to {attacked} on every model")
         checked = {one.name: self._retrials.answer(attacked, u, one) for one in self._conditions}
-        return [_cell(name, one) for name, one in checked.items()]
+        return [
+            MatrixCell(model=name, ending=one.ending.value, verified=verified_rate(one))
+            for name, one in checked.items()
+        ]
 
     def _begin(self, title: str) -> None:
         self._progress.stage(title, self._each, hint=f"{self._each} answers; `trials` or `verify_spp` shorten it")
@@ -72,11 +74,6 @@ class Transfer:
             spp=one.spp,
             clean=control_group(self._retrials.clean(one), one.spp),
         )
-
-
-def _cell(name: str, checked: Verification) -> MatrixCell:
-    verified = verified_rate(checked)
-    return MatrixCell(model=name, ending=checked.ending.value, verified=verified)
 
 
 def _size(problem: Problem) -> tuple[int, int]:

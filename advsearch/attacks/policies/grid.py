@@ -92,8 +92,9 @@ def _counts(domain: Domain, steps: int, points: int) -> list[int]:
     least = combinations * (points or 2) ** min(numbers, 64)
     if least > steps:
         more = f" and {combinations} combinations of options" if combinations > 1 else ""
+        many = str(least) if least < 10**9 else "billions of"
         raise InputError(
-            f"policy 'grid': {points or 2} values for each of {numbers} numbers{more} are {_many(least)} renders, and "
+            f"policy 'grid': {points or 2} values for each of {numbers} numbers{more} are {many} renders, and "
             f"there are {steps}; use policy sobol, cmaes, nes, pgd or auto, or give more `steps`"
         )
     each = points or max(2, int((steps // combinations) ** (1.0 / max(numbers, 1)) * (1 - 1e-9)))
@@ -108,10 +109,6 @@ def _counts(domain: Domain, steps: int, points: int) -> list[int]:
                 total, grew = total // counts[j] * (counts[j] + 1), True
                 counts[j] += 1
     return counts
-
-
-def _many(count: int) -> str:
-    return str(count) if count < 10**9 else "billions of"
 
 
 def _bounds(domain: Domain) -> tuple[Tensor, Tensor]:

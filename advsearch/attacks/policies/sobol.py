@@ -57,7 +57,7 @@ class Sobol(Policy[SobolState]):
     handles_choices: ClassVar[bool] = True
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> SobolState:
-        size = _width(domain)
+        size = domain.dim + sum(block.norm == "l2" for block in domain.blocks)
         if size > MOST:
             raise InputError(
                 f"policy 'sobol': expected at most {MOST} dimensions, got {size}; use policy random, nes, pgd or auto"
@@ -77,10 +77,6 @@ class Sobol(Policy[SobolState]):
 
     def update(self, state: SobolState, evaluated: Evaluated) -> SobolState:
         return state
-
-
-def _width(domain: Domain) -> int:
-    return domain.dim + sum(block.norm == "l2" for block in domain.blocks)
 
 
 def draw(size: int, seed: int, begin: int, count: int) -> Tensor:

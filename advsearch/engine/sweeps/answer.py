@@ -65,14 +65,11 @@ class SweepResult:
 
     def __repr__(self) -> str:
         right = f"{self.summary.correct} of {self.summary.configurations} right"
-        return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={self._place})"
+        place = None if self.run is None else str(self.run)
+        return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={place!r})"
 
     def _repr_html_(self) -> str:
         return sweep_html(self.summary)
 
     def _repr_png_(self) -> bytes | None:
         return sweep_figure(self.summary).get("png")
-
-    @property
-    def _place(self) -> str:
-        return "None" if self.run is None else repr(str(self.run))

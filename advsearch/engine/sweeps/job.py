@@ -97,7 +97,7 @@ class Job:
         """Draws at each point of the grid."""
         return self.config.samples or (SAMPLES if self.controls and not self.axes else 1)
 
-    @property
+    @cached_property
     def spp(self) -> int:
         """Samples a pixel, as the sampler has them."""
         return next_count(self.config.pixel_sampler, self.config.search_spp)
@@ -107,9 +107,10 @@ class Job:
         """(height, width) of the pictures for each model."""
         return tuple(self.config.resolution or model.input_size for model in self.models)
 
-    def is_first_of_size(self, model: int) -> bool:
-        """Whether no model before this one is shown the same pictures."""
-        return self.sizes[model] not in self.sizes[:model]
+    @cached_property
+    def first_of_size(self) -> tuple[bool, ...]:
+        """Of each model, whether no model before it is shown the same pictures."""
+        return tuple(size not in self.sizes[:model] for model, size in enumerate(self.sizes))
 
     # ---- what is asked ----------------------------------------------------------------------------------------------
 

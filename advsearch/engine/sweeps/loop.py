@@ -206,7 +206,7 @@ class Sweep:
         rows = self.journal.keep(list(zip(queries, answers, strict=True)), numbered=True)
         self._spend(rows)
         scene = queries[0].number // self.models // self.per_scene
-        self._rendered += sum(self.job.is_first_of_size(query.number % self.models) for query in queries)
+        self._rendered += sum(self.job.first_of_size[query.number % self.models] for query in queries)
         self._transport[worker, scene] = answers[-1].light or []
         if any(one.non_finite for one in answers) and not self._not_finite:
             self._not_finite = True
@@ -274,12 +274,12 @@ class Sweep:
 
     def rows(self) -> Iterable[Row]:
         """Return the rows of the sweep that are there."""
-        return [one for one in self.journal.rows if one.kind == KIND] if self.run is None else self.run.store.rows(KIND)
+        return self.journal.rows if self.run is None else self.run.store.rows(KIND)
 
     def _spend(self, rows: Sequence[Row]) -> None:
         """Count the pictures that rows took; old ones don't say it."""
         for row in rows:
-            first = self.job.is_first_of_size(row.step % self.models)
+            first = self.job.first_of_size[row.step % self.models]
             self._traced += int(first) if row.renders is None else row.renders
             self._predicted += row.seed is None and first
             self._lost += row.label == LOST

@@ -103,7 +103,7 @@ class SweptScene:
         seconds, answers = (time.perf_counter() - begun) / len(queries), list[Evaluation]()
         for query in queries:
             number, model = divmod(query.number, models)
-            one, first = made[job.sizes[model]][number], job.is_first_of_size(model)
+            one, first = made[job.sizes[model]][number], job.first_of_size[model]
             answer = Evaluation.of(
                 said[query.number], cost=one.traced * first, predicted=one.predicted, seconds=seconds
             )
