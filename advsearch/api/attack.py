@@ -390,7 +390,7 @@ def _job(config: AttackConfig) -> _Job:
         raise one_only("object", config.objects)
     searched, drawn = _controls(config, config.controls, config.over)
     task, objective = _asked(config, config.task, config.objective)
-    policy = make_policy(config.policy_name, **_policy_options(config))
+    policy = make_policy(config.policy_name, **config.policy_options)
     scene = lent(SCENE, config.object) or scene_of(config)
     model = _model(config.model, config, task)
     metrics = load_metrics(config.metrics)
@@ -401,7 +401,7 @@ def _given(config: AttackConfig, scene: Scene, model: Model) -> _Job:
     """Find what a configuration names besides its scene and its model."""
     searched, drawn = _controls(config, config.controls, config.over)
     task, objective = _asked(config, config.task, config.objective)
-    policy = make_policy(config.policy_name, **_policy_options(config))
+    policy = make_policy(config.policy_name, **config.policy_options)
     return _Job(config, scene, (model, []), task, searched, drawn, objective, policy, False)
 
 
@@ -427,10 +427,6 @@ def _model(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Tas
     """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
     models, warnings = load_models(several(model), task, config)
     return models[0] if len(models) == 1 else together(models, config.resolution), warnings
-
-
-def _policy_options(config: AttackConfig) -> JsonObject:
-    return config.policy_options | ({} if config.step_size is None else {"step_size": config.step_size})
 
 
 def check_from_config(config: AttackConfig) -> None:
@@ -587,7 +583,7 @@ def _policy(job: _Job, problem: Problem) -> Policy[Any]:
         return make_policy("nes")
     if not isinstance(job.policy, str):
         return with_derivatives(job.policy, job.config)
-    return with_derivatives(make_policy(job.policy, **_policy_options(job.config)), job.config)
+    return with_derivatives(make_policy(job.policy, **job.config.policy_options), job.config)
 
 
 def with_derivatives(policy: Policy[Any], config: AttackConfig) -> Policy[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,11 +22,10 @@ from advsearch.engine.gradients import (
     Reference,
     estimates,
     inside,
+    judge,
     probes,
     reference,
-    scale_of,
     smooth_loss,
-    verdict,
 )
 from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
@@ -344,9 +342,7 @@ def _rows(
 
                 key = _key(part, f"{estimator} x {factor:g}", wanted)
                 for probe, one in zip(wanted, results.value(key, list[Estimate], estimated), strict=True):
-                    against = references[probe.name]
-                    size = scale_of(against, list(references.values()))
-                    row = _row(part, spp, probe, one, against, size)
+                    row = _row(part, spp, probe, one, references[probe.name], list(references.values()))
                     good |= {probe.name} if row.status == "ok" else set()
                     yield row
                 progress.advance(1)
@@ -378,9 +374,9 @@ def attempts(group: Group) -> list[tuple[str, float]]:
 
 
 def _row(
-    part: CheckedPart, spp: int, probe: Probe, estimate: Estimate, against: Reference, size: float
+    part: CheckedPart, spp: int, probe: Probe, estimate: Estimate, against: Reference, beside: Sequence[Reference]
 ) -> DerivativeRow:
-    status, error = verdict(estimate, against, size)
+    judged = judge(estimate, against, beside)
     return DerivativeRow(
         **vars(_place(part)),
         control=probe.group.control,
@@ -393,10 +389,10 @@ def _row(
         reference_steps=against.steps,
         reference_factor=against.factor,
         reference_noise=against.noise,
-        relative_error=error,
-        noise=estimate.noise / size if size else math.inf,
+        relative_error=judged.error,
+        noise=judged.noise,
         seconds=estimate.seconds,
-        status=status,
+        status=judged.status,
     )
 
 

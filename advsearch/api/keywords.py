@@ -95,7 +95,6 @@ class SearchKeywords(DerivativeKeywords, total=False):
     measure: Literal["no", "quick", "full"]
     steps: int | None
     seconds: float | None
-    step_size: float | None
     target: int | Names | None
     minimise: bool
     path: str | None
@@ -180,7 +179,6 @@ class HardenKeywords(RunKeywords, total=False):
     objective: str | None
     policy: Named
     steps: int
-    step_size: float | None
     verify_spp: int | None
     trials: int | None
     layers: Literal["all", "last"]

@@ -141,14 +141,6 @@ class AttackConfig(DerivativeConfig):
         gt=0.0,
         le=1e9,
     )
-    step_size: float | None = setting(
-        None,
-        "search",
-        "size of the first step, as a share of epsilon",
-        otherwise="the policy's own",
-        gt=0.0,
-        le=2.0,
-    )
     target: str | None = setting(
         None,
         "search",

@@ -53,7 +53,8 @@ def gains() -> list[GainRow]:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few samples: what is measured says little, but it is measured by the same means."""
     for function in (cosines, cosine_samples):
-        monkeypatch.setattr(planning, function.__name__, partial(function, counts=(2,), factors=(1.0, 3.0)))
+        monkeypatch.setattr(planning, function.__name__, partial(function, counts=(2,)))
+    monkeypatch.setattr("advsearch.engine.planning.FACTORS", (1.0, 3.0))
     monkeypatch.setattr("advsearch.engine.planning.CONVERGED", 2)
     monkeypatch.setattr("advsearch.engine.planning.AGAIN", 2)
     monkeypatch.setattr(INTERRUPTS, "count", 0)

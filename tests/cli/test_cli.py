@@ -325,7 +325,7 @@ def test_attack_builds_its_configuration_from_flags(asked: list[AttackConfig]) -
     argv = (
         "attack --object mug.obj --up y --environment room.hdr --model net.pt2 --labels l.json --label cup --norm l2"
         " --control texture,pose --control light --set camera.azimuth=130 --set a.b=[0,1] --epsilon 0.1 --exposure -1"
-        " --texture-resolution 64 --policy random --steps 3 --step-size 0.5 --objective margin --spp 4 --verify-spp 32"
+        " --texture-resolution 64 --policy random --steps 3 --objective margin --spp 4 --verify-spp 32"
         " --trials 7 --denoise none --resolution 64x96 --no-baseline --seed 9 --threads 1 --run x --overwrite"
         " --deterministic --quiet"
     )
@@ -335,7 +335,7 @@ def test_attack_builds_its_configuration_from_flags(asked: list[AttackConfig]) -
             object="mug.obj", up="y", environment="room.hdr", model="net.pt2", labels="l.json", label="cup",
             controls={"texture": {}, "pose": {}, "light": {}, "patch": {"size": 0.3}},
             set_={"camera.azimuth": 130, "a.b": [0, 1]}, epsilon=0.1, norm="l2", texture_resolution=64, policy="random",
-            steps=3, step_size=0.5, objective="margin", spp=4, verify_spp=32, trials=7, denoise="none",
+            steps=3, objective="margin", spp=4, verify_spp=32, trials=7, denoise="none",
             resolution=(64, 96), exposure=-1, baseline=False, seed=9, threads=1, run="x", overwrite=True,
             deterministic=True,
         )

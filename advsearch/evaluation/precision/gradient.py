@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.gradients import Loss, Probe, estimated, reference
+from advsearch.engine.gradients import Estimate, Loss, Probe, estimated, judge, reference
 from advsearch.evaluation.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.evaluation.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
 from advsearch.evaluation.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
@@ -32,8 +32,6 @@ MATRIX = "matrix"
 MATRIX_COST = 2.0
 """Making a matrix takes about as long as so many renders of as many samples."""
 CHECK_SPP = 64
-AGREE = 0.05
-"""Relative bias of a reference by an adjoint, beyond the noise, from which it is called biased."""
 
 
 @dataclass(frozen=True)
@@ -185,8 +183,7 @@ class GradientBench:
         probe = self._along(value, seed)
         against = reference(self._exact, self._loss, self._u, probe, seed=seed, spp=CHECK_SPP, repeats=(2, 4))
         own = float(value @ torch.cat([probe.direction[group.coordinates] for group in self.part.groups]))
-        doubt = 2.5 * (against.noise + self.reference.error * abs(own))
-        if abs(own - against.value) <= AGREE * abs(against.value) + doubt:
+        if judge(Estimate(self.by, own, self.reference.error * abs(own), 1, 0.0), against).status != "biased":
             return None
         return (
             f"{self.part.name}: the reference is the mean of {self.by}, and along one direction it gives {own:.3g}, "

@@ -222,7 +222,7 @@ def gimbal() -> Outcome:
         other = locked(torch.tensor([0.5, 0.5, 0.3]), 0, 16)  # yaw 36 is roll -36 here
     free = small(dark(), {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}, settings=BARE)
     vector = compared(free, free.start + 0.1, seeds=(3, 5))
-    worst = max(one.excess for one in vector)
+    worst = max(one.excess for one in vector.values())
     return found.findings(
         Check("mean difference of yaw 36 and roll -36", float((one - other).abs().mean()), most=SAME_PICTURE),
         Check("gradient error of the rotation vector", worst, most=0.1),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,7 +15,7 @@ from torch import Tensor
 from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import domains
-from advsearch.engine.gradients import Loss, Probe, estimates, probes, reference, scale_of, smooth_loss, verdict
+from advsearch.engine.gradients import Judgement, Loss, Probe, estimates, judge, probes, reference, smooth_loss
 from advsearch.evaluation.stability.case import Check, Outcome, holds
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
@@ -39,8 +38,6 @@ ERROR = 0.1
 """Relative error that the mean of a gradient may have beyond what its noise explains."""
 DOUBT = 0.4
 """The noise of a comparison, as a share of the derivative, from which it decides nothing."""
-CONFIDENCE = 2.5
-"""Standard errors within which two means agree."""
 SHARPNESS = 20.0
 """Logits per unit of the linear loss that the searched model answers with."""
 
@@ -104,26 +101,6 @@ def thing(mesh: Mesh) -> ObjectAsset:
 
 
 @dataclass(frozen=True)
-class Compared:
-    """A gradient along a probe beside its reference.
-
-    Attributes:
-        name: of the probe.
-        error: distance of the means over the derivative's size (`scale_of`).
-        doubt: `CONFIDENCE` standard errors of that distance, over the same.
-    """
-
-    name: str
-    error: float
-    doubt: float
-
-    @property
-    def excess(self) -> float:
-        """What of the error its noise does not explain."""
-        return max(0.0, self.error - self.doubt)
-
-
-@dataclass(frozen=True)
 class Examined:
     """What a scene showed.
 
@@ -140,7 +117,7 @@ class Examined:
     finite: bool
     replaced: int
     inside: bool
-    compared: tuple[Compared, ...]
+    compared: Mapping[str, Judgement]
     gradient: float
     mean: float
     result: SearchResult
@@ -154,10 +131,10 @@ class Examined:
         ]
         error = None
         if self.compared:
-            worst = max(self.compared, key=lambda one: (one.excess, one.error))
-            unsure = max(self.compared, key=lambda one: one.doubt)
-            checks.append(Check(f"noise of the comparison, {unsure.name}", unsure.doubt, most=DOUBT))
-            checks.append(Check(f"gradient error beyond the noise, {worst.name}", worst.excess, most=ERROR))
+            name, worst = max(self.compared.items(), key=lambda item: (item[1].excess, item[1].error))
+            noisy, unsure = max(self.compared.items(), key=lambda item: item[1].doubt)
+            checks.append(Check(f"noise of the comparison, {noisy}", unsure.doubt, most=DOUBT))
+            checks.append(Check(f"gradient error beyond the noise, {name}", worst.excess, most=ERROR))
             error = worst.error
         measured = {"mean": self.mean, "largest gradient": self.gradient}
         return Outcome((*checks, *more), self.finite, error, self.result.ending.value, measured, rule)
@@ -195,7 +172,7 @@ def examine_gradient(
         picture = renderer(u, seed=0, spp=spp)
     _, gradient = renderer.gradient(loss, u, 0, spp)
     finite = bool(torch.isfinite(picture).all()) and bool(torch.isfinite(gradient).all())
-    beside = compared(renderer, u, spp=spp, seeds=seeds) if compare else ()
+    beside = compared(renderer, u, spp=spp, seeds=seeds) if compare else {}
     result = searched(renderer, u, evaluations, policy or PGD(), spp=spp)
     return Examined(
         finite=finite and renderer.non_finite == 0,
@@ -210,17 +187,21 @@ def examine_gradient(
 
 def compared(
     renderer: Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 12), repeats: int = 24
-) -> tuple[Compared, ...]:
-    """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw picture."""
+) -> dict[str, Judgement]:
+    """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw picture, along
+    each probe by its name."""
     before = renderer.formation
     renderer.formation = replace(before, transfer="linear")
     try:
         loss = smooth_loss(before.resolution)
-        return tuple(
-            one
-            for along in _together(renderer, loss, u, spp)
-            for one in _beside(renderer, loss, u, along, spp, seeds, repeats)
-        )
+        found: dict[str, Judgement] = {}
+        for along in _together(renderer, loss, u, spp):
+            high = spp if along[0].group.estimator == "image" else max(spp, REFERENCE_SPP)
+            against = [reference(renderer, loss, u, one, seed=1, spp=high, repeats=seeds) for one in along]
+            own = estimates(renderer, loss, u, along[0].group.estimator, along, seed=2, spp=spp, repeats=repeats)
+            for probe, one, estimate in zip(along, against, own, strict=True):
+                found[probe.name] = judge(estimate, one, against)
+        return found
     finally:
         renderer.formation = before
 
@@ -231,21 +212,6 @@ def _together(renderer: Renderer, loss: Loss, u: Tensor, spp: int) -> list[list[
     for probe in probes(renderer, loss, u, 0, spp):
         sets.setdefault((probe.group.control, probe.group.estimator), []).append(probe)
     return list(sets.values())
-
-
-def _beside(
-    renderer: Renderer, loss: Loss, u: Tensor, along: list[Probe], spp: int, seeds: tuple[int, int], repeats: int
-) -> list[Compared]:
-    high = spp if along[0].group.estimator == "image" else max(spp, REFERENCE_SPP)
-    against = [reference(renderer, loss, u, one, seed=1, spp=high, repeats=seeds) for one in along]
-    found = estimates(renderer, loss, u, along[0].group.estimator, along, seed=2, spp=spp, repeats=repeats)
-    rows = []
-    for probe, one, estimate in zip(along, against, found, strict=True):
-        size = scale_of(one, against)
-        doubt = CONFIDENCE * math.hypot(estimate.standard_error, one.noise)
-        _, error = verdict(estimate, one, size)
-        rows.append(Compared(probe.name, error, doubt / size if size else 0.0))
-    return rows
 
 
 def searched(renderer: Renderer, u: Tensor, evaluations: int, policy: Policy[Any], *, spp: int = SPP) -> SearchResult:

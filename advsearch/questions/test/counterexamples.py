@@ -48,7 +48,7 @@ TRIALS = {False: 6, True: 20}
 """Fresh renders that try one, and one that has to hold under many conditions."""
 
 OF_SEARCH = (
-    *(*OWN, "policy", "steps", "step_size", "objective", "metrics", "log", "average", "baseline", "trials"),
+    *(*OWN, "policy", "steps", "objective", "metrics", "log", "average", "baseline", "trials"),
     *("measure", "estimators", "specialise", "draws", "aov", "printable", "spp", "verify_spp"),
 )
 """Settings of a run that say nothing of what its answer is."""
