@@ -18,7 +18,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_object
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
-from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig, SweepConfig
+from advsearch.config import AttackConfig, SceneConfig, SweepConfig
 from advsearch.config.attack import OVER_NUMBERS, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
@@ -69,6 +69,7 @@ from advsearch.models import Model
 from advsearch.models.ensemble import together
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.precision.settings import PrecisionConfig
 from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.directory import only_here as only_python_has

@@ -20,7 +20,7 @@ REGISTRIES = {
     "tasks": "advsearch.tasks:TASKS",
     "objectives": "advsearch.attacks.objectives:objective_summaries",
     "models": "advsearch.cli.list:MODELS",
-    "recipes": "advsearch.recipes.description:titles",
+    "recipes": "advsearch.questions.recipe.description:titles",
 }
 """Where the names of each kind are: a mapping from them, or a function that returns them."""
 

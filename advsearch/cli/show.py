@@ -179,7 +179,7 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
 
 
 def _show_recipe(name: str, as_json: bool) -> int:
-    from advsearch.recipes.description import read_recipe, recipe_yaml
+    from advsearch.questions.recipe.description import read_recipe, recipe_yaml
 
     text = recipe_yaml(name)
     if as_json:

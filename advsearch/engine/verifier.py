@@ -14,10 +14,11 @@ from advsearch.attacks import Evaluation, SearchResult, Verification, choose_spp
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.product import batches
 from advsearch.attacks.sample_count import LADDER, margins_of, most_samples
-from advsearch.config import AttackConfig, RegionConfig, SweepConfig
+from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages
+from advsearch.questions.region.settings import RegionConfig
 from advsearch.report.wording import count as plural
 from advsearch.scene.formation import next_count
 from advsearch.tasks import Judgement

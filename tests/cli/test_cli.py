@@ -33,11 +33,12 @@ from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import aligned, finish
 from advsearch.cli.progress import watch_progress
-from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
+from advsearch.config import AttackConfig, GapConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
+from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.parameters import Parameter
@@ -771,7 +772,7 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> None:
     put("advsearch.controls", CONTROLS={"camera": Camera()})
     put("advsearch.attacks", POLICIES={"pgd": Pgd})
     put("advsearch.tasks", TASKS={"classification": Pgd})
-    put("advsearch.recipes.description", titles=lambda: {"backgrounds": "Which are hard?"})
+    put("advsearch.questions.recipe.description", titles=lambda: {"backgrounds": "Which are hard?"})
     put("advsearch.attacks.objectives", objective_summaries=lambda: {"margin": "Largest wrong logit."})
 
 

@@ -13,11 +13,11 @@ from stored_sweeps import serving
 
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
+from advsearch.questions.recipe.answer import RecipeResult
+from advsearch.questions.stability.answer import StabilityResult
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.gap import StudyResult
-from advsearch.runs.results.recipe import RecipeResult
-from advsearch.runs.results.stability import StabilityResult
 from advsearch.viewer.pages import write_page
 from advsearch.viewer.study_page import heading
 
