@@ -69,7 +69,6 @@ from advsearch.models import Model
 from advsearch.models.ensemble import together
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.precision.settings import PrecisionConfig
 from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.directory import only_here as only_python_has
@@ -565,7 +564,7 @@ def answering_of(settings: JsonObject) -> Call:
 
 
 def executor_for(
-    config: AttackConfig | PrecisionConfig | SweepConfig, function: str, progress: Progress, *, ahead: bool = True
+    config: AttackConfig | SweepConfig, function: str, progress: Progress, *, ahead: bool = True
 ) -> AbstractContextManager[Executor | None]:
     """Return what carries out a function of a configuration, as its workers and cluster say; None for this process.
 

@@ -24,6 +24,7 @@ from advsearch import __version__
 from advsearch.cli.screen import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS
+from advsearch.rooms import there
 
 GROUPS = {
     "ask: what does a model get wrong?": {
@@ -65,7 +66,7 @@ GROUPS = {
 }
 """Each command and its module, in the groups and the order in which the help shows them."""
 
-COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
+COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items() if there(module)}
 
 OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
@@ -197,9 +198,9 @@ def _listing() -> str:
     lines = []
     for title, commands in GROUPS.items():
         lines.append(title)
-        for name, path in commands.items():
+        for name in (one for one in commands if one in COMMANDS):
             begin = f"  {name}".ljust(column)
-            lines.append(textwrap.fill(begin + _module(path).HELP, width, subsequent_indent=" " * column))
+            lines.append(textwrap.fill(begin + _module(COMMANDS[name]).HELP, width, subsequent_indent=" " * column))
         lines.append("")
     return "\n".join(lines)
 

@@ -118,7 +118,7 @@ def output_kept_clean() -> Iterator[None]:
 
 def shown_text(result: Result) -> str:
     """Return what is shown of an answer as text: what it says, its parts, by what it came about, and notes."""
-    from advsearch.report.shown import facts_of, shown
+    from advsearch.report.shown import facts_of, remarks_of, shown
     from advsearch.runs.directory import REPORT
 
     given, run = shown(result), getattr(result, "run", None)
@@ -132,8 +132,7 @@ def shown_text(result: Result) -> str:
         parts.append("\n".join(filter(None, [one.title, "\n\n".join(filter(None, inside))])))
     facts = [[name.lower(), text] for name, text in facts_of(result, given).items()]
     parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))
-    parts += ["Interrupted."] if getattr(result, "ending", "") == "interrupted" else []
-    return "\n\n".join(filter(None, parts)) + as_notes(getattr(result, "warnings", ()))
+    return "\n\n".join(filter(None, parts)) + as_notes(remarks_of(result, given))
 
 
 def aligned(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from advsearch import rooms
 from advsearch.report import wording
-from advsearch.runs.results.base import Fields, Formation, Result
+from advsearch.runs.results.base import INTERRUPTED, Fields, Formation, Result
 
 LONG = 24
 """Rows of a table of fields above which it is folded."""
@@ -45,6 +45,7 @@ class Section:
         heads: of the columns.
         rows: texts, the first of which is the row's name.
         note: how the table is to be read, for a page.
+        figure: file of a figure of the numbers in the run's folder, for a page.
         pictures: groups, each of which stands side by side.
         draw: draws a chart of the numbers on matplotlib's axes, for a page; `title` and `text` say what is on it.
         height: of the chart, CSS pixels.
@@ -59,6 +60,7 @@ class Section:
     heads: Sequence[str] = ()
     rows: Sequence[Sequence[str]] = ()
     note: str = ""
+    figure: str = ""
     pictures: Sequence[Sequence[Picture]] = ()
     draw: Callable[[Any], object] | None = None
     height: int = 300
@@ -93,6 +95,7 @@ class Shown:
         said: what a reader should know first, in a sentence or two.
         sections: what else there is.
         facts: what it was done with, by name; beside what all questions have: environment, renders, time and seed.
+        cautions: what has to be known beside the warnings.
         about: what it is of, in a few names; empty: the object, the controls and the model.
     """
 
@@ -100,6 +103,7 @@ class Shown:
     sections: Sequence[Section] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     about: Sequence[str] = ()
+    cautions: Sequence[str] = ()
 
 
 def shown(result: Result) -> Shown:
@@ -107,6 +111,12 @@ def shown(result: Result) -> Shown:
     own = rooms.in_room(result.command, "words", "shown")
     made: Shown = own(result) if own else fields_shown(result)
     return made
+
+
+def remarks_of(result: Result, given: Shown) -> list[str]:
+    """Return what has to be known beside an answer."""
+    stopped = ["Interrupted before its end."] if getattr(result, "ending", "") == INTERRUPTED else []
+    return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
 
 
 def subject_of(result: Result, given: Shown) -> list[str]:
@@ -119,15 +129,14 @@ def facts_of(result: Result, given: Shown) -> dict[str, str]:
     """Return by what an answer came about, without what is not known."""
     renders, seconds = getattr(result, "renders", None), getattr(result, "seconds", None)
     spent = sum(renders.values()) if isinstance(renders, Mapping) else renders
-    facts = {
-        **given.facts,
-        "environment": getattr(result, "environment", ""),
+    own = {
+        "environment": "" if "environments" in given.facts else getattr(result, "environment", ""),
         "renders": "" if spent is None else str(spent),
         "workers": wording.workers_text(getattr(result, "shared", None)),
         "time": wording.seconds_text(seconds["total"]) if seconds else "",
         "seed": str(getattr(result, "seed", "")),
     }
-    return {name: text for name, text in facts.items() if text}
+    return {name: text for name, text in {**given.facts, **own, **given.facts}.items() if text}
 
 
 # ---- fields as they are ---------------------------------------------------------------------------------------------

@@ -8,12 +8,12 @@ from pathlib import Path
 from advsearch import rooms
 from advsearch.report.charts import NARROW, WIDE, study_chart
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.shown import Picture, Section, Shown, facts_of, shown, subject_of
+from advsearch.report.shown import Picture, Section, Shown, facts_of, remarks_of, shown, subject_of
 from advsearch.runs.directory import IMAGES, REPORT
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.gap import CurveResult
+from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.viewer import attack_page, study_page, sweep_page
@@ -43,6 +43,8 @@ def write_page(run: Path, result: Result) -> Path:
             return attack_page.write_report(run)
         case SweepSummary():
             return sweep_page.write_sweep_page(run, result)
+        case GapResult():
+            text = study_page.gap_page(run, result)
         case CurveResult():
             text = study_page.curve_page(run, result)
         case MatrixResult():
@@ -57,17 +59,17 @@ def shown_page(run: Path, result: Result, given: Shown) -> str:
     """Return what is shown of an answer as the page of the run in the folder `run`."""
     parts = list(getattr(result, "parts", ()))
     facts = {name[:1].upper() + name[1:]: text for name, text in facts_of(result, given).items()}
-    drawn = any(one.draw for one in given.sections)
+    drawn = any(one.draw or one.figure or one.pictures for one in given.sections)
     main = element(
         "main",
-        *([] if drawn else _figures(run, given)),
+        *([] if drawn else _figures(run, given.said)),
         *(_section(run, one) for one in given.sections if one.only != "text" and not one.empty),
         _links(run, parts) if parts and all(isinstance(one, str) for one in parts) else None,
         join_html(element("h2", "Cost and conditions"), facts_table(facts)),
         again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
     )
     what = join_html(f"{result.command}; ", subject_html(*(("", one) for one in subject_of(result, given))))
-    header = heading(what, given.said, getattr(result, "warnings", ()))
+    header = heading(what, given.said, remarks_of(result, given))
     return document(
         f"{run.name}, {result.command}", header, main, footer=f"run {run.name}. This page needs no other file."
     )
@@ -89,7 +91,7 @@ def _section(run: Path, one: Section) -> Html:
     table = study_table(one.heads, one.rows, part_links(run, one.parts), one.shares) if one.heads else None
     inside = join_html(
         *(element("p", text) for text in one.text if text and one.draw is None),
-        chart,
+        chart or _figure(run, one.figure, " ".join(one.text) or one.title),
         (table or facts_table({row[0]: row[1] for row in one.rows})) if one.rows else None,
         *(_pictures(run, group) for group in one.pictures),
         element("p", one.note, class_="soft") if one.note else None,
@@ -113,14 +115,19 @@ def _pictures(run: Path, group: Iterable[Picture]) -> Html | None:
     return element("div", *figures, class_="pictures pair" if len(figures) < 3 else "pictures") if figures else None
 
 
-def _figures(run: Path, given: Shown) -> Iterator[Html]:
-    """The figures among the images of a run, but for those that a part shows with words of its own."""
-    named = {picture.file for one in given.sections for group in one.pictures for picture in group}
+def _figures(run: Path, said: str) -> Iterator[Html]:
+    """The figures among the images of a run whose question names none."""
     for file in sorted((run / IMAGES).glob("*.png")):
-        if str(file.relative_to(run)) not in named and kept(run, file.relative_to(run)):
-            alt = f"{file.stem.replace('-', ' ').replace('_', ' ').capitalize()}: {given.said}"
-            picture = element("img", src=data_url(file.read_bytes(), "image/png"), alt=alt)
-            yield element("figure", scrolled(picture, "wide"), class_="wide")
+        name = file.stem.replace("-", " ").replace("_", " ").capitalize()
+        yield _figure(run, f"{IMAGES}/{file.name}", f"{name}: {said}") or Html()
+
+
+def _figure(run: Path, name: str, alt: str) -> Html | None:
+    file = kept(run, name) if name else None
+    if file is None:
+        return None
+    picture = element("img", src=data_url(file.read_bytes(), "image/png"), alt=alt)
+    return element("figure", scrolled(picture, "wide"), class_="wide")
 
 
 def _links(run: Path, parts: list[str]) -> Html:

@@ -489,12 +489,16 @@ def test_region_builds_its_configuration_and_prints_the_box(
     ]
     assert capsys.readouterr().out == (
         "The model is wrong in 200 of 200 fresh samples of this box: with 95 % confidence in at least 98.2 % of it.\n\n"
+        "The box\n"
         "  parameter   from   to     centre   unit\n"
         "  pose.yaw    10     55.5   30       degrees\n\n"
         "  share of the space   12 %\n"
+        "  samples a pixel      16\n"
+        "  environment          studio\n"
         "  renders              300\n"
         "  time                 9.0 s\n"
-        "  run                  runs/mug-pose-002\n"
+        "  seed                 0\n"
+        "  page                 runs/mug-pose-002/report.html\n"
     )
 
 

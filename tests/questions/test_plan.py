@@ -20,13 +20,13 @@ from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress
 from advsearch.questions.plan import carry_out as planning
-from advsearch.questions.plan.answer import CosineRow, GainRow, PlanResult
+from advsearch.questions.plan.answer import GainRow, PlanResult
 from advsearch.questions.plan.carry_out import plan_from_config, quieter
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.questions.plan.words import READING
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
-from advsearch.runs.results.derivatives import PathLength
+from advsearch.runs.results.derivatives import CosineRow, PathLength
 from advsearch.runs.summary import read_result
 
 SMALL: dict[str, Any] = {
@@ -117,7 +117,7 @@ def test_a_plan_that_is_stopped_anywhere_goes_on_to_the_same_result(
         before = len(stopped.cosines)
         if number == 0:
             assert stopped.not_measured == LEFT and before == 1
-            assert "not measured, it was stopped:\n  step and samples of camera\n" in answer(stopped)
+            assert "Not measured, it was stopped\nstep and samples of camera\n" in answer(stopped)
             assert listed_runs(tmp_path)[0].state == "stopped"
     INTERRUPTS.count = 0
     assert main(["resume", str(folder), "--json", "--quiet"]) == 0
@@ -139,7 +139,7 @@ def test_seconds_end_a_plan_and_may_be_changed_before_it_goes_on(
     monkeypatch.setattr(planning, "Results", results)
     cut = plan_from_config(PlanConfig(**SMALL, seconds=1e-9, run=str(folder)))
     assert cut.ending == "out of time" and not cut.cosines and cut.not_measured == ["ways to differentiate", *LEFT]
-    assert "not measured, the time was up:\n  ways to differentiate\n" in answer(cut)
+    assert "Not measured, the time was up\nways to differentiate\n" in answer(cut)
     assert main(["resume", str(folder), "--quiet"]) == 0  # one gradient is taken, whatever the time
     assert f"Go on with: advsearch resume {folder}\n" in capsys.readouterr().out
     assert [one.made for one in sittings] == [1, 1]

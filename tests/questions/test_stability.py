@@ -232,7 +232,7 @@ def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
 ) -> None:
     assert main(["stability", "--seconds", "1e-9", "--quiet"]) == 0
     said = capsys.readouterr().out
-    assert "not run: bad" in said and said.endswith("Go on with: advsearch resume stability-001\n")
+    assert "Not run\nbad" in said and said.endswith("Go on with: advsearch resume stability-001\n")
 
     def interrupted() -> Outcome:
         raise KeyboardInterrupt

@@ -55,4 +55,4 @@ def test_limits_of_a_plan_are_sentences() -> None:
             "limits": [limit],
         }
     )
-    assert "limits of the material form:\n  a mirror's reflections stay\n" in plan_text(plan)
+    assert "Limits of the material form\na mirror's reflections stay\n" in plan_text(plan)

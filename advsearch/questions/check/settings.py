@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from advsearch.config.derivative import DerivativeConfig
+from advsearch.config.derivative import DerivativeConfig, TimedConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, setting, setting_as_in
 
@@ -39,15 +39,7 @@ class CheckConfig(DerivativeConfig):
         "check",
         "what is differentiated: a smooth linear loss of the raw picture, the model's own, or both in turn",
     )
-    seconds: float | None = setting(
-        None,
-        "check",
-        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
-        otherwise="no limit",
-        unit="seconds",
-        gt=0.0,
-        le=1e9,
-    )
+    seconds: float | None = setting_as_in(TimedConfig, "seconds")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-check-NNN")
 
     @property

@@ -50,14 +50,16 @@ def shown(result: HardenResult) -> Shown:
         "model": result.model,
         "searched with": result.search,
         "stronger": result.stronger_search,
-        "load it with": f"--model {result.hardened}" if result.hardened else "",
+        "load it with": f"model={result.hardened}" if result.hardened else "",
         "weights": result.weights or "",
         "pictures": result.pictures or "",
     }
     return Shown(
         hardened_text(result),
         [
-            Section("Before and after", heads=HEADS, rows=hardened_rows(result), note=ROBUST),
+            Section(
+                "Before and after", heads=HEADS, rows=hardened_rows(result), note=ROBUST, figure="images/harden.png"
+            ),
             Section.table(enumerate(result.rounds), rounds, title="The training", note=TRAINED, only="page"),
             Section.table(result.split.items(), split, title="What it was trained and measured on", only="page"),
         ],

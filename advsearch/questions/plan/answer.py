@@ -7,20 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from advsearch.runs.results.base import Fields, Formation, JsonFloat, RunResult
-from advsearch.runs.results.derivatives import GradientStatus, GroupDerivative, PathLength
-
-
-class CosineRow(Fields):
-    """How well a working gradient of the model's loss points the way of the converged one."""
-
-    denoise: str
-    control: str
-    factor: float = Field(description="step as a multiple of the plan's")
-    spp: int = Field(description="samples a pixel")
-    cosine: JsonFloat = Field(description="mean over seeds; null where the converged gradient is zero")
-    converged: JsonFloat = Field(description="smallest cosine of two converged gradients")
-    seconds: float = Field(description="of one working gradient, median")
-    status: GradientStatus = Field(description="whether it is good enough to search by")
+from advsearch.runs.results.derivatives import CosineRow, GroupDerivative, PathLength
 
 
 class DenoiserAdvice(Fields):

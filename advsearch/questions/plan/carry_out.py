@@ -18,13 +18,13 @@ from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.plan.answer import CosineRow, DenoiserAdvice, EstimatorLimit, GainRow, PlanResult, TexelRow
+from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, GainRow, PlanResult, TexelRow
 from advsearch.questions.plan.leaving_out import measured_gains, most_gradients, resolved_texels
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Formation
-from advsearch.runs.results.derivatives import PathLength
+from advsearch.runs.results.derivatives import CosineRow, PathLength
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES
 
 if TYPE_CHECKING:

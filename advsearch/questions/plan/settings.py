@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from advsearch.config.derivative import DerivativeConfig
+from advsearch.config.derivative import DerivativeConfig, TimedConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.questions.check.settings import CheckConfig
 from advsearch.settings import setting_as_in
 
 
@@ -16,7 +15,7 @@ class PlanConfig(DerivativeConfig):
     command: ClassVar[str] = "plan"
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
 
-    seconds: float | None = setting_as_in(CheckConfig, "seconds")
+    seconds: float | None = setting_as_in(TimedConfig, "seconds")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-plan-NNN")
 
     @property

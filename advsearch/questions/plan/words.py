@@ -45,7 +45,7 @@ def shown(chosen: PlanResult) -> Shown:
         "estimator": "{0.estimator}",
         "step": _step,
     }
-    denoise, left_out = chosen.denoise, chosen.left_out if chosen.specialised else ["nothing (--no-specialise)"]
+    denoise, left_out = chosen.denoise, chosen.left_out if chosen.specialised else ["nothing (`specialise=false`)"]
     why = "the time was up" if chosen.ending == OUT_OF_TIME else "it was stopped"
     advice = f"denoiser asked for: {denoise.asked}; better gradients: {denoise.advised} ({denoise.reason})"
     return Shown(
@@ -92,7 +92,7 @@ def _measured(chosen: PlanResult) -> list[str]:
         lines.append(f"longest light path of the search: {depth} segments of {full}: {chosen.bounces.reason}")
     for one in (chosen.texels or ()) if chosen.specialised else ():
         enough = (
-            f"--texture-resolution {one.enough} would resolve as much"
+            f"`texture_resolution={one.enough}` would resolve as much"
             if one.enough < one.side
             else f"{one.side} a side is what the pixels resolve"
         )

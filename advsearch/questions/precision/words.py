@@ -94,7 +94,7 @@ def sentence(one: Recommended, goal: float) -> str:
     if one.quantity == "objective":
         asked = f"{100 * (1 - goal):.3g} % of the largest median gain in the verified objective"
     if one.estimator is None:
-        return f"{asked}: not reached by anything that was measured; give it more --seconds or a larger --error"
+        return f"{asked}: not reached by anything that was measured; give it more `seconds` or a larger `error`"
     if one.quantity == "objective":
         return f"{asked}: policy {one.estimator}, {one.renders} renders, {one.seconds:.2g} s"
     basis = "" if one.basis in ("interpolated", "fitted") else f" ({one.basis})"

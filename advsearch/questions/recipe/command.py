@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.output import as_notes
 from advsearch.cli.question import Positional, QuestionCommand
-
-if TYPE_CHECKING:
-    from advsearch.questions.recipe.answer import RecipeResult
 
 HELP = "run a whole experiment that a recipe describes, and write a page of figures"
 EXAMPLES = (
@@ -51,29 +46,8 @@ def _listed(as_json: bool) -> int:
     return 0
 
 
-def answer(result: RecipeResult) -> str:
-    """Return what each figure says, and the cost."""
-    from advsearch.questions.recipe.words import told_once
-    from advsearch.report import wording
-    from advsearch.runs.directory import REPORT
-
-    told = zip(result.figures, told_once(result.figures), strict=True)
-    said = [f"{one.title}\n" + "\n".join(f"  {text}" for text in texts) for one, texts in told]
-    facts = [
-        ["runs", str(len(result.parts))],
-        ["renders", str(sum(one.renders for one in result.parts))],
-        ["time", wording.seconds_text(result.seconds["total"])],
-        ["page", f"{result.run}/{REPORT}"],
-    ]
-    parts = [result.title, *said, output.aligned(facts)]
-    parts += ["Quick: few and small pictures; no result."] if result.quick else []
-    parts += ["Interrupted."] if result.goes_on else []
-    return "\n\n".join(parts) + as_notes(result.warnings)
-
-
 COMMAND = _Recipe(
     "recipe",
-    answer,
     about="recipe",
     place=Positional("NAME", "a recipe, or list", "; list shows the recipes that there are"),
 )

@@ -49,7 +49,7 @@ def claims_of(result: Result) -> list[Claim]:
         told = f"; so far: {result.brief}" if result.brief else ""
         return [nothing_claimed(f"the run was stopped before its end{told}")]
     if own := rooms.in_room(result.command, "words", "claims"):
-        return list(own(result))
+        return list(own(result)) or [nothing_claimed("nothing in this run came to its end")]
     for kind, claims in _CLAIMS.items():
         if isinstance(result, kind):
             return list(claims(result)) or [nothing_claimed("nothing in this run came to its end")]

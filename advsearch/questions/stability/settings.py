@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 from pydantic import field_validator
 
+from advsearch.config.derivative import TimedConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.questions.check.settings import CheckConfig
 from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
 
 
@@ -24,7 +24,7 @@ class StabilityConfig(Config):
     group: str | None = setting(
         None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all", form="names"
     )
-    seconds: float | None = setting_as_in(CheckConfig, "seconds")
+    seconds: float | None = setting_as_in(TimedConfig, "seconds")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/stability-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 

@@ -58,3 +58,16 @@ class PathLength(Fields):
     cuts: list[PathCut] = Field(description="what was measured, longest paths first")
     configurations: int = Field(description="how many the measurement looked at")
     reason: str
+
+
+class CosineRow(Fields):
+    """How well a working gradient of the model's loss points the way of the converged one."""
+
+    denoise: str
+    control: str
+    factor: float = Field(description="step as a multiple of the plan's")
+    spp: int = Field(description="samples a pixel")
+    cosine: JsonFloat = Field(description="mean over seeds; null where the converged gradient is zero")
+    converged: JsonFloat = Field(description="smallest cosine of two converged gradients")
+    seconds: float = Field(description="of one working gradient, median")
+    status: GradientStatus = Field(description="whether it is good enough to search by")
