@@ -180,7 +180,7 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
     )
     assert main(flags.split()) == 130
     said = capsys.readouterr().out
-    assert said.startswith("Stopped before the box was known.") and "renders   1\n" in said
+    assert said.startswith("Stopped before the box was known.") and "renders       1\n" in said
     assert said.endswith(f"Go on with: advsearch resume {folder}\n")
     assert main(["show", str(folder)]) == 0 and capsys.readouterr().out == said
     assert not finished(folder) and listed_runs(tmp_path)[0].state == "stopped"

@@ -493,7 +493,7 @@ def test_region_builds_its_configuration_and_prints_the_box(
         "  parameter   from   to     centre   unit\n"
         "  pose.yaw    10     55.5   30       degrees\n\n"
         "  share of the space   12 %\n"
-        "  samples a pixel      16\n"
+        "  samples a pixel      64\n"
         "  environment          studio\n"
         "  renders              300\n"
         "  time                 9.0 s\n"

@@ -585,7 +585,7 @@ def test_a_tiny_scene_from_end_to_end(
     independent = slopes.get(("image", "independent", "error", "samples"))
     if independent is not None:  # a slow machine measures too few points
         assert independent["slope"] == pytest.approx(-0.5, abs=0.15)
-    assert precision_text(PrecisionResult.of(report)).count("figure: ") == 2
+    assert precision_text(PrecisionResult.of(report)).count("images/precision.") == 2
     run = Path(report["run"])
     assert run.parent == Path("runs") and (run / "run.yaml").is_file() and (run / "summary.json").is_file()
     assert [Path(path).suffix for path in report["figures"]] == [".png", ".svg"]
@@ -664,7 +664,7 @@ def test_workers_make_the_references_and_what_is_timed_stays_here(
         ("image", "raw"), ("image", "oidn"), ("image", "depth"), ("gradient of pose", "differences"),
         ("gradient of texture", "adjoint"),
     }  # fmt: skip
-    assert report.shared is not None and "workers: 2 at most" in precision_text(report)
+    assert report.shared is not None and "workers       2 at most" in precision_text(report)
     again = references_of(PrecisionConfig(**settings).plain())
     for one in {each.name: each for each in asked}.values():
         assert np.array_equal(again([one])[0], asked[one]) and asked[one].dtype == np.float64
