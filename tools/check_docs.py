@@ -21,20 +21,22 @@ from types import ModuleType
 
 import reference_scenes
 
-from advsearch.api import region as mapping
-from advsearch.attacks import POLICIES, clopper_pearson, planned_renders, region, sample_count, smallest, verification
+from advsearch.attacks import POLICIES, clopper_pearson, planned_renders, sample_count, smallest, verification
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS
-from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig, RegionConfig
+from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.controls import CONTROLS, texture
 from advsearch.engine import stages
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
+from advsearch.questions.region import carry_out as mapping
+from advsearch.questions.region import growing as region
+from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs import directory, export, store
 from advsearch.runs.results import KEPT
 from advsearch.runs.results.base import Result

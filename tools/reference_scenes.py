@@ -15,7 +15,7 @@ import torch
 
 from advsearch.bundled.objects import OBJECTS
 from advsearch.controls import Space
-from advsearch.engine.hardening.variation import varied
+from advsearch.questions.harden.scenes import varied
 from advsearch.scene import library
 from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription

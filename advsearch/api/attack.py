@@ -18,7 +18,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_object
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
-from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig, SweepConfig
+from advsearch.config import AttackConfig, SceneConfig
 from advsearch.config.attack import OVER_NUMBERS, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
@@ -560,7 +560,7 @@ def attack_answers(settings: JsonObject) -> Call:
 
 
 def executor_for(
-    config: AttackConfig | PrecisionConfig | SweepConfig, function: str, progress: Progress, *, ahead: bool = True
+    config: SceneConfig, function: str, progress: Progress, *, ahead: bool = True
 ) -> AbstractContextManager[Executor | None]:
     """Return what carries out a function of a configuration, as its workers and cluster say; None for this process.
 
@@ -572,7 +572,8 @@ def executor_for(
     """
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     work = Work(function, settings, FILES, config.used_threads or 1, ahead=ahead)
-    return executor_of(work, workers=config.workers, cluster=config.cluster, tell=progress.message)
+    workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))
+    return executor_of(work, workers=workers, cluster=cluster, tell=progress.message)
 
 
 def _policy(job: _Job, problem: Problem) -> Policy[Any]:

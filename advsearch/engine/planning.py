@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
-from advsearch.runs.results.check import GradientStatus
-from advsearch.runs.results.plan import CosineRow
+from advsearch.runs.results.derivatives import CosineRow, GradientStatus
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, compared
 from advsearch.scene.renderer import Renderer

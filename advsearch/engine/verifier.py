@@ -14,7 +14,7 @@ from advsearch.attacks import Evaluation, SearchResult, Verification, choose_spp
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.product import batches
 from advsearch.attacks.sample_count import LADDER, margins_of, most_samples
-from advsearch.config import AttackConfig, RegionConfig, SweepConfig
+from advsearch.config.scene import SceneConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages
@@ -26,10 +26,11 @@ MANY = 64
 """Of a configuration with more numbers than this, a trial's row does not hold the values."""
 
 
-def ladder_of(config: AttackConfig | RegionConfig | SweepConfig) -> Sequence[int]:
+def ladder_of(config: SceneConfig) -> Sequence[int]:
     """Return the samples a pixel that a verification climbs, as the sampler has them; the only count, if one was asked
     for."""
-    return LADDER if config.verify_spp is None else (next_count(config.pixel_sampler, config.verify_spp),)
+    asked = getattr(config, "verify_spp", None)
+    return LADDER if asked is None else (next_count(config.pixel_sampler, asked),)
 
 
 @dataclass

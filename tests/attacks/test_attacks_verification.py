@@ -26,12 +26,13 @@ from advsearch.attacks import (
     search,
     verify,
 )
-from advsearch.attacks.region import GrownBox
 from advsearch.attacks.sample_count import LOOKS, SEEDS, MarginsOf, most_samples
 from advsearch.attacks.trials import paired_difference
 from advsearch.attacks.verification import EASIER, LEAST_RATE, OVER_CONDITIONS, WORST_CASE, Rule
-from advsearch.config import FEWEST_SAMPLES, FEWEST_TRIALS
+from advsearch.config import FEWEST_TRIALS
 from advsearch.errors import InputError
+from advsearch.questions.region.growing import GrownBox
+from advsearch.questions.region.settings import FEWEST_SAMPLES
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Judgement
 

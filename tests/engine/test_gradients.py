@@ -14,9 +14,7 @@ from torch import Tensor
 
 from advsearch import load_scene
 from advsearch.api.attack import problem_from_config
-from advsearch.api.check import attempts, check_from_config
-from advsearch.cli.check import check_table
-from advsearch.config import AttackConfig, CheckConfig
+from advsearch.config import AttackConfig
 from advsearch.controls import make_control
 from advsearch.engine.gradients import (
     Estimate,
@@ -31,8 +29,11 @@ from advsearch.engine.gradients import (
 )
 from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.runs.results.check import WHOLE, DerivativeRow, DirectionRow
-from advsearch.runs.results.plan import CosineRow
+from advsearch.questions.check.answer import WHOLE, DerivativeRow, DirectionRow
+from advsearch.questions.check.carry_out import attempts, check_from_config
+from advsearch.questions.check.settings import CheckConfig
+from advsearch.questions.check.words import shown
+from advsearch.runs.results.derivatives import CosineRow
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import ESTIMATORS, SEARCH_STEP, first_plan
@@ -632,7 +633,8 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
 
 def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> None:
     config = CheckConfig(controls={"background": {}}, resolution=(24, 24), spp=4, run=str(tmp_path / "run"))
-    rows = check_from_config(config).rows
+    check = check_from_config(config)
+    rows = check.rows
     linear = [row for row in rows if row.loss == "linear"]
     assert {row.parameter for row in linear} >= {"hue", "saturation", "value"}
     for row in linear:
@@ -652,5 +654,5 @@ def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> N
             and math.isfinite(row.gradient)
         )
         assert row.status in ("ok", "noisy", "biased", "reference unusable")
-    text = check_table(rows)
-    assert "smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text
+    text = " ".join(one.title for one in shown(check).sections if not one.empty)
+    assert "Smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

@@ -18,9 +18,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from advsearch.api.attack import parts_in, problem_of_parts
-from advsearch.api.replay import kept_answer
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.loading import Scene
+from advsearch.engine.retrial import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
 from advsearch.questions.test.answer import ANSWERS, HELD

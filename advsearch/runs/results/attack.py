@@ -17,7 +17,7 @@ from advsearch.runs.results.base import (
     SceneResult,
     VariedValue,
 )
-from advsearch.runs.results.plan import PlannedGradient
+from advsearch.runs.results.derivatives import PlannedGradient
 
 
 class DescribedValue(Fields):
