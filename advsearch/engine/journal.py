@@ -111,7 +111,7 @@ class Journal:
         if told is None:
             return None
         row, beside = told
-        if beside.u != _digest(query.u) or row.seed != query.seed:
+        if beside.u != digest(query.u) or row.seed != query.seed:
             path, again = ("", "") if self.run is None else (self.run.path, self.run.again)
             raise InputError(
                 f"{path}: cannot go on: evaluation {query.number} of the {query.kind} is another one now than it was, "
@@ -139,10 +139,8 @@ class Journal:
             self._trials_of(query.kind)[query.number] = replace(answer, picture=None)
             values = problem.describe(query.u, query.seed) if query.described else {}
             values |= problem.conditions_of(query.u, query.seed) if query.drawn else {}
-            sought, machine = query.sought, answer.machine
-            row = trial_row(
-                query.kind, query.number, query.seed, query.spp, answer.said, values, sought=sought, machine=machine
-            )
+            more: dict[str, Any] = {"sought": query.sought, "machine": answer.machine, "renders": answer.cost}
+            row = trial_row(query.kind, query.number, query.seed, query.spp, answer.said, values, **more)
         else:
             row = Row(
                 kind=query.kind,
@@ -160,7 +158,7 @@ class Journal:
             row = row if answer.judgement is None else judged(row, answer.judgement)
             told = Told(
                 number=query.number,
-                u=_digest(query.u),
+                u=digest(query.u),
                 non_finite=answer.non_finite,
                 cost=answer.cost,
                 gradient=None if answer.gradient is None else answer.gradient.detach().numpy(),
@@ -223,5 +221,6 @@ def other_answers(run: RunDirectory | None, values: Mapping[str, tuple[float | N
     )
 
 
-def _digest(u: Tensor) -> bytes:
+def digest(u: Tensor) -> bytes:
+    """Return what tells a configuration from others."""
     return hashlib.blake2b(np.ascontiguousarray(u.detach().numpy()).tobytes(), digest_size=16).digest()
