@@ -21,7 +21,7 @@ from advsearch.errors import InputError
 from advsearch.tasks import Judgement
 
 PASS_PERCENT = 95
-"""What a claim must hold in, in per cent of the trials, and what the clean control must pass: 19 of 20."""
+"""What a claim must hold in, in per cent of the trials, and what the clean control must pass: 14 of 14, 19 of 20, 22 of 23."""
 
 PASS_PERCENT_OVER = 90
 """What a claim over many conditions must hold in, in per cent of those in which the clean configuration is right."""
@@ -29,8 +29,8 @@ PASS_PERCENT_OVER = 90
 TRIAL_LOOKS = 14, 23
 """Trials after which a verdict may stand, where nobody asked for a number: `found` takes 14 of 14, or 22 of 23.
 
-Whatever the rate is, what holds in 75 % or less is found no oftener than by 19 of 20, and the interval of what is found
-begins higher (at 77 %; at 75 % by 19 of 20). `benchmarks/verdicts.py` has both exactly."""
+What holds in 75 % or less is found in 2.4 % of all cases at most, as by 19 of 20, and the interval of what is found
+begins at 77 %, by 19 of 20 at 75 %. `benchmarks/verdicts.py` has both exactly."""
 
 LEAST_RATE = 0.5
 """Where the 95 % interval of a claim's rate may begin: what is called found holds more often than not. So 6 trials are

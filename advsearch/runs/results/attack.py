@@ -173,7 +173,7 @@ class VerificationSamples(Fields):
     """The sample count of the verification."""
 
     spp: int
-    converged: bool = Field(description="whether the margins are shown to stand still there")
+    converged: bool = Field(description="whether it is shown that more would leave the margins on their sides")
 
 
 class SearchClaim(Fields):
