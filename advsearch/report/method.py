@@ -88,7 +88,7 @@ def _sample_count(summary: AttackSummary) -> str:
     chosen = summary.sample_count
     if chosen is None:
         return ""
-    still = "the margin stands still there" if chosen.converged else "that the margin stands still there is not shown"
+    still = "more would leave the margin on its side" if chosen.converged else "that more would not change it is not shown"
     return f"{chosen.spp} a pixel in the verification; {still}"
 
 

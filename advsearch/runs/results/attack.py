@@ -75,6 +75,11 @@ class VerifiedRate(Fields):
     labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
     margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
     not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+    stopped: str | None = Field(
+        default=None,
+        description="why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "
+        "trials that are no verdict",
+    )
 
 
 class ObjectiveValues(Fields):
@@ -168,7 +173,7 @@ class VerificationSamples(Fields):
     """The sample count of the verification."""
 
     spp: int
-    converged: bool = Field(description="whether the margins are shown to stand still there")
+    converged: bool = Field(description="whether it is shown that more would leave the margins on their sides")
 
 
 class SearchClaim(Fields):
