@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 import small_models
 import yaml
@@ -15,12 +19,14 @@ import yaml
 import advsearch
 from advsearch.api.attack import attack_once
 from advsearch.cli.main import main
+from advsearch.cluster.executor import InProcess
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
-from advsearch.questions.test import machines
+from advsearch.questions.test import claims, machines
 from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
 from advsearch.questions.test.carry_out import test_from_config as carry_out
+from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.runs.store import Store
@@ -124,23 +130,43 @@ def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_
     assert much.picture == "parts/much/images/adversarial.png" and (tmp_path / "run" / much.picture).is_file()
 
 
-def test_a_suite_that_was_stopped_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front,too-few", run=str(tmp_path / "run"))
-    real, done = Problem.judge, 0
+@contextmanager
+def worked(config: AttackConfig, function: str, *more: Any) -> Iterator[InProcess | None]:
+    """In place of workers: what they would do, in this process."""
+    module, _, name = function.partition(":")
+    settings = config.to_repeat().plain()
+    yield None if config.workers is None else InProcess(getattr(import_module(module), name)(settings))
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictures(
+    workers: int | None, tested: tuple[SuiteResult, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(claims, "executor_for", worked)
+    chosen, suite = ("in-front", "no-worse", "too-few"), written(tmp_path, CLAIMS)
+    config = SuiteConfig(suite=suite, only=",".join(chosen), workers=workers, run=str(tmp_path / "run"))
+    whole = {one.name: (one.answer, one.reason, one.interval) for one in tested[0].claims if one.name in chosen}
+    front = next(one.pictures for one in tested[0].claims if one.name == "in-front")
+    real, done, last = Problem.judge, 0, 4
 
     def stopped(*given: Any) -> Any:
         nonlocal done
         done += 1
-        if done == 4:
+        if done == last:
             raise KeyboardInterrupt
         return real(*given)
 
     monkeypatch.setattr(Problem, "judge", stopped)
     first = carry_out(config)
-    assert first.goes_on and [one.reason for one in first.claims] == ["it was interrupted"] * 2
+    assert first.goes_on and {one.reason for one in first.claims} == {"it was interrupted"}
+    done, last = 0, front + 4  # in the middle of `no-worse`
     again = carry_out(config, resumed=tmp_path / "run")
-    assert again.ending == "done" and [one.answer for one in again.claims] == ["held", "undecided"]
-    assert done == 1 + sum(one.pictures for one in again.claims), "three were read back, one was asked twice"
+    assert again.goes_on and [one.answer for one in again.claims] == ["held", "undecided", "undecided"]
+    done, last = 0, -1
+    ended = carry_out(config, resumed=tmp_path / "run")
+    assert {one.name: (one.answer, one.reason, one.interval) for one in ended.claims} == whole
+    if workers is None:
+        assert done < sum(one.pictures for one in ended.claims), "what was there was read back"
 
 
 def test_what_the_time_is_over_for_is_undecided_and_can_go_on(tmp_path: Path) -> None:
@@ -158,7 +184,7 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
     added = carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
     assert added.status == 0 and added.added == str(tmp_path / "suite.counterexamples" / "found.json")
-    assert sum(path.stat().st_size for path in folder_of(suite).iterdir()) < 20_000
+    assert sum(path.stat().st_size for path in folder_of(suite).iterdir()) < 12_000
     tried = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "tried")))
     assert [(one.name, one.answer, one.pictures) for one in tried.claims] == [
         ("found", "failed", 6),
@@ -179,7 +205,7 @@ def test_an_answer_that_does_not_hold_for_the_suite_s_model_is_not_kept(attacked
     Path(suite).write_text(yaml.safe_dump({"settings": always, "claims": {"too-few": CLAIMS["too-few"]}}))
     with pytest.raises(AdvsearchError, match="is not kept: right in 6 of 6 trials"):
         carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "run")))
-    assert counterexamples(suite) == [] and not list(folder_of(suite).glob("*.png"))
+    assert counterexamples(suite) == [] and not list(folder_of(suite).glob("*.jpg"))
 
 
 def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Path, tmp_path: Path) -> None:
@@ -190,10 +216,27 @@ def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Pa
     file.write_text(json.dumps({**kept, "settings": {**kept["settings"], "environment": "loft"}}))
     other = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "other")))
     assert other.claims[0].answer == "undecided" and "its scene is another one now" in other.claims[0].reason
+    (block,) = kept["blocks"]
     for change, message in (({"offsets": "%%"}, "expected a counterexample"), ({"numbers": 3}, "expected 3 numbers")):
-        file.write_text(json.dumps({**kept, **change}))
+        file.write_text(json.dumps({**kept, "blocks": [{**block, **change}]}))
         with pytest.raises(AdvsearchError, match=message):
             counterexamples(suite)
+
+
+def test_numbers_are_kept_finely_where_they_are_few_and_by_their_signs_on_squares_where_they_are_many() -> None:
+    generator = np.random.default_rng(0)
+    few = generator.uniform(-0.3, 0.3, 7).astype(np.float32)
+    assert np.abs(Block.of(few, True, 4).moved() - few).max() < 1e-4
+    signs = np.sign(generator.normal(size=(20, 20, 3))).repeat(2, axis=0).repeat(2, axis=1).astype(np.float32)
+    many = 0.05 * signs.ravel()
+    sizes = []
+    for squares, on, exact in ((True, 4, False), (True, 2, True), (True, 1, True), (False, 1, False)):
+        kept = Block.of(many, squares, on)
+        assert kept.moved().shape == many.shape and np.abs(kept.moved()).max() <= 0.0511
+        assert (np.abs(kept.moved() - many).max() < 1e-6) == exact
+        sizes.append(len(kept.offsets))
+    assert sizes[0] < sizes[1] < sizes[2]
+    assert Block.of(many[:-3], True, 4).square == 1, "no square texture"
 
 
 # ---- for machines ---------------------------------------------------------------------------------------------------
