@@ -88,7 +88,7 @@ class Trial:
         problem, shared = self._problem(config), self._shared(config)
         sequence, right = ConfidenceSequence(self.confidence), 0
         wrong: list[tuple[float, Query, str]] = []
-        self.progress.stage(asked.name, claim.pictures, hint="`pictures` of the claim shortens it", at_most=True)
+        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         with executor_for(shared, "advsearch.api.attack:answering_of", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor))
             queries = drawn(problem, f"claim {asked.name}", claim.pictures, spp_of(config))
@@ -118,7 +118,7 @@ class Trial:
         same = other.renderer.formation == problem.renderer.formation
         sequence, ours, theirs, answer = ConfidenceSequence(self.confidence), 0, 0, UNDECIDED
         kind, first = f"claim {asked.name}", None
-        self.progress.stage(asked.name, claim.pictures, hint="`pictures` of the claim shortens it", at_most=True)
+        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         shared = self._shared(config).model_copy(update={"model": f"{config.model},{claim.than}"})
         with executor_for(shared, "advsearch.questions.test.claims:answering_of", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor, "0"))
