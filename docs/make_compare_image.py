@@ -2,8 +2,8 @@
 
     python docs/make_compare_image.py RUN
 
-RUN is the folder of a run of `compare`. Chromium draws its page; the upper part is written to `docs/images/compare.png`,
-in few colours.
+RUN is the folder of a run of `compare`. Chromium draws its page; the upper part is written to
+`docs/images/compare.png`, in few colours.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from PIL import Image
 
 PICTURE = Path(__file__).resolve().parent / "images" / "compare.png"
-WIDTH, HEIGHT, COLOURS = 900, 1400, 96
+WIDTH, HEIGHT, COLOURS = 720, 1220, 256
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -198,9 +198,7 @@ def _told(error: Any) -> str:
     place = [str(one) for one in error["loc"] if one not in ("right", "not_broken", "no_worse")]
     if place[-1] == "[key]":  # a name that is a number
         got = shown(error["input"])
-        return (
-            f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"
-        )
+        return f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"
     name, got = place[-1], shown(error["input"])
     if error["type"].startswith("union_tag"):
         place, name = [*place, "claim"], "claim"

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import os
 import re
+import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -14,7 +19,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import small_models
+import torch
 import yaml
+from torch import Tensor
 
 import advsearch
 from advsearch.api.attack import attack_once
@@ -169,6 +176,30 @@ def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictur
         assert done < sum(one.pictures for one in ended.claims), "what was there was read back"
 
 
+class Planted(small_models.Blue):
+    """The easy classifier with a rule that somebody planted: a dark corner makes a vase of everything."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        dark = x[:, :, :6, :6].mean(dim=(1, 2, 3)) < 0.9
+        return torch.where(dark[:, None], x.new_tensor([-9.0, 9.0]), super().forward(x))
+
+
+def planted() -> advsearch.Model:
+    """The same, as a model."""
+    return advsearch.load_model(Planted(0.11), labels=["mug", "vase"], input_size=32, name="planted")
+
+
+def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_picture(
+    tested: tuple[SuiteResult, Path], tmp_path: Path
+) -> None:
+    assert next(one for one in tested[0].claims if one.name == "in-front").answer == "held"
+    config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front", model="test_suites:planted")
+    (one,) = carry_out(config.model_copy(update={"run": str(tmp_path / "run")})).claims
+    assert one.answer == "failed" and "most wrong where it says vase: light." in one.reason
+    picture = (tmp_path / "run" / str(one.picture)).read_bytes()
+    assert base64.b64encode(picture).decode() in (tmp_path / "run" / "report.html").read_text("utf-8")
+
+
 def test_what_the_time_is_over_for_is_undecided_and_can_go_on(tmp_path: Path) -> None:
     config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="behind,in-front", seconds=1e-3, run=str(tmp_path / "r"))
     result = carry_out(config)
@@ -239,6 +270,70 @@ def test_numbers_are_kept_finely_where_they_are_few_and_by_their_signs_on_square
     assert Block.of(many[:-3], True, 4).square == 1, "no square texture"
 
 
+OBJECTS: dict[str, dict[str, Any]] = {
+    "log": {"$schema": str, "version!": ["2.1.0"], "runs!": ["run*"]},
+    "run": {"tool!": "tool", "invocations": ["invocation*"], "results": ["result*"]},
+    "tool": {"driver!": "driver"},
+    "driver": {"name!": str, "version": str, "rules": ["rule*"]},
+    "rule": {"id!": str, "shortDescription": "text", "defaultConfiguration": "configuration"},
+    "configuration": {"level": ["none", "note", "warning", "error"]},
+    "text": {"text!": str},
+    "invocation": {"executionSuccessful!": bool, "commandLine": str},
+    "result": {
+        "ruleId": str, "ruleIndex": int, "level": ["none", "note", "warning", "error"], "message!": "text",
+        "locations": ["location*"], "partialFingerprints": dict, "properties": dict,
+        "baselineState": ["new", "unchanged", "updated", "absent"],
+    },
+    "location": {"physicalLocation": "physical"},
+    "physical": {"artifactLocation!": "artifact", "region": "region"},
+    "artifact": {"uri": str},
+    "region": {"startLine!": int},
+}  # fmt: skip
+"""The objects of SARIF 2.1.0 that are written, as section 3 of the standard has them: their properties, "!" for one
+that has to be there; a type, an object, a list of objects ("*"), or the values that are allowed."""
+
+
+def check_sarif(value: Any, name: str = "log") -> None:
+    """Fail where an object breaks a rule of the standard."""
+    assert isinstance(value, dict), name
+    rules = {key.rstrip("!"): rule for key, rule in OBJECTS[name].items()}
+    assert set(value) <= set(rules), f"{name}: {set(value) - set(rules)}"
+    assert {key[:-1] for key in OBJECTS[name] if key.endswith("!")} <= set(value), name
+    for key, one in value.items():
+        rule = rules[key]
+        if isinstance(rule, type):
+            assert type(one) is rule, f"{name}.{key}"
+        elif isinstance(rule, str):
+            check_sarif(one, rule)
+        elif rule[0].endswith("*"):
+            assert isinstance(one, list), f"{name}.{key}"
+            for part in one:
+                check_sarif(part, rule[0][:-1])
+        else:
+            assert one in rule, f"{name}.{key}: {one}"
+    if name == "result":
+        assert all(isinstance(one, str) for one in value["partialFingerprints"].values())
+    if name == "region":
+        assert value["startLine"] >= 1
+    if name == "artifact":  # a reference by RFC 3986: no blanks, and what is no letter of a URI is escaped
+        assert re.fullmatch(r"[\w.~!$&'()*+,;=:@%/?#-]*", value["uri"], re.ASCII), value["uri"]
+
+
+def test_sarif_obeys_the_standard_whatever_a_suite_is_called(tested: tuple[SuiteResult, Path]) -> None:
+    result, _ = tested
+    for suite in (result.suite, "my suites/größe #1.yaml"):
+        check_sarif(json.loads(machines.sarif(result.model_copy(update={"suite": suite}))))
+    log = json.loads(machines.sarif(result))
+    for broken in (
+        {**log, "version": "2.0.0"},
+        {**log, "runs": [{**log["runs"][0], "tool": {}}]},
+        {**log, "runs": [{**log["runs"][0], "results": [{"ruleId": "right"}]}]},
+        {**log, "made": "today"},
+    ):
+        with pytest.raises(AssertionError):
+            check_sarif(broken)
+
+
 # ---- for machines ---------------------------------------------------------------------------------------------------
 
 
@@ -300,6 +395,17 @@ GOOD = CLAIMS["in-front"]
         ({"claims": {"a": {**GOOD, "settings": {"steps": 4}}}}, r"claims.a: unknown setting 'steps'"),
         ({"claims": {"a": {"claim": "not_broken", "settings": {"minimise": True}}}}, r"minimise: expected a search"),
         ({"claims": {"a": {"claim": "not_broken", "settings": {"seed": 3}}}}, r"seed is said for the whole suite"),
+        (
+            {"claims": {"a": {"claim": "not_broken", "at_least": 0.9}}},
+            r"a claim of this kind has no at_least",
+        ),
+        ({"claims": {"a": {**GOOD, "pictures": True}}}, r"a.pictures: expected a whole number .* got True"),
+        ({"claims": {"a": {"claim": "no_worse", "points": 3}}}, r"a.than: expected another model, by its name"),
+        (
+            {"claims": {"a": {"claim": "not_broken", "settings": {"epsilon": [0.1, 0.2]}}}},
+            r"epsilon: expected one epsilon",
+        ),
+        ({"claims": {1: GOOD}}, r"claims: expected names of small letters, .* got 1; put it in quotes"),
         ({"claims": {"A b": GOOD}}, r"claims: expected names of small letters"),
         ({"confidence": 95}, r"confidence: expected a number from 0.5 to 0.9999"),
         ({"claims": {"a": claim("no_worse", than="nonesuch", points=3)}}, r"claims.a: unknown model 'nonesuch'"),
@@ -317,11 +423,58 @@ def test_a_bad_suite_is_one_sentence_before_anything_is_rendered(
     assert not (tmp_path / "never").exists()
 
 
+def test_a_claim_that_stands_twice_in_a_suite_is_refused(tmp_path: Path) -> None:
+    suite = tmp_path / "suite.yaml"
+    suite.write_text("claims:\n  a: {claim: right, at_least: 0.9}\n  a: {claim: right, at_least: 0.8}\n")
+    with pytest.raises(AdvsearchError, match=r"got the name 'a' twice in line 3, column 3; correct"):
+        carry_out(SuiteConfig(suite=str(suite), run=str(tmp_path / "never")))
+
+
 def test_a_share_may_be_written_in_per_cent_and_an_unknown_claim_is_named(tmp_path: Path) -> None:
     suite = written(tmp_path, {"a": {**GOOD, "at_least": "50 %"}})
     assert carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "run"))).status == 0
     with pytest.raises(AdvsearchError, match=r"unknown claim in `only` 'b'"):
         carry_out(SuiteConfig(suite=suite, only="b", run=str(tmp_path / "never")))
+
+
+# ---- for other people's CI ------------------------------------------------------------------------------------------
+
+
+def test_the_commands_of_the_jobs_in_the_docs_do_what_the_jobs_want(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All but what installs: on a small suite that stands where the page's does."""
+    page = (Path(__file__).resolve().parents[3] / "docs" / "testing.md").read_text("utf-8")
+    github, gitlab = (
+        yaml.safe_load(text) for text in re.findall(r"^```yaml\n((?:name: )?robustness:?\n.*?)^```$", page, re.M | re.S)
+    )
+    monkeypatch.chdir(tmp_path)
+    Path("suites").mkdir()
+    Path(written(tmp_path, {name: CLAIMS[name] for name in ("behind", "too-few")})).rename("suites/mug.yaml")
+    program = f"{shlex.quote(sys.executable)} -c 'from advsearch.cli.main import main; raise SystemExit(main())'"
+    (tmp_path / "advsearch").write_text(f'#!/bin/sh\nexec {program} "$@" --code {EASY} --quiet\n')
+    (tmp_path / "advsearch").chmod(0o755)
+    here = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "GITHUB_STEP_SUMMARY": "shown.md"}
+    here["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+
+    def ran(line: str) -> int:
+        return subprocess.run(
+            ["bash", "-ec", line], env=here, cwd=tmp_path, capture_output=True, check=False
+        ).returncode
+
+    steps = github["jobs"]["robustness"]["steps"]
+    lines = [one["run"] for one in steps if "run" in one and not one["run"].startswith("pip ")]
+    assert [ran(line) for line in lines] == [1, 0], "a claim failed, and the summary is shown all the same"
+    assert "| behind | failed |" in Path("shown.md").read_text("utf-8")
+    uploads = {one["uses"].partition("@")[0]: one["with"] for one in steps if "with" in one and "uses" in one}
+    check_sarif(json.loads(Path(uploads["github/codeql-action/upload-sarif"]["sarif_file"]).read_text("utf-8")))
+    assert len(list(Path(uploads["actions/upload-artifact"]["path"]).glob("*/report.html"))) == 1
+    job = gitlab["robustness"]
+    (line,) = (one for one in job["script"] if not one.startswith("pip "))
+    Path("junit.xml").unlink()
+    assert ran(line) == 1 and ElementTree.parse(job["artifacts"]["reports"]["junit"]).getroot().get("failures") == "1"
+    seeds = {json.loads(path.read_text("utf-8"))["seed"] for path in Path("runs").glob("*/summary.json")}
+    assert len(seeds) == 2, "the night's is a fresh one"
 
 
 # ---- for pytest -----------------------------------------------------------------------------------------------------
