@@ -36,6 +36,7 @@ from advsearch.questions.test.carry_out import test_from_config as carry_out
 from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
 from advsearch.questions.test.settings import SuiteConfig
+from advsearch.report.evidence import claims_of
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
@@ -111,6 +112,12 @@ def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tu
     assert read_result(folder / "run") == result
     page = (folder / "run" / "report.html").read_text("utf-8")
     assert "data:image/png" in page and "too-few" in page and "Failed: 2 held" in page
+
+
+def test_the_evidence_has_a_paragraph_for_each_claim(tested: tuple[SuiteResult, Path]) -> None:
+    kinds = [(one.kind, one.statement.partition(":")[0]) for one in claims_of(tested[0])]
+    measured = [("measured", name) for name in ("in-front", "behind")]
+    assert kinds == [*measured, ("nothing claimed", "too-few"), ("measured", "no-worse")]
 
 
 def test_the_command_repeats_a_claim_alone(tested: tuple[SuiteResult, Path], tmp_path: Path) -> None:
