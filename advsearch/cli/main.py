@@ -141,7 +141,9 @@ def _run_and_tell(given: list[str]) -> int:
     except AdvsearchError as error:
         from advsearch.cli.flags import with_flags
 
-        print(f"advsearch: error: {shortened(with_flags(str(error)))}", file=sys.stderr)
+        in_a_file = given[0] in ("run", "resume") and not isinstance(error, UnknownNameError)
+        text = str(error) if in_a_file else with_flags(str(error))
+        print(f"advsearch: error: {shortened(text)}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
         return OK
