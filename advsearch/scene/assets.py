@@ -107,6 +107,10 @@ class ObjectAsset:
             and normal, row 0 on top; None where there is none.
         emission: (H, W, 3) float32 linear radiance of the front of its faces, row 0 on top; (1, 1, 3) where it is the
             same everywhere, None where there is none.
+        finishes: of an object of several materials, what each of `mesh.materials` is like beside its base colour; what
+            none of them covers is like `material`.
+        metres: its largest extent in metres, where it has a size of its own; then distances of the camera are in
+            metres. None where distances are in object sizes.
     """
 
     name: str
@@ -121,6 +125,8 @@ class ObjectAsset:
     opacity: Floats | None = None
     normal_map: Floats | None = None
     emission: Floats | None = None
+    finishes: Mapping[str, Material] = field(default_factory=dict)
+    metres: float | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
