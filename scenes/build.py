@@ -68,7 +68,10 @@ def everything() -> Iterator[tuple[str, bytes]]:
         yield from object_files(thing).items()
     for light in ENVIRONMENTS.values():
         yield from environment_files(light).items()
-    facts = {name: {"split": family.split, "source": family.script} for name, family in ENVIRONMENTS.items()}
+    facts = {
+        name: {"split": family.split, "source": family.script} | ({"ground": family.ground} if family.ground else {})
+        for name, family in ENVIRONMENTS.items()
+    }
     yield "environments/environments.json", (json.dumps({"schema": 1, "environments": facts}, indent=1) + "\n").encode()
 
 

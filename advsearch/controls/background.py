@@ -102,7 +102,7 @@ class BackgroundControl(NumberControl):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         scene = dataclasses.replace(scene, backdrop=True)
-        return scene.with_values(ground__size=0.0) if self.chosen["ground"] == "hide" else scene
+        return scene.with_values(ground__size=0.0).on_its_ground() if self.chosen["ground"] == "hide" else scene
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if WHAT[int(values["what"])] == "environment":

@@ -107,7 +107,8 @@ class Scene:
         check_ground(own.given_values, name)
         if environment is not None:
             check_one_environment(own.parts, f"`environment={name}`")
-        return Scene(replace(own, environment=environment, environment_spec=name, given=given), self.only_here)
+        lit = replace(own, environment=environment, environment_spec=name, given=given)
+        return Scene(lit.on_its_ground(), self.only_here)
 
     def __repr__(self) -> str:
         described = self.description
@@ -135,7 +136,7 @@ class Scene:
         own = self.description
         check_meshes(own, given)
         values = {**own.values, **{name: resolved[name] for name in given}}
-        return Scene(replace(own, values=values, given=own.given | set(given)), self.only_here)
+        return Scene(replace(own, values=values, given=own.given | set(given)).on_its_ground(), self.only_here)
 
 
 @plainly()

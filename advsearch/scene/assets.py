@@ -146,6 +146,8 @@ class EnvironmentAsset:
         source: where it came from.
         warnings: what the importer had to repair or leave out, one sentence each.
         photographed: it shows the floor of a real place: the ground that things stand on is that floor by itself.
+        ground: the kind of ground that belongs to it by itself (`advsearch.scene.settings.GROUND_KINDS`); None for the
+            usual one.
 
     Raises:
         InputError: a texel is negative, NaN or infinite.
@@ -156,6 +158,7 @@ class EnvironmentAsset:
     source: str = ""
     warnings: tuple[str, ...] = ()
     photographed: bool = False
+    ground: str | None = None
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)

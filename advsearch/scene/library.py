@@ -50,10 +50,17 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
     """Return the names of the bundled environments, sorted.
 
     Args:
-        split: "train" or "heldout" to list only that half; None for all.
+        split: "train" or "heldout" to list only that half, "street" for the streets; None for all.
     """
-    facts = json.loads((_data() / "environments" / "environments.json").read_text("utf-8"))["environments"]
-    return tuple(sorted(name for name, fact in facts.items() if split is None or fact["split"] == split))
+    facts = _environments().items()
+    return tuple(sorted(name for name, fact in facts if split is None or fact["split"] == split))
+
+
+def _environments() -> dict[str, dict[str, str]]:
+    """What is known of each bundled environment, by name."""
+    text = (_data() / "environments" / "environments.json").read_text("utf-8")
+    facts: dict[str, dict[str, str]] = json.loads(text)["environments"]
+    return facts
 
 
 def load_object(name: str) -> ObjectAsset:
@@ -101,7 +108,7 @@ def load_environment(name: str) -> EnvironmentAsset:
         radiance = _exr((_data() / "environments" / f"{name}.exr").read_bytes())
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
-    return EnvironmentAsset(name, radiance, source=BUNDLED_ENVIRONMENT)
+    return EnvironmentAsset(name, radiance, source=BUNDLED_ENVIRONMENT, ground=_environments()[name].get("ground"))
 
 
 def _mesh(content: bytes) -> Mesh:

@@ -142,16 +142,16 @@ ENVIRONMENT = (
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
     ),
 )
-GROUND_KINDS = TABLE, PHOTOGRAPH = "table", "photograph"
+GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD = "table", "photograph", "road", "wet-road"
 GROUND = (
     Parameter(
         "kind",
         (),
         "name",
         0.0,
-        1.0,
-        "photograph where the map is a file, else table",
-        "What the object stands on: a square table, or the floor that the environment's photograph shows.",
+        3.0,
+        "what the environment has: photograph where the map is a file, a road in a street, else table",
+        "What the object stands on: a square table, the floor that the environment's photograph shows, or a road.",
         options=GROUND_KINDS,
     ),
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),

@@ -317,7 +317,7 @@ def _fittings() -> list[Patch]:
     for side in (1.0, -1.0):
         for x in (0.05, -0.92):
             found += box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
-    found += placed(box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2), rotation("y", -9.0), (-1.60, 0.0, 1.372))
+    found += placed(box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2), rotation("y", 9.0), (-1.60, 0.0, 1.372))
     return found
 
 

@@ -221,7 +221,7 @@ def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[PosedMe
         shown = photograph.base if reflectance is None else reflectance
         return [PosedMesh("ground", photograph.mesh, linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
     half = scene.number("ground.size") / 2.0
-    if half <= 0.0:
+    if half <= 0.0 or scene.road is not None:
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))

@@ -39,7 +39,7 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     photograph = description.photograph
     if photograph is not None:
         scene[GROUND] = mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), matt(photograph.base.numpy()))
-    elif number("ground.size") > 0.0:
+    elif number("ground.size") > 0.0 and description.road is None:
         reflectance = srgb_to_linear(np.array(description.ground_color, np.float32)).tolist()
         scene[GROUND] = {
             "type": "rectangle",
