@@ -1,7 +1,7 @@
 """A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
 
 Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
-in degrees. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
+in degrees. `camera.distance` and `camera.focus` are in metres where the object has a size in metres. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
 """
 
 from __future__ import annotations
@@ -170,6 +170,12 @@ class SceneDescription:
         return self.environment is not None or bool(self.lamps) or shining or self.emits
 
     @property
+    def metres(self) -> float:
+        """What distances of the camera are to be divided by to be in object sizes: the object's size in metres; 1 where
+        it has none."""
+        return self.object.metres or 1.0
+
+    @property
     def object_name(self) -> str:
         """How the object was asked for, or else its own name."""
         return self.object_spec or self.object.name
@@ -268,7 +274,7 @@ class SceneDescription:
         if self._paved is None and ROAD not in self.around:
             return self
         others = tuple(part for part in self.parts if part.name != ROAD)
-        laid = () if self._paved is None else (road(self._paved == settings.WET_ROAD, self.object.metres or 1.0),)
+        laid = () if self._paved is None else (road(self._paved == settings.WET_ROAD, self.metres),)
         return replace(self, parts=(*others, *laid))
 
     @property

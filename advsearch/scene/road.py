@@ -81,7 +81,7 @@ def _texture(wet: bool) -> Floats:
     """One period of the road, (h, w, 3) display-referred, multiples of 1/255, row 0 on the left."""
     width, height = round(PERIOD / TEXEL), round((EDGES[1] - EDGES[0]) / TEXEL)
     fine = np.random.Generator(np.random.PCG64(7)).random((height, width))
-    grain = 0.9 * (_blurred(fine, 1) - 0.5) + 1.6 * (_blurred(fine, 12) - 0.5)
+    grain = 0.9 * (_blurred(fine, 1) - 0.5) + 0.8 * (_blurred(fine, 12) - 0.5)
     x, y = np.meshgrid((np.arange(width) + 0.5) * TEXEL, EDGES[1] - (np.arange(height) + 0.5) * TEXEL)
     linear = reflectance(x.ravel(), y.ravel(), grain.ravel()).reshape(height, width, 3) * (WETNESS if wet else 1.0)
     levels = np.round(linear_to_srgb(np.round(linear, 5).astype(np.float32)) * 255.0)

@@ -116,7 +116,7 @@ CAMERA = (
         0.05,
         1000.0,
         "fits the object",
-        "Distance to the object's middle.",
+        "Distance to the object's middle; in metres where the object has a size.",
         (0.8, 1.5),
         log=True,
     ),

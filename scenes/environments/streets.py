@@ -76,9 +76,9 @@ def _front(x: Array, z: Array, side: int, weather: Weather) -> tuple[Array, Arra
     pick = _hashed(number, bay, level)
     lit = (pick < weather.windows)[:, None]
     mirrored = weather.sky(np.stack([0 * x, np.full_like(x, -0.7 if side else 0.7), np.full_like(x, 0.7)], axis=1))
-    pane = np.where(lit, np.array([1.6, 1.05, 0.5]) * (0.6 + 0.8 * pick / max(weather.windows, 0.01))[:, None], 0.22 * mirrored)
+    pane = np.where(lit, np.array([0.75, 0.46, 0.2]) * (0.4 + pick / max(weather.windows, 0.01))[:, None], 0.22 * mirrored)
     pane = pane + 0.02 * light
-    shown = np.where((pick < 1.6 * weather.windows)[:, None], np.array([2.0, 1.5, 0.9]), 0.12 * mirrored + 0.04 * light)
+    shown = np.where((pick < 1.6 * weather.windows)[:, None], np.array([0.7, 0.5, 0.3]), 0.12 * mirrored + 0.04 * light)
     color = np.where(window[:, None], pane, color)
     color = np.where(shop[:, None], shown, color)
     return color, (z < height) & (z > 0.0)
@@ -188,7 +188,7 @@ def _dusk_sky(rays: Array) -> Array:
 DAY = Weather(_day_sky, np.array([1.25, 1.2, 1.12]), np.array([0.4, 0.45, 0.52]), np.array([1.1, 1.08, 1.05]))
 RAIN = Weather(_grey_sky, np.full(3, 0.5), np.full(3, 0.48), np.full(3, 0.75), 0.12, True)
 DUSK = Weather(
-    _dusk_sky, np.array([0.16, 0.13, 0.13]), np.array([0.1, 0.1, 0.14]), np.array([0.3, 0.22, 0.17]), 0.4, False, 45.0
+    _dusk_sky, np.array([0.16, 0.13, 0.13]), np.array([0.1, 0.1, 0.14]), np.array([0.3, 0.22, 0.17]), 0.22, False, 30.0
 )
 
 _SCRIPT = "scenes/environments/streets.py"

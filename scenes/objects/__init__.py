@@ -7,6 +7,7 @@ from .family import Instance, ObjectFamily
 from .furniture import CHAIR, LAMP
 from .kitchen import FRYING_PAN, TEAPOT
 from .things import BALL, BANANA, BOOK
+from .signs import STOP_SIGN
 from .tools import DUMBBELL, HAMMER
 from .vessels import BOTTLE, BOWL, MUG, VASE, WINE_GLASS
 
@@ -31,7 +32,7 @@ HOUSEHOLD: dict[str, ObjectFamily] = {
 }
 """What the reference model is trained on."""
 
-STREET: dict[str, ObjectFamily] = {family.name: family for family in (CAR,)}
+STREET: dict[str, ObjectFamily] = {family.name: family for family in (CAR, STOP_SIGN)}
 
 OBJECTS: dict[str, ObjectFamily] = HOUSEHOLD | STREET
 

@@ -167,14 +167,14 @@ def _arch(axle: float, radius: float) -> Field:
 
 
 def _headlight(p: Array) -> Array:
-    out = np.abs(p[:, 1]) - 0.45
-    low, high = 0.57 + 0.1 * out, 0.655 + 0.21 * out
+    out = np.abs(p[:, 1]) - 0.42
+    low, high = 0.565 + 0.1 * out, 0.665 + 0.2 * out
     return np.where(p[:, 0] > 1.2, _softest(out, p[:, 0] - 1.66, p[:, 2] - low, high - p[:, 2]), -1.0)
 
 
 def _taillight(p: Array) -> Array:
-    out = np.abs(p[:, 1]) - 0.42
-    return np.where(p[:, 0] < -1.0, _softest(out, -1.84 - p[:, 0], p[:, 2] - 0.80, 0.935 - p[:, 2]), -1.0)
+    out = np.abs(p[:, 1]) - 0.40
+    return np.where(p[:, 0] < -1.0, _softest(out, -1.80 - p[:, 0], p[:, 2] - 0.785, 0.955 - p[:, 2]), -1.0)
 
 
 def _grille(half: float, low: float, high: float, lean: float = 0.0) -> Field:
@@ -228,8 +228,8 @@ def _body(tag: str) -> list[Patch]:
         shell = carved(shell, _arch(axle, ARCH), None)
     shell = carved(shell, _headlight, "headlight")
     shell = carved(shell, _taillight, "taillight")
-    shell = carved(shell, _grille(0.56, 0.23, 0.40, -0.06), "trim")
-    shell = carved(shell, _grille(0.43, 0.53, 0.615, 0.0), "trim")
+    shell = carved(shell, _grille(0.62, 0.24, 0.37, -0.02), "trim")
+    shell = carved(shell, _grille(0.41, 0.5, 0.64, 0.04), "trim")
     return carved(shell, _valance, "trim")
 
 
@@ -312,12 +312,15 @@ def _mirrors() -> list[Patch]:
 
 def _fittings() -> list[Patch]:
     found = _mirrors()
-    found += placed(box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1), rotation("y", -4.0), (2.146, 0.0, 0.462))
+    found += placed(box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1), rotation("y", -4.0), (2.146, 0.0, 0.428))
     found += placed(box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1), rotation("y", 3.0), (-2.138, 0.0, 0.705))
+    badge = lathe([("rim", np.array([(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)]))], 24)
+    found += placed(badge, rotation("y", 78.0), (2.118, 0.0, 0.575))
+    found += placed(badge, rotation("y", -80.0), (-2.075, 0.0, 0.86))
     for side in (1.0, -1.0):
         for x in (0.05, -0.92):
             found += box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
-    found += placed(box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2), rotation("y", 9.0), (-1.60, 0.0, 1.372))
+    found += placed(box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2), rotation("y", 9.0), (-1.60, 0.0, 1.364))
     return found
 
 
@@ -370,14 +373,21 @@ def _lamps(t: Texels) -> Array:
     """A headlight: two round lamps in a bright housing."""
     x, y, z = t.xyz.T
     out = np.abs(y)
-    lamp = np.minimum(np.hypot(out - 0.62, z - 0.615), np.hypot(out - 0.74, z - 0.632))
-    base = mix(np.broadcast_to(hexed("9aa4ab"), (len(x), 3)), hexed("f4f7f8"), step(0.03 - lamp, 0.0, 0.01))
-    return mix(base, hexed("3a4045"), step(0.01 - np.abs(lamp - 0.036), 0.0, 0.008))
+    lamp = np.minimum(np.hypot(out - 0.58, z - 0.62), np.hypot(out - 0.71, z - 0.64))
+    base = mix(np.broadcast_to(hexed("9aa4ab"), (len(x), 3)), hexed("f4f7f8"), step(0.032 - lamp, 0.0, 0.01))
+    return mix(base, hexed("3a4045"), step(0.01 - np.abs(lamp - 0.039), 0.0, 0.008))
 
 
 def _tail(t: Texels) -> Array:
     z = t.xyz[:, 2]
     return mix(np.broadcast_to(hexed("8e0d12"), (len(z), 3)), hexed("d8392f"), step(0.018 - np.abs(z - 0.87), 0.0, 0.01))
+
+
+def _slats(t: Texels) -> Array:
+    """Dark plastic; the grilles have bright slats."""
+    x, _, z = t.xyz.T
+    slat = np.where((x > 1.9) & (z > 0.48), step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, 0.006), 0.0)
+    return mix(np.broadcast_to(hexed("17181a"), (len(x), 3)), hexed("8b9095"), slat)
 
 
 def _plate(ground: Array) -> Paint:
@@ -410,7 +420,7 @@ FINISHES = {
 
 
 def _car(draw: Draw) -> Instance:
-    color = colour(draw, "b3202a", "2a5fa8", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2)
+    color = colour(draw, "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2)
     stretch = np.array([draw(1.0, 0.94, 1.07), draw(1.0, 0.96, 1.05), draw(1.0, 0.95, 1.1)])
     patches = [*_body("paint"), *_cabin("paint"), *_wheels(), *_wells(), *_fittings()]
     metal = colour(draw, "c4c7ca", "8d9094", "2d2f31", wild=0.0)
@@ -421,11 +431,11 @@ def _car(draw: Draw) -> Instance:
         "taillight": _tail,
         "rubber": solid(hexed("1c1c1d")),
         "rim": solid(metal),
-        "trim": solid(hexed("17181a")),
+        "trim": _slats,
         "plate": _plate(colour(draw, "f2f2ec", "f0d264", wild=0.0)),
         "well": solid(hexed("0a0a0b")),
     }
-    detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.5, "plate": 3.0}
+    detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
     return Instance(stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES)
 
 

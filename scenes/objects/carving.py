@@ -17,7 +17,7 @@ from .shapes import Patch
 Field = Callable[[Array], Array]
 """(N, 3) points to (N,) values, positive inside; about the distance to the edge."""
 
-SNAP = 0.2
+SNAP = 0.1
 """Share of an edge within which a cut goes through the edge's end: thinner slivers are not worth a triangle."""
 
 
