@@ -36,6 +36,7 @@ from advsearch.scene.importing.images import read_picture
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.road import on_its_ground
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 
@@ -108,7 +109,7 @@ class Scene:
         if environment is not None:
             check_one_environment(own.parts, f"`environment={name}`")
         lit = replace(own, environment=environment, environment_spec=name, given=given)
-        return Scene(lit.on_its_ground(), self.only_here)
+        return Scene(on_its_ground(lit), self.only_here)
 
     def __repr__(self) -> str:
         described = self.description
@@ -136,7 +137,7 @@ class Scene:
         own = self.description
         check_meshes(own, given)
         values = {**own.values, **{name: resolved[name] for name in given}}
-        return Scene(replace(own, values=values, given=own.given | set(given)).on_its_ground(), self.only_here)
+        return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
 
 
 @plainly()

@@ -1,7 +1,8 @@
 """A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
 
 Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
-in degrees. `camera.distance` and `camera.focus` are in metres where the object has a size in metres. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
+in degrees. `camera.distance` and `camera.focus` are in metres where the object has a size in metres. The camera at
+azimuth 0 and elevation 0 looks from +x towards the object.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.photograph import Photograph, photograph_of
-from advsearch.scene.road import ROAD, road
+from advsearch.scene.road import on_its_ground
 
 Doubles = npt.NDArray[np.float64]
 
@@ -41,10 +42,6 @@ ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 """Mitsuba's lights from everywhere, of which a scene can have one."""
 NO_MAP = "none"
 """What the environment of a scene without a map is called."""
-TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in settings.CHANNELS))
-"""Settings that only a table has."""
-ROADS = (settings.DRY_ROAD, settings.WET_ROAD)
-"""Kinds of ground that are roads."""
 OWN_MAP = "own"
 """What the scene's own environment is called where another may be chosen."""
 
@@ -245,37 +242,13 @@ class SceneDescription:
         own, kind = self.environment, self.values.get("ground.kind")
         if own is None or self.number("ground.size") == 0.0:
             return None
-        if kind is None and (not own.photographed or self.backdrop or not self.given.isdisjoint(TABLE_SETTINGS)):
+        if kind is None and (
+            not own.photographed or self.backdrop or not self.given.isdisjoint(settings.TABLE_SETTINGS)
+        ):
             return None
         if kind is not None and settings.GROUND_KINDS[int(kind)] != settings.PHOTOGRAPH:
             return None
         return photograph_of(own, self.number("ground.height"), self.number("environment.rotation"))
-
-    @property
-    def road(self) -> MeshPart | None:
-        """The road that the object stands on; None where it stands on something else."""
-        return self.around.get(ROAD) if self._paved is not None else None
-
-    @property
-    def _paved(self) -> str | None:
-        """The kind of road that it should stand on; None for no road."""
-        kind = self.values.get("ground.kind")
-        if self.number("ground.size") == 0.0:
-            return None
-        own = None if self.environment is None else self.environment.ground
-        if kind is not None:
-            own = settings.GROUND_KINDS[int(kind)]
-        elif not self.given.isdisjoint(TABLE_SETTINGS):
-            return None
-        return own if own in ROADS else None
-
-    def on_its_ground(self) -> SceneDescription:
-        """Return the scene with the road that environment and settings ask for, and no other."""
-        if self._paved is None and ROAD not in self.around:
-            return self
-        others = tuple(part for part in self.parts if part.name != ROAD)
-        laid = () if self._paved is None else (road(self._paved == settings.WET_ROAD, self.metres),)
-        return replace(self, parts=(*others, *laid))
 
     @property
     def ground_color(self) -> tuple[float, ...]:
@@ -348,9 +321,8 @@ def describe(
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
     )
-    described = described.on_its_ground()
     check_meshes(described, values)
-    return described
+    return on_its_ground(described)
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
@@ -390,13 +362,13 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         InputError: there is no photograph, or a table is described beside it.
     """
     kind = given.get("ground.kind")
-    if kind not in (settings.PHOTOGRAPH, *ROADS):
+    if kind not in (settings.PHOTOGRAPH, *settings.ROADS):
         return
     if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
         raise InputError(
             "`set` ground.kind=photograph: the scene has no environment map to show; give it one, or leave it out"
         )
-    described = [name for name in TABLE_SETTINGS if name in given]
+    described = [name for name in settings.TABLE_SETTINGS if name in given]
     if described:
         raise InputError(
             f"`set` ground.kind={kind} and `set` {described[0]} contradict each other: only a table has that; "

@@ -6,14 +6,20 @@ Beyond the pavements, and far ahead, the environment's map is seen.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from advsearch.scene import settings
 from advsearch.scene.assets import Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
+
+if TYPE_CHECKING:
+    from advsearch.scene.description import SceneDescription
 
 Doubles = npt.NDArray[np.float64]
 
@@ -54,6 +60,33 @@ def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles
     kerb = (0.38 * (1.0 + 0.3 * grain))[:, None] * np.where((x % 1.0 < 0.02)[:, None], 0.6, np.ones(3))
     found: Doubles = np.where((off > 0.0)[:, None], np.where((off > 0.16)[:, None], slabs, kerb), color)
     return np.where((np.abs(off) < 0.012)[:, None], 0.05, found)
+
+
+def paved(scene: SceneDescription) -> bool:
+    """Tell whether the object stands on the road."""
+    return ROAD in scene.around
+
+
+def on_its_ground(scene: SceneDescription) -> SceneDescription:
+    """Return the scene with the road that its environment and its settings ask for, and no other."""
+    kind = _kind(scene)
+    if kind not in settings.ROADS and not paved(scene):
+        return scene
+    others = tuple(part for part in scene.parts if part.name != ROAD)
+    laid = (road(kind == settings.WET_ROAD, scene.metres),) if kind in settings.ROADS else ()
+    return replace(scene, parts=(*others, *laid))
+
+
+def _kind(scene: SceneDescription) -> str | None:
+    """What the object stands on: as was asked, or else what belongs to the environment, unless a table is described."""
+    kind = scene.values.get("ground.kind")
+    if scene.number("ground.size") == 0.0:
+        return None
+    if kind is not None:
+        return settings.GROUND_KINDS[int(kind)]
+    if scene.environment is None or not scene.given.isdisjoint(settings.TABLE_SETTINGS):
+        return None
+    return scene.environment.ground
 
 
 @lru_cache(maxsize=4)

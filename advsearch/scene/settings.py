@@ -143,6 +143,9 @@ ENVIRONMENT = (
     ),
 )
 GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD = "table", "photograph", "road", "wet-road"
+ROADS = (DRY_ROAD, WET_ROAD)
+TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
+"""Settings that only a table has."""
 GROUND = (
     Parameter(
         "kind",

@@ -72,11 +72,15 @@ def _front(x: Array, z: Array, side: int, weather: Weather) -> tuple[Array, Arra
     window = (across > 0.7) & (across < 1.9) & (up > 0.75) & (up < 2.35) & (level < floors) & (z > 3.6)
     shop = (z > 0.5) & (z < 3.1) & (across > 0.25) & (across < 2.35)
     color = wall * light * (0.85 + 0.15 * np.clip(z / 12.0, 0.0, 1.0))[:, None]
-    color = np.where((np.abs(z - 3.4) < 0.16)[:, None] | (np.abs(z - height + 0.25) < 0.25)[:, None], 0.55 * light, color)
+    color = np.where(
+        (np.abs(z - 3.4) < 0.16)[:, None] | (np.abs(z - height + 0.25) < 0.25)[:, None], 0.55 * light, color
+    )
     pick = _hashed(number, bay, level)
     lit = (pick < weather.windows)[:, None]
     mirrored = weather.sky(np.stack([0 * x, np.full_like(x, -0.7 if side else 0.7), np.full_like(x, 0.7)], axis=1))
-    pane = np.where(lit, np.array([0.75, 0.46, 0.2]) * (0.4 + pick / max(weather.windows, 0.01))[:, None], 0.22 * mirrored)
+    pane = np.where(
+        lit, np.array([0.75, 0.46, 0.2]) * (0.4 + pick / max(weather.windows, 0.01))[:, None], 0.22 * mirrored
+    )
     pane = pane + 0.02 * light
     shown = np.where((pick < 1.6 * weather.windows)[:, None], np.array([0.7, 0.5, 0.3]), 0.12 * mirrored + 0.04 * light)
     color = np.where(window[:, None], pane, color)
@@ -88,7 +92,9 @@ def _trees(rays: Array, light: Array) -> tuple[Array, Array]:
     """The end of the street: radiance (N, 3) and (N,) whether something is there."""
     a = np.arctan2(rays[:, 1], np.abs(rays[:, 0]))
     crown = 0.05 + 0.012 * np.sin(31.0 * a + 0.7) + 0.008 * np.sin(67.0 * a) + 0.02 * np.cos(9.0 * a)
-    leaves = np.array([0.06, 0.085, 0.04]) * light * (0.8 + 0.3 * np.sin(90.0 * a) * np.sin(150.0 * rays[:, 2]))[:, None]
+    leaves = (
+        np.array([0.06, 0.085, 0.04]) * light * (0.8 + 0.3 * np.sin(90.0 * a) * np.sin(150.0 * rays[:, 2]))[:, None]
+    )
     return leaves, rays[:, 2] < crown
 
 
@@ -179,7 +185,11 @@ def _dusk_sky(rays: Array) -> Array:
     up = np.clip(rays[:, 2], 0.0, 1.0)[:, None]
     west = (0.5 + 0.5 * rays[:, :1]) ** 3
     low = np.array([0.30, 0.26, 0.34]) * (1.0 - west) + np.array([1.5, 0.62, 0.22]) * west
-    sky = np.array([0.07, 0.11, 0.25]) + low * np.exp(-up / 0.16) + 0.25 * west * np.exp(-up / 0.5) * np.array([1, 0.5, 0.5])
+    sky = (
+        np.array([0.07, 0.11, 0.25])
+        + low * np.exp(-up / 0.16)
+        + 0.25 * west * np.exp(-up / 0.5) * np.array([1, 0.5, 0.5])
+    )
     cover = 0.6 * _clouds(rays)[:, None] * np.exp(-((up - 0.25) ** 2) / 0.04)
     seen: Array = sky * (1.0 - cover) + cover * (np.array([0.16, 0.13, 0.2]) + west * np.array([0.5, 0.2, 0.12]))
     return seen

@@ -6,8 +6,8 @@ from .cars import CAR
 from .family import Instance, ObjectFamily
 from .furniture import CHAIR, LAMP
 from .kitchen import FRYING_PAN, TEAPOT
-from .things import BALL, BANANA, BOOK
 from .signs import STOP_SIGN
+from .things import BALL, BANANA, BOOK
 from .tools import DUMBBELL, HAMMER
 from .vessels import BOTTLE, BOWL, MUG, VASE, WINE_GLASS
 

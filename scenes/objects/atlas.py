@@ -35,7 +35,7 @@ class Slot:
 
 
 def _shelves(sizes: Sequence[tuple[float, float]], scale: float, side: int) -> list[Slot] | None:
-    """Pack rectangles on shelves of a square, tallest first; None where they do not fit. `sizes` are (w, h) with w >= h."""
+    """Pack rectangles (w, h), w >= h, on shelves of a square, tallest first; None where they do not fit."""
     cells = [(int(np.ceil(w * scale)) + 2 * GUTTER, int(np.ceil(h * scale)) + 2 * GUTTER) for w, h in sizes]
     order = sorted(range(len(cells)), key=lambda i: (-cells[i][1], -cells[i][0], i))
     slots: list[Slot | None] = [None] * len(cells)

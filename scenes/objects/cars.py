@@ -1,12 +1,13 @@
 """A car: a hatchback of five doors. Units are metres; it drives towards +x.
 
-Body and cabin are stacks of outlines: superellipses seen from above, each with its own length and width, at heights that
-follow the lines of hood, waist and roof. Windows, lights, grilles and wheel arches are carved out of them.
+Body and cabin are stacks of outlines: superellipses seen from above, each with its own length and width, at heights
+that follow the lines of hood, waist and roof. Windows, lights, grilles and wheel arches are carved out of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -69,7 +70,7 @@ def _pieces(tag: str, points: Array, cuts: tuple[int, ...]) -> list[Patch]:
     across = np.gradient(around, axis=1)[:, 1:-1]
     normals = unit(np.cross(across, np.gradient(points, axis=0)))
     found = []
-    for first, last in zip(cuts, cuts[1:], strict=False):
+    for first, last in pairwise(cuts):
         part = points[:, first : last + 1]
         u, v = (_lengths(part, axis) for axis in (1, 0))
         size = (float(u[-1]), float(v[-1]))
@@ -284,15 +285,13 @@ def _wells() -> list[Patch]:
         for side in (1.0, -1.0):
             angle = np.radians(np.linspace(-30.0, 210.0, 17))
             inner = np.stack([axle + ARCH * np.cos(angle), 0 * angle, WHEEL + ARCH * np.sin(angle)], axis=1)
-            rows = np.stack([inner + (0, side * y, 0) for y in (0.79, 0.56)])
+            rows = np.stack([inner + np.array([0.0, side * y, 0.0]) for y in (0.79, 0.56)])
             if side > 0:
                 rows = rows[::-1]
-            normals = np.broadcast_to(
-                np.stack([-np.cos(angle), 0 * angle, -np.sin(angle)], axis=1)[None], rows.shape
-            )
+            normals = np.broadcast_to(np.stack([-np.cos(angle), 0 * angle, -np.sin(angle)], axis=1)[None], rows.shape)
             down, across = np.array([0.0, 1.0]), np.linspace(0.0, 1.0, len(angle))
             found.append(grid("well", rows, normals, (ARCH * 4.2, 0.32), down, across))
-            ring = inner + (0, side * 0.56, 0)
+            ring = inner + np.array([0.0, side * 0.56, 0.0])
             found.append(cap("well", ring[::-1] if side > 0 else ring, np.array([0.0, side, 0.0])))
     x, y = _outline(np.linspace(np.pi, -np.pi, 41)[:-1], 1.97, -1.99, 0.79, _BODY_POWER, 0.0)
     return [*found, cap("well", np.stack([x, y, np.full_like(x, 0.2)], axis=1), np.array([0.0, 0.0, -1.0]))]
@@ -330,7 +329,7 @@ def _fittings() -> list[Patch]:
 def _near(a: Array, b: Array, path: list[tuple[float, float]]) -> Array:
     """Distance of points (a, b) to a polyline."""
     best = np.full(len(a), 9.0)
-    for (x0, y0), (x1, y1) in zip(path, path[1:], strict=False):
+    for (x0, y0), (x1, y1) in pairwise(path):
         dx, dy = x1 - x0, y1 - y0
         t = np.clip(((a - x0) * dx + (b - y0) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
         best = np.minimum(best, np.hypot(a - x0 - t * dx, b - y0 - t * dy))
@@ -356,17 +355,24 @@ def _lacquer(color: Array) -> Paint:
         gate = _near(np.abs(y), z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)])
         gate = np.where(x < -1.7, gate, 9.0)
         cap_ = np.where((y < -0.6) & (x < -1.0), np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075), 9.0)
+        fold = _near(x, np.abs(y), [(0.95, 0.5), (1.9, 0.36)])
         gap = np.min([side, hood, gate, cap_], axis=0)
-        return mix(np.broadcast_to(color, (len(x), 3)), 0.12 * color, 0.9 * step(0.005 - gap, 0.0, 0.011))
+        fold = np.where((x > 0.8) & (z > 0.7), np.clip(1.0 - fold / 0.05, 0.0, 1.0), 0.0)
+        shaded = mix(np.broadcast_to(color, (len(x), 3)), 0.75 * color, 0.8 * fold)
+        return mix(shaded, 0.12 * color, 0.9 * step(0.005 - gap, 0.0, 0.011))
 
     return paint
 
 
 def _panes(t: Texels) -> Array:
-    """Dark glass, with the pillar between the doors."""
-    x, y, _ = t.xyz.T
-    pillar = np.where(np.abs(y) > 0.55, step(0.035 - np.abs(x + 0.25), 0.0, 0.01), 0.0)
-    return mix(np.broadcast_to(hexed("20272b"), (len(x), 3)), hexed("0b0c0d"), pillar)
+    """Dark glass, with the pillar between the doors, and behind the windscreen what one sees of two seats."""
+    x, y, z = t.xyz.T
+    color = mix(np.broadcast_to(hexed("20272b"), (len(x), 3)), hexed("414d55"), np.clip((z - 0.95) / 0.5, 0.0, 1.0))
+    out = np.abs(y)
+    seat = np.minimum(np.hypot((out - 0.36) / 0.24, (z - 1.0) / 0.2), np.hypot((out - 0.36) / 0.11, (z - 1.23) / 0.055))
+    ahead = np.where(x > 0.0, step(1.0 - seat, 0.0, 0.15), 0.0)
+    pillar = np.where(out > 0.55, step(0.035 - np.abs(x + 0.25), 0.0, 0.01), 0.0)
+    return mix(color, hexed("0b0c0d"), np.maximum(pillar, ahead))
 
 
 def _lamps(t: Texels) -> Array:
@@ -380,7 +386,9 @@ def _lamps(t: Texels) -> Array:
 
 def _tail(t: Texels) -> Array:
     z = t.xyz[:, 2]
-    return mix(np.broadcast_to(hexed("8e0d12"), (len(z), 3)), hexed("d8392f"), step(0.018 - np.abs(z - 0.87), 0.0, 0.01))
+    return mix(
+        np.broadcast_to(hexed("8e0d12"), (len(z), 3)), hexed("d8392f"), step(0.018 - np.abs(z - 0.87), 0.0, 0.01)
+    )
 
 
 def _slats(t: Texels) -> Array:

@@ -50,32 +50,6 @@ def cropped(patch: Patch) -> Patch:
     return replace(patch, uvs=uvs, size=size, rest=lambda u, v: patch.rest(low[0] + u * span[0], low[1] + v * span[1]))
 
 
-def flattened(patches: Iterable[Patch], tag: str, axes: tuple[int, int], height: Field) -> Patch:
-    """Return patches of one tag joined into one, whose chart is the surface seen along an axis.
-
-    Args:
-        patches: pieces of a surface that does not overhang, seen that way.
-        tag: which of them; they become one.
-        axes: which coordinates u and v are; u x v points at the viewer.
-        height: the third coordinate of points (N, 3) that lack it.
-    """
-    own = [one for one in patches if one.tag == tag]
-    starts = np.cumsum([0] + [len(one.vertices) for one in own[:-1]])
-    vertices, normals = np.concatenate([p.vertices for p in own]), np.concatenate([p.normals for p in own])
-    faces = np.concatenate([p.faces + start for p, start in zip(own, starts, strict=True)])
-    used = vertices[np.unique(faces)][:, axes]
-    low, span = used.min(axis=0), np.ptp(used, axis=0)
-
-    def rest(u: Array, v: Array) -> Array:
-        points = np.zeros((len(u), 3))
-        points[:, axes] = low + np.stack([u, v], axis=1) * span
-        points[:, 3 - sum(axes)] = height(points)
-        return points
-
-    uvs = np.clip((vertices[:, axes] - low) / span, 0.0, 1.0)
-    return Patch(tag, vertices, normals, uvs, faces, (float(span[0]), float(span[1])), rest)
-
-
 def _edges(patch: Patch) -> Array:
     """The (E, 2) edges of a patch."""
     pairs = np.concatenate([patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]])
@@ -123,6 +97,6 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, Array]:
             for k in range(1, len(part) - 1):
                 faces.append((part[0], part[k], part[k + 1]))
                 side.append(sign > 0.0)
-    together = [np.concatenate([one, more]) for one, more in zip((patch.vertices, patch.normals, patch.uvs), extra, strict=True)]
-    cut_patch = replace(patch, vertices=together[0], normals=together[1], uvs=together[2], faces=np.array(faces))
-    return cut_patch, np.array(side)
+    before = (patch.vertices, patch.normals, patch.uvs)
+    places, normals, uvs = (np.concatenate([one, more]) for one, more in zip(before, extra, strict=True))
+    return replace(patch, vertices=places, normals=normals, uvs=uvs, faces=np.array(faces)), np.array(side)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from advsearch.scene.assets import Material
@@ -25,12 +27,12 @@ _STROKES = {  # letters in a cell 1 high and 0.6 wide: runs of points (x, y)
 def _ink(x: Array, y: Array, word: str, height: float, weight: float) -> Array:
     """Distance inside the strokes of a word centred at (0, 0), in the unit of x and y; negative outside."""
     best = np.full(len(x), -9.0)
-    width = 0.86 * height
+    width = 0.74 * height
     for k, letter in enumerate(word):
-        left = (k - len(word) / 2) * width + 0.13 * height
+        left = (k - len(word) / 2) * width + 0.07 * height
         for path in _STROKES[letter]:
             ends = np.array(path) * height + np.array([left, -height / 2])
-            for (x0, y0), (x1, y1) in zip(ends, ends[1:], strict=False):
+            for (x0, y0), (x1, y1) in pairwise(ends):
                 dx, dy = x1 - x0, y1 - y0
                 t = np.clip(((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
                 best = np.maximum(best, weight - np.hypot(x - x0 - t * dx, y - y0 - t * dy))
@@ -46,7 +48,7 @@ def _face(red: Array, radius: float) -> Paint:
         y, z = t.xyz[:, 1], t.xyz[:, 2]
         out = np.max([y * np.cos(a) + z * np.sin(a) for a in turns], axis=0)
         white = np.maximum(step(out - 0.915 * inner, 0.0, 0.006) * step(0.985 * inner - out, 0.0, 0.006), 0.0)
-        letters = step(_ink(y, z, "STOP", 0.62 * inner, 0.062 * inner), 0.0, 0.006)
+        letters = step(_ink(y, z, "STOP", 0.52 * inner, 0.05 * inner), 0.0, 0.006)
         return mix(np.broadcast_to(red, (len(y), 3)), hexed("f3f2ee"), np.maximum(white, letters))
 
     return paint
@@ -69,7 +71,9 @@ def _stop_sign(draw: Draw) -> Instance:
     tube = rounded([(0.03, 0.0), (0.03, height + 0.7 * radius), (0.0, height + 0.7 * radius + 0.004)], 0.004, 2)
     post = lathe([("post", np.array([(0.0, 0.0), (0.03, 0.0)])), ("post", tube[:-1]), ("post", tube[-2:])], 20)
     foot = lathe([("post", np.array([(0.0, 0.0), (0.09, 0.0), (0.09, 0.03), (0.03, 0.06)]))], 24)
-    clamps = [p for z in (-0.5, 0.5) for p in box("post", (0.02, 0.0, height + z * radius), (0.05, 0.09, 0.03), 0.006, 1)]
+    clamps = []
+    for z in (height - 0.5 * radius, height + 0.5 * radius):
+        clamps += box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)
     grey = colour(draw, "9a9da0", "7d8083", wild=0.0)
     paints: dict[str, Paint] = {"face": _face(red, radius), "metal": solid(hexed("a4a7aa")), "post": solid(grey)}
     finishes = {
