@@ -358,7 +358,7 @@ def _lacquer(color: Array) -> Paint:
         fold = _near(x, np.abs(y), [(0.95, 0.5), (1.9, 0.36)])
         gap = np.min([side, hood, gate, cap_], axis=0)
         fold = np.where((x > 0.8) & (z > 0.7), np.clip(1.0 - fold / 0.05, 0.0, 1.0), 0.0)
-        shaded = mix(np.broadcast_to(color, (len(x), 3)), 0.75 * color, 0.8 * fold)
+        shaded = mix(np.broadcast_to(color, (len(x), 3)), 0.75 * color, 0.4 * fold)
         return mix(shaded, 0.12 * color, 0.9 * step(0.005 - gap, 0.0, 0.011))
 
     return paint
