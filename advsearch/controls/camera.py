@@ -63,9 +63,12 @@ class CameraControl(NumberControl):
             )
         return replace(scene, thin_lens=True) if wanted else scene
 
+    def in_scene(self, scene: SceneDescription, parameter: Parameter) -> Parameter:
+        return measured_in(parameter, scene.object.metres is not None)
+
     def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
         if parameter.name == "distance" or parameter.name == "focus":
-            return fitted_distance(self._described(scene))
+            return fitted_distance(self._described(scene)) * scene.metres
         if parameter.name == "focal_length":
             return SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
         return super().default(scene, parameter)
@@ -75,7 +78,7 @@ class CameraControl(NumberControl):
 
     def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
         if parameter.name == "distance" and parameter.search is not None:
-            fitted = fitted_distance(self._described(scene))
+            fitted = fitted_distance(self._described(scene)) * scene.metres
             return parameter.search[0] * fitted, parameter.search[1] * fitted
         return parameter.search
 
@@ -84,13 +87,13 @@ class CameraControl(NumberControl):
         if "focal_length" in self.specs:
             fov = _fov_of(values["focal_length"])
         if self._distance_is_free(scene):
-            distance = values["distance"]
+            distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
         inputs = {"camera.to_world": self._orbit(scene, values, distance), "camera.fov": fov.reshape(1)}
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
-            focus = values["focus"] if "focus" in self.specs else distance
+            focus = values["focus"] / scene.metres if "focus" in self.specs else distance
             inputs["camera.focus"] = focus.reshape(1)
         if "shift_x" in self.specs or "shift_y" in self.specs:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
@@ -119,6 +122,11 @@ class CameraControl(NumberControl):
         left, up = roll.cos() * left + roll.sin() * up, roll.cos() * up - roll.sin() * left
         place = torch.from_numpy(middle(scene)).to(distance) + distance * outwards
         return affine(torch.stack([left, up, -outwards], dim=1), place)
+
+
+def measured_in(parameter: Parameter, metres: bool) -> Parameter:
+    """Return a parameter of the camera as it is around an object that has a size in metres, or has none."""
+    return replace(parameter, unit="metres") if metres and parameter.name in ("distance", "focus") else parameter
 
 
 def fitted_distance(scene: SceneDescription) -> float:

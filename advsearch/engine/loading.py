@@ -36,6 +36,7 @@ from advsearch.scene.importing.images import read_picture
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.road import on_its_ground
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 
@@ -107,7 +108,8 @@ class Scene:
         check_ground(own.given_values, name)
         if environment is not None:
             check_one_environment(own.parts, f"`environment={name}`")
-        return Scene(replace(own, environment=environment, environment_spec=name, given=given), self.only_here)
+        lit = replace(own, environment=environment, environment_spec=name, given=given)
+        return Scene(on_its_ground(lit), self.only_here)
 
     def __repr__(self) -> str:
         described = self.description
@@ -135,7 +137,7 @@ class Scene:
         own = self.description
         check_meshes(own, given)
         values = {**own.values, **{name: resolved[name] for name in given}}
-        return Scene(replace(own, values=values, given=own.given | set(given)), self.only_here)
+        return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
 
 
 @plainly()

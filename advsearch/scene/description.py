@@ -1,7 +1,8 @@
 """A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
 
 Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
-in degrees. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
+in degrees. `camera.distance` and `camera.focus` are in metres where the object has a size in metres. The camera at
+azimuth 0 and elevation 0 looks from +x towards the object.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.photograph import Photograph, photograph_of
+from advsearch.scene.road import on_its_ground
 
 Doubles = npt.NDArray[np.float64]
 
@@ -40,8 +42,6 @@ ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 """Mitsuba's lights from everywhere, of which a scene can have one."""
 NO_MAP = "none"
 """What the environment of a scene without a map is called."""
-TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in settings.CHANNELS))
-"""Settings that only a table has."""
 OWN_MAP = "own"
 """What the scene's own environment is called where another may be chosen."""
 
@@ -167,6 +167,12 @@ class SceneDescription:
         return self.environment is not None or bool(self.lamps) or shining or self.emits
 
     @property
+    def metres(self) -> float:
+        """What distances of the camera are to be divided by to be in object sizes: the object's size in metres; 1 where
+        it has none."""
+        return self.object.metres or 1.0
+
+    @property
     def object_name(self) -> str:
         """How the object was asked for, or else its own name."""
         return self.object_spec or self.object.name
@@ -236,7 +242,9 @@ class SceneDescription:
         own, kind = self.environment, self.values.get("ground.kind")
         if own is None or self.number("ground.size") == 0.0:
             return None
-        if kind is None and (not own.photographed or self.backdrop or not self.given.isdisjoint(TABLE_SETTINGS)):
+        if kind is None and (
+            not own.photographed or self.backdrop or not self.given.isdisjoint(settings.TABLE_SETTINGS)
+        ):
             return None
         if kind is not None and settings.GROUND_KINDS[int(kind)] != settings.PHOTOGRAPH:
             return None
@@ -314,7 +322,7 @@ def describe(
         metered=not mitsuba,
     )
     check_meshes(described, values)
-    return described
+    return on_its_ground(described)
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
@@ -353,16 +361,17 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
     Raises:
         InputError: there is no photograph, or a table is described beside it.
     """
-    if given.get("ground.kind") != settings.PHOTOGRAPH:
+    kind = given.get("ground.kind")
+    if kind not in (settings.PHOTOGRAPH, *settings.ROADS):
         return
-    if lit_by == NO_MAP:
+    if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
         raise InputError(
             "`set` ground.kind=photograph: the scene has no environment map to show; give it one, or leave it out"
         )
-    described = [name for name in TABLE_SETTINGS if name in given]
+    described = [name for name in settings.TABLE_SETTINGS if name in given]
     if described:
         raise InputError(
-            f"`set` ground.kind=photograph and `set` {described[0]} contradict each other: only a table has that; "
+            f"`set` ground.kind={kind} and `set` {described[0]} contradict each other: only a table has that; "
             f"leave one of the two out"
         )
 

@@ -29,6 +29,7 @@ from advsearch.scene.exporting.gltf import PosedMesh, glb, posed
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.blender import command, last_line, surroundings
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
+from advsearch.scene.road import paved
 
 LONGEST = 300
 """Seconds that one picture may take, the start included, before `advsearch.files.scaled`."""
@@ -221,7 +222,7 @@ def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[PosedMe
         shown = photograph.base if reflectance is None else reflectance
         return [PosedMesh("ground", photograph.mesh, linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
     half = scene.number("ground.size") / 2.0
-    if half <= 0.0:
+    if half <= 0.0 or paved(scene):
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))

@@ -14,6 +14,7 @@ from advsearch.scene.mitsuba_backend.meshes import matt, mitsuba_mesh
 from advsearch.scene.mitsuba_backend.parts import SceneInput, number, transform
 from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mitsuba
 from advsearch.scene.parts import PluginPart
+from advsearch.scene.road import paved
 
 GROUND = "ground"
 GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True)
@@ -39,7 +40,7 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     photograph = description.photograph
     if photograph is not None:
         scene[GROUND] = mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), matt(photograph.base.numpy()))
-    elif number("ground.size") > 0.0:
+    elif number("ground.size") > 0.0 and not paved(description):
         reflectance = srgb_to_linear(np.array(description.ground_color, np.float32)).tolist()
         scene[GROUND] = {
             "type": "rectangle",
