@@ -112,6 +112,7 @@ class NoWorseClaim(_Claim):
 
 
 AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim
+"""The kinds of claims; each is tried by a method of `Trial`. A claim about the frames of a drive would stand here."""
 
 
 class Suite(_Described):
