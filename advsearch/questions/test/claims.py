@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import Any
 
 import torch
 
@@ -16,7 +17,6 @@ from advsearch.api.subruns import carry_out_part
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.sequential import ConfidenceSequence
-from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
@@ -298,7 +298,7 @@ class Trial:
         )
 
 
-def answering_of(settings: JsonObject) -> Call:
+def answering_of(settings: JsonObject) -> Callable[[Any], Any]:
     """Return what answers the queries of a claim about two models, named by their place: what a worker does."""
     models = split_names(str(settings["model"]))
 

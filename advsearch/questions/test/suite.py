@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
-from pydantic_core import PydanticCustomError
 
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
@@ -56,10 +55,10 @@ class _Described(BaseModel):
 
     @field_validator(*NUMBERS, mode="before", check_fields=False)
     @classmethod
-    def _no_number_from_bool(cls, value: Any) -> Any:
+    def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
         """Refuse true for a number: YAML's `pictures: yes` is a slip, not 1."""
         if isinstance(value, bool):
-            raise PydanticCustomError("bool", "expected something else")
+            raise ValueError(f"expected {EXPECTED[info.field_name]}, got {value}")
         return value
 
 
@@ -113,6 +112,7 @@ class NoWorseClaim(_Claim):
 
 
 AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim
+"""The kinds of claims; each is tried by a method of `Trial`. A claim about the frames of a drive would stand here."""
 
 
 class Suite(_Described):
