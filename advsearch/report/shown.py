@@ -36,7 +36,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Section:
+class AnswerPart:
     """A part of an answer; what is empty is left out.
 
     Attributes:
@@ -70,7 +70,7 @@ class Section:
     only: str = ""
 
     @classmethod
-    def table(cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any) -> Section:
+    def table(cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any) -> AnswerPart:
         """Return a table, a row for each of some values.
 
         Args:
@@ -88,7 +88,7 @@ class Section:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownAnswer:
     """An answer.
 
     Attributes:
@@ -100,32 +100,32 @@ class Shown:
     """
 
     said: str
-    sections: Sequence[Section] = ()
+    sections: Sequence[AnswerPart] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     about: Sequence[str] = ()
     cautions: Sequence[str] = ()
 
 
-def shown(result: Result) -> Shown:
+def shown(result: Result) -> ShownAnswer:
     """Return what a person is shown of the result of any question."""
     own = rooms.in_room(result.command, "words", "shown")
-    made: Shown = own(result) if own else fields_shown(result)
+    made: ShownAnswer = own(result) if own else fields_shown(result)
     return made
 
 
-def remarks_of(result: Result, given: Shown) -> list[str]:
+def remarks_of(result: Result, given: ShownAnswer) -> list[str]:
     """Return what has to be known beside an answer."""
     stopped = ["Interrupted before its end."] if getattr(result, "ending", "") == INTERRUPTED else []
     return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
 
 
-def subject_of(result: Result, given: Shown) -> list[str]:
+def subject_of(result: Result, given: ShownAnswer) -> list[str]:
     """Return what an answer is about: objects, controls, model."""
     found = [getattr(result, name, None) or () for name in ("object", "objects", "controls", "model")]
     return [*given.about] or [", ".join([one] if isinstance(one, str) else one) for one in found if one]
 
 
-def facts_of(result: Result, given: Shown) -> dict[str, str]:
+def facts_of(result: Result, given: ShownAnswer) -> dict[str, str]:
     """Return by what an answer came about, without what is not known."""
     renders, seconds = getattr(result, "renders", None), getattr(result, "seconds", None)
     spent = sum(renders.values()) if isinstance(renders, Mapping) else renders
@@ -142,13 +142,13 @@ def facts_of(result: Result, given: Shown) -> dict[str, str]:
 # ---- fields as they are ---------------------------------------------------------------------------------------------
 
 
-def fields_shown(result: Result) -> Shown:
+def fields_shown(result: Result) -> ShownAnswer:
     """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
     values = {name: getattr(result, name) for name in type(result).model_fields}
     tables = {name: found for name, value in values.items() if (found := _rows(value))}
     plain = {_words(name): _text(one) for name, one in values.items() if name not in (*_ELSEWHERE, *tables)}
     sections = [
-        Section(
+        AnswerPart(
             _words(name),
             heads=[_words(one) for one in _columns(rows)],
             rows=[[_text(getattr(row, one, None)) for one in _columns(rows)] for row in rows],
@@ -157,9 +157,9 @@ def fields_shown(result: Result) -> Shown:
         for name, rows in tables.items()
     ]
     meanings = list(_meanings(result, {name for name, text in plain.items() if text}, list(tables.values())).items())
-    sections.append(Section("What these words mean", rows=meanings, folded=True, only="page"))
+    sections.append(AnswerPart("What these words mean", rows=meanings, folded=True, only="page"))
     said = result.brief or str(values.get("ending", "done"))
-    return Shown(said[:1].upper() + said[1:] + ".", sections, plain)
+    return ShownAnswer(said[:1].upper() + said[1:] + ".", sections, plain)
 
 
 def _meanings(result: Result, plain: set[str], tables: Sequence[Sequence[Fields]]) -> dict[str, str]:

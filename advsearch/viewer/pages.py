@@ -8,7 +8,7 @@ from pathlib import Path
 from advsearch import rooms
 from advsearch.report.charts import NARROW, WIDE, study_chart
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.shown import Picture, Section, Shown, facts_of, remarks_of, shown, subject_of
+from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
 from advsearch.runs.directory import IMAGES, REPORT
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary
@@ -55,7 +55,7 @@ def write_page(run: Path, result: Result) -> Path:
     return write_text(run / REPORT, text, durable=False)
 
 
-def shown_page(run: Path, result: Result, given: Shown) -> str:
+def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
     """Return what is shown of an answer as the page of the run in the folder `run`."""
     parts = list(getattr(result, "parts", ()))
     facts = {name[:1].upper() + name[1:]: text for name, text in facts_of(result, given).items()}
@@ -82,7 +82,7 @@ def kept(run: Path, name: str | Path) -> Path | None:
     return file if inside and file.stat().st_size <= LARGEST_FIGURE else None
 
 
-def _section(run: Path, one: Section) -> Html:
+def _section(run: Path, one: AnswerPart) -> Html:
     """A part of an answer; a folded one has its title as the handle."""
     chart = None
     if one.draw is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from advsearch.questions.check.answer import CheckedRow, CheckResult, DerivativeRow, DirectionRow
-from advsearch.report.shown import Column, Section, Shown
+from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 from advsearch.runs.results.base import OUT_OF_TIME
 
 READING = (
@@ -47,7 +47,7 @@ LOSSES = {
 }
 
 
-def shown(result: CheckResult) -> Shown:
+def shown(result: CheckResult) -> ShownAnswer:
     """Return what fell short, how to read the tables, and a table for each loss."""
     rows, left, said = result.rows, result.planned - result.measured, []
     if left:
@@ -59,15 +59,15 @@ def shown(result: CheckResult) -> Shown:
         said.append(f"Every parameter {'so far ' if left else ''}has a good gradient.")
     single = [row for row in rows if isinstance(row, DerivativeRow)]
     whole = [row for row in rows if isinstance(row, DirectionRow)]
-    return Shown(
+    return ShownAnswer(
         " ".join(said),
         [
-            Section(text=[READING] if rows else []),
+            AnswerPart(text=[READING] if rows else []),
             *(
-                Section.table([row for row in single if row.loss == name], SINGLE, title=text)
+                AnswerPart.table([row for row in single if row.loss == name], SINGLE, title=text)
                 for name, text in LOSSES.items()
             ),
-            Section.table(whole, WHOLE, title="The model's loss, cosine with the converged gradient"),
+            AnswerPart.table(whole, WHOLE, title="The model's loss, cosine with the converged gradient"),
         ],
     )
 

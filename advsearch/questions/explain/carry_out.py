@@ -31,7 +31,7 @@ from advsearch.questions.explain.answer import (
     RuleRow,
 )
 from advsearch.questions.explain.findings import Envelope, FactorWeight, find_envelope, find_importance
-from advsearch.questions.explain.renders import Asked, Renders, right_of
+from advsearch.questions.explain.renders import AskedSweep, Renders, right_of
 from advsearch.questions.explain.settings import ExplainConfig
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.results.base import INTERRUPTED
@@ -87,7 +87,7 @@ def explain_from_config(
     """
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage("reading rows")
-    asked = [Asked.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
+    asked = [AskedSweep.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
     rows = [row for one in asked for row in one.rows]
     if len(rows) < FEWEST_ROWS:
         raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")

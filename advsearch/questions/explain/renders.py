@@ -154,7 +154,7 @@ def _ranges(control: str, found: Observations, mask: Mask, cut: Mapping[int, Rul
 
 
 @dataclass(frozen=True)
-class Asked:
+class AskedSweep:
     """One of the sweeps whose rows are read."""
 
     folder: Path
@@ -163,7 +163,7 @@ class Asked:
     rows: list[Answered]
 
     @classmethod
-    def of(cls, folder: Path) -> Asked:
+    def of(cls, folder: Path) -> AskedSweep:
         summary = read_result(folder)
         if not isinstance(summary, SweepSummary):
             raise FileFormatError(f"{folder}: expected the run of a sweep that has ended, got one of another command")
@@ -199,7 +199,7 @@ class Renders:
         self.count += sum(done.renders.values())
         return None if self.interrupted else rows_of("", path, done)
 
-    def confirmed(self, rule: CountedRule, number: int, asked: Sequence[Asked]) -> RightOf | None:
+    def confirmed(self, rule: CountedRule, number: int, asked: Sequence[AskedSweep]) -> RightOf | None:
         """Render fresh configurations inside a rule, in the scene of each sweep."""
         if not self.config.confirm:
             return None
@@ -214,7 +214,7 @@ class Renders:
         return right_of(sum(kept), len(kept)) if kept else None
 
     def pairs(
-        self, rules: Sequence[CountedRule], rows: Sequence[Answered], asked: Sequence[Asked]
+        self, rules: Sequence[CountedRule], rows: Sequence[Answered], asked: Sequence[AskedSweep]
     ) -> Iterator[NearestRight]:
         """The nearest right configurations to typical failures, along the parameters of their rule or else the others.
 
@@ -234,7 +234,7 @@ class Renders:
                     yield min(near, key=self._moved)
                     break
 
-    def clusters(self, asked: Sequence[Asked], run: RunDirectory) -> FailureClusters | None:
+    def clusters(self, asked: Sequence[AskedSweep], run: RunDirectory) -> FailureClusters | None:
         """Render failures of one model's sweeps again, and group them by what it decides by."""
         alone = [one for one in asked if len(one.config.models) == 1]
         alike = [one for one in alone if one.config.models == alone[0].config.models]
@@ -288,7 +288,7 @@ class Renders:
             return 1.0
         return abs(float(pair.right_at) - float(pair.wrong_at)) / float(np.ptp(column))
 
-    def _nearest(self, name: str, one: Asked, row: Answered, factor: Factor) -> NearestRight | None:
+    def _nearest(self, name: str, one: AskedSweep, row: Answered, factor: Factor) -> NearestRight | None:
         """Go along one factor until the answer is right, twice with other noise; the failure fails in both."""
         self.progress.message(f"{name}: the nearest right answer along {factor.name}")
         label = f"{name}-{factor.name.replace('.', '_')}"
@@ -353,7 +353,7 @@ def _by_typicality(found: Observations, failures: npt.NDArray[np.intp]) -> list[
     return [int(one) for one in failures[np.argsort(away, kind="stable")]]
 
 
-def _sweep_of(index: int, asked: Sequence[Asked]) -> Asked:
+def _sweep_of(index: int, asked: Sequence[AskedSweep]) -> AskedSweep:
     for one in asked:
         if index < len(one.rows):
             return one

@@ -14,7 +14,7 @@ from advsearch.questions.explain.answer import (
 from advsearch.report import wording
 from advsearch.report.claims import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.report.phrases import percent, percent_number
-from advsearch.report.shown import Column, Picture, Section, Shown
+from advsearch.report.shown import AnswerPart, Column, Picture, ShownAnswer
 from advsearch.report.wording import conditions_text, interval_text
 
 CHOSEN = (
@@ -33,7 +33,7 @@ MOST_ANSWERS = 3
 """Answers of a cluster that are named."""
 
 
-def shown(result: ExplainResult) -> Shown:
+def shown(result: ExplainResult) -> ShownAnswer:
     """Return the rules, what decides, the envelope, and failures beside the nearest right answers."""
     rules = [f"{number + 1}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules)]
     weights: Mapping[str, Column] = {
@@ -43,15 +43,17 @@ def shown(result: ExplainResult) -> Shown:
         "by parts": lambda one: str(one.parts or ""),
     }
     found = result.clusters
-    return Shown(
+    return ShownAnswer(
         explain_text(result),
         [
-            Section("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
-            Section.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
-            Section("Where it can be relied on", [envelope_text(result)]),
-            Section("One thing changed", [pairs_text(result)]) if result.pairs_sought else Section(),
-            *(Section(text=[pair_text(one)], pictures=[_beside(one)]) for one in result.pairs),
-            Section("Kinds of failures", [clusters_text(found)], pictures=[_typical(found)]) if found else Section(),
+            AnswerPart("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
+            AnswerPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
+            AnswerPart("Where it can be relied on", [envelope_text(result)]),
+            AnswerPart("One thing changed", [pairs_text(result)]) if result.pairs_sought else AnswerPart(),
+            *(AnswerPart(text=[pair_text(one)], pictures=[_beside(one)]) for one in result.pairs),
+            AnswerPart("Kinds of failures", [clusters_text(found)], pictures=[_typical(found)])
+            if found
+            else AnswerPart(),
         ],
         {
             "rows": f"right in {right_share_text(result)}",

@@ -10,7 +10,7 @@ from advsearch.report import wording
 from advsearch.report.claims import NO_PROOF, Claim, Extent, claim, share_text
 from advsearch.report.drawing import BLUE, RED, Figures, drawn
 from advsearch.report.phrases import percent
-from advsearch.report.shown import Column, Section, Shown
+from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 
 ROBUST = (
     "Robust: the plain picture of a held-out scene is right, and the search finds no wrong one. 95 % Clopper-Pearson "
@@ -29,7 +29,7 @@ LINES = (("before", RED), ("after", BLUE))
 """Names and colours of the figure."""
 
 
-def shown(result: HardenResult) -> Shown:
+def shown(result: HardenResult) -> ShownAnswer:
     """Return how robust the model was and is, what it was trained on, and what never was."""
     rounds: Mapping[str, Column] = {
         "round": lambda one: str(one[0]),
@@ -54,14 +54,14 @@ def shown(result: HardenResult) -> Shown:
         "weights": result.weights or "",
         "pictures": result.pictures or "",
     }
-    return Shown(
+    return ShownAnswer(
         hardened_text(result),
         [
-            Section(
+            AnswerPart(
                 "Before and after", heads=HEADS, rows=hardened_rows(result), note=ROBUST, figure="images/harden.png"
             ),
-            Section.table(enumerate(result.rounds), rounds, title="The training", note=TRAINED, only="page"),
-            Section.table(result.split.items(), split, title="What it was trained and measured on", only="page"),
+            AnswerPart.table(enumerate(result.rounds), rounds, title="The training", note=TRAINED, only="page"),
+            AnswerPart.table(result.split.items(), split, title="What it was trained and measured on", only="page"),
         ],
         facts,
         about=[",".join(result.objects), ", ".join(result.controls)],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from advsearch.questions.plan.answer import PlanResult
-from advsearch.report.shown import Column, Section, Shown
+from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 from advsearch.runs.results.base import OUT_OF_TIME
 from advsearch.runs.results.derivatives import GroupDerivative
 
@@ -37,7 +37,7 @@ GAINS: Mapping[str, Column] = {
 """Columns of the tables."""
 
 
-def shown(chosen: PlanResult) -> Shown:
+def shown(chosen: PlanResult) -> ShownAnswer:
     """Return how derivatives are obtained, what is left out, and why."""
     groups: Mapping[str, Column] = {
         "parameter": "{0.name}",
@@ -48,17 +48,17 @@ def shown(chosen: PlanResult) -> Shown:
     denoise, left_out = chosen.denoise, chosen.left_out if chosen.specialised else ["nothing (`specialise=false`)"]
     why = "the time was up" if chosen.ending == OUT_OF_TIME else "it was stopped"
     advice = f"denoiser asked for: {denoise.asked}; better gradients: {denoise.advised} ({denoise.reason})"
-    return Shown(
+    return ShownAnswer(
         f"{chosen.brief[:1].upper()}{chosen.brief[1:]} a pixel.",
         [
-            Section.table(chosen.groups, groups, title="Derivatives", text=[READING]),
-            Section("Why", _why(chosen)),
-            Section("Left out", [*left_out, *_measured(chosen)]),
-            Section.table(chosen.gains or (), GAINS, title="What that saves"),
-            Section.table(chosen.cosines, COSINES, title="Gradients of the model's loss", note=advice),
-            Section(text=[advice] if chosen.cosines else [], only="text"),
-            Section(f"Not measured, {why}", chosen.not_measured),
-            Section("Limits of the material form", [limit.what for limit in chosen.limits]),
+            AnswerPart.table(chosen.groups, groups, title="Derivatives", text=[READING]),
+            AnswerPart("Why", _why(chosen)),
+            AnswerPart("Left out", [*left_out, *_measured(chosen)]),
+            AnswerPart.table(chosen.gains or (), GAINS, title="What that saves"),
+            AnswerPart.table(chosen.cosines, COSINES, title="Gradients of the model's loss", note=advice),
+            AnswerPart(text=[advice] if chosen.cosines else [], only="text"),
+            AnswerPart(f"Not measured, {why}", chosen.not_measured),
+            AnswerPart("Limits of the material form", [limit.what for limit in chosen.limits]),
         ],
         {"renders a gradient": str(chosen.renders_per_gradient), "samples a pixel": str(chosen.spp)},
     )

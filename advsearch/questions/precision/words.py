@@ -13,7 +13,7 @@ from advsearch.questions.precision.answer import (
     PrecisionSlope,
     Recommended,
 )
-from advsearch.report.shown import Column, Section, Shown
+from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 
 READING = (
     "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that "
@@ -55,25 +55,25 @@ REFERENCES: Mapping[str, Column] = {
 """Columns of the tables."""
 
 
-def shown(result: PrecisionResult) -> Shown:
+def shown(result: PrecisionResult) -> ShownAnswer:
     """Return what was measured, what follows from it, and what was not measured."""
     by = {name: [one for one in result.points if one.quantity == name] for name in ("image", "gradient", "objective")}
     machine = result.machine
     threads = " and ".join(f"{count} of {name}" for name, count in machine.threads.items())
     said = [sentence(one, result.goal) for one in result.recommendations]
     stopped = ["It was stopped: only a part was measured."] if result.goes_on else []
-    return Shown(
+    return ShownAnswer(
         " ".join(stopped) or "Error against run time, and the settings that reach the goal soonest.",
         [
-            Section("Recommended", said),
-            Section(text=[READING], only="text"),
+            AnswerPart("Recommended", said),
+            AnswerPart(text=[READING], only="text"),
             *(_errors(name, by[name]) for name in ("image", "gradient")),
-            Section.table(by["objective"], OBJECTIVES, title="Objective"),
-            Section.table(
+            AnswerPart.table(by["objective"], OBJECTIVES, title="Objective"),
+            AnswerPart.table(
                 result.slopes, SLOPES, title="Slopes: logarithm of the error against that of samples or seconds"
             ),
-            Section.table(result.references, REFERENCES, title="References, with their own errors", note=READING),
-            Section("Not measured, the time was up", _left_out(result.left_out)),
+            AnswerPart.table(result.references, REFERENCES, title="References, with their own errors", note=READING),
+            AnswerPart("Not measured, the time was up", _left_out(result.left_out)),
         ],
         {
             "model": result.model,
@@ -101,7 +101,7 @@ def sentence(one: Recommended, goal: float) -> str:
     return f"{asked}: {one.estimator}, {one.spp} samples, {one.seconds:.2g} s{basis}"
 
 
-def _errors(name: str, points: Sequence[PrecisionPoint]) -> Section:
+def _errors(name: str, points: Sequence[PrecisionPoint]) -> AnswerPart:
     """A row for each setting: of pictures with the error of the margin, of gradients with the cosine."""
     margin = any(one.margin_error is not None for one in points)
     columns: dict[str, Column] = {} if margin else {"control": lambda one: one.control or ""}
@@ -118,7 +118,7 @@ def _errors(name: str, points: Sequence[PrecisionPoint]) -> Section:
     columns["seconds"] = "{0.seconds:.3g}"
     if any(one.later_seconds is not None for one in points):
         columns["again"] = lambda one: f"{one.seconds if one.later_seconds is None else one.later_seconds:.3g}"
-    return Section.table(points, {**columns, "repeats": "{0.repeats}"}, title=name.capitalize())
+    return AnswerPart.table(points, {**columns, "repeats": "{0.repeats}"}, title=name.capitalize())
 
 
 def _theory(one: PrecisionSlope) -> str:

@@ -24,7 +24,7 @@ from advsearch.questions.recipe.answer import (
     TernaryFigure,
 )
 from advsearch.report.phrases import percent
-from advsearch.report.shown import Column, Section, Shown
+from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 from advsearch.report.wording import count, interval_text, short_name
 
 HeadsAndRows = tuple[list[str], list[list[str]]]
@@ -33,14 +33,14 @@ HeadsAndRows = tuple[list[str], list[list[str]]]
 COUNT_HEADS = ["right", "accuracy", "95 % interval"]
 
 
-def shown(result: RecipeResult) -> Shown:
+def shown(result: RecipeResult) -> ShownAnswer:
     """Return each figure with what it says and its numbers, and the runs that it took."""
     told = zip(result.figures, told_once(result.figures), strict=True)
-    sections = [Section(text=[result.about], only="page")]
+    sections = [AnswerPart(text=[result.about], only="page")]
     for number, (one, texts) in enumerate(told, start=1):
         heads, rows = figure_table(one)
-        sections.append(Section(one.title, texts, figure=f"images/figure-{number}.png"))
-        sections.append(Section("The numbers", heads=heads, rows=rows, folded=True, only="page"))
+        sections.append(AnswerPart(one.title, texts, figure=f"images/figure-{number}.png"))
+        sections.append(AnswerPart("The numbers", heads=heads, rows=rows, folded=True, only="page"))
     columns: Mapping[str, Column] = {
         "run in parts/": "{0.name}",
         "command": "{0.command}",
@@ -48,7 +48,7 @@ def shown(result: RecipeResult) -> Shown:
         "renders": "{0.renders}",
     }
     runs = {"title": count(len(result.parts), "run"), "parts": [one.name for one in result.parts]}
-    sections.append(Section.table(result.parts, columns, **runs, folded=True, only="page"))
+    sections.append(AnswerPart.table(result.parts, columns, **runs, folded=True, only="page"))
     objects, environments, models = (
         ", ".join(map(short_name, names))
         for names in (result.objects, result.environment.split(","), result.model.split(","))
@@ -56,7 +56,7 @@ def shown(result: RecipeResult) -> Shown:
     facts = {"objects": objects, "environments": environments, "models": models, "runs": str(len(result.parts))}
     facts |= {"renders": str(sum(one.renders for one in result.parts))}
     quick = ["Made with few and small pictures, to see what comes out; no result."] if result.quick else []
-    return Shown(result.title, sections, facts, [PurePath(result.recipe).stem, models, objects], quick)
+    return ShownAnswer(result.title, sections, facts, [PurePath(result.recipe).stem, models, objects], quick)
 
 
 def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:

@@ -9,14 +9,14 @@ from advsearch.questions.region.answer import BoxSide, MarginMap, RegionResult
 from advsearch.report.claims import Claim, Extent, claim, share_text
 from advsearch.report.drawing import Figures
 from advsearch.report.phrases import percent
-from advsearch.report.shown import Column, Section, Shown
+from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 from advsearch.report.studies import MARGIN, axis_title, figure_of, heat
 
 
-def shown(result: RegionResult) -> Shown:
+def shown(result: RegionResult) -> ShownAnswer:
     """Return the box and what is known of it."""
     if result.box is None or result.interval is None:
-        return Shown("Stopped before the box was known.")
+        return ShownAnswer("Stopped before the box was known.")
     box: Mapping[str, Column] = {
         "parameter": "{0.name}",
         "from": "{0.low:.4g}",
@@ -24,10 +24,10 @@ def shown(result: RegionResult) -> Shown:
         "centre": "{0.centre:.4g}",
         "unit": "{0.unit}",
     }
-    return Shown(
+    return ShownAnswer(
         f"The model is {result.verdict} in {result.same} of {result.samples} fresh samples of this box: with 95 % "
         f"confidence in at least {percent(result.interval[0])} of it.",
-        [Section.table(result.box, box, title="The box")],
+        [AnswerPart.table(result.box, box, title="The box")],
         {"share of the space": percent(result.volume), "samples a pixel": str(result.spp or "")},
     )
 

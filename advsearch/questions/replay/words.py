@@ -8,22 +8,22 @@ from pathlib import PurePath
 from advsearch.questions.replay.answer import NOT_DONE, ReplayResult, ReplayRow
 from advsearch.report import wording
 from advsearch.report.claims import Claim, case_claim
-from advsearch.report.shown import Section, Shown
+from advsearch.report.shown import AnswerPart, ShownAnswer
 
 HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "answer")
 """Of the columns."""
 
 
-def shown(result: ReplayResult) -> Shown:
+def shown(result: ReplayResult) -> ShownAnswer:
     """Return the table of conditions."""
     note = (
         "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
         "intervals. A success is what the search sought, where the clean scene is right with the same seed under the "
         "same condition."
     )
-    table = Section("Under other conditions", heads=HEADS, rows=replay_rows(result), note=note)
+    table = AnswerPart("Under other conditions", heads=HEADS, rows=replay_rows(result), note=note)
     about = [f"answer of {PurePath(result.answer).name} ({result.answered})", result.object, ", ".join(result.controls)]
-    return Shown(replay_text(result), [table], {"answer": result.answer, "model": result.model}, about)
+    return ShownAnswer(replay_text(result), [table], {"answer": result.answer, "model": result.model}, about)
 
 
 def claims(result: ReplayResult) -> Iterator[Claim]:

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Mapping
 
 from advsearch.questions.stability.answer import StabilityResult
-from advsearch.report.shown import Column, Section, Shown
+from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 
 COLUMNS: Mapping[str, Column] = {
     "group": "{0.group}",
@@ -19,7 +19,7 @@ COLUMNS: Mapping[str, Column] = {
 }
 
 
-def shown(result: StabilityResult) -> Shown:
+def shown(result: StabilityResult) -> ShownAnswer:
     """Return the cases, what was measured, what decides where a case fell short, and what was not run."""
     short = [row for row in result.rows if row.status != "ok"]
     numbers = [
@@ -28,13 +28,13 @@ def shown(result: StabilityResult) -> Shown:
         for name, value in row.measured.items()
         if name.startswith("condition number")
     ]
-    return Shown(
+    return ShownAnswer(
         f"{len(result.rows) - len(short)} of {len(result.rows)} cases hold, in "
         f"{sum(row.seconds for row in result.rows):.0f} seconds.",
         [
-            Section.table(result.rows, COLUMNS, title="Cases"),
-            Section("Condition numbers", rows=numbers),
-            Section("Short", [f"{row.case} fell short: {row.decides}; expected: {row.holds}" for row in short]),
-            Section("Not run", [", ".join(result.not_run)]),
+            AnswerPart.table(result.rows, COLUMNS, title="Cases"),
+            AnswerPart("Condition numbers", rows=numbers),
+            AnswerPart("Short", [f"{row.case} fell short: {row.decides}; expected: {row.holds}" for row in short]),
+            AnswerPart("Not run", [", ".join(result.not_run)]),
         ],
     )
