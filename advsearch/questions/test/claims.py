@@ -307,7 +307,7 @@ def answering_of(settings: JsonObject) -> Callable[[Any], Any]:
         parts = parts_of(config)
         return problem_of(config, parts.scene, parts.loaded[0], differentiated=False)
 
-    return answering(problem)
+    return answering(cache(problem))
 
 
 def _judged(problem: Problem, query: Query, picture: torch.Tensor | None) -> Evaluation:
