@@ -11,7 +11,7 @@ from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
 from advsearch.report.phrases import percent, with_article
 from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.evidence import Claim, Kind
+from advsearch.report.claims import Claim, Kind
 
 TABLE_HEADS = ("claim", "answer", "pictures", "why")
 
