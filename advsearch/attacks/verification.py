@@ -21,7 +21,7 @@ from advsearch.errors import InputError
 from advsearch.tasks import Judgement
 
 PASS_PERCENT = 95
-"""What a claim must hold in, in per cent of the trials, and what the clean control must pass: 14 of 14, 19 of 20, 22 of 23."""
+"""What a claim must hold in, in per cent of the trials, and what the clean control must pass: 14 of 14, 19 of 20."""
 
 PASS_PERCENT_OVER = 90
 """What a claim over many conditions must hold in, in per cent of those in which the clean configuration is right."""
