@@ -12,8 +12,8 @@ from advsearch.bundled import build
 from advsearch.bundled.environments import ENVIRONMENTS
 from advsearch.bundled.environments.panorama import HEIGHT, LEVEL, WIDTH, brightness, directions, irradiance
 from advsearch.bundled.objects import HOUSEHOLD, OBJECTS, STREET
-from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.carving import carved
+from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.shapes import grid
 from advsearch.errors import UnknownNameError
 from advsearch.scene import library
@@ -176,7 +176,7 @@ def test_things_of_the_street_have_their_size_and_several_materials() -> None:
     assert 1.4 < extent[2] < 1.55
     assert set(car.finishes) == set(car.mesh.materials)
     assert sum(map(len, car.mesh.materials.values())) == len(car.mesh.faces)
-    assert 2.2 < (library.load_object("stop-sign").metres or 0.0) < 2.8
+    assert 1.0 < (library.load_object("stop-sign").metres or 0.0) < 1.3
     assert library.load_object("mug").metres is None
 
 
