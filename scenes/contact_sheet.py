@@ -136,12 +136,13 @@ def street(size: int, spp: int) -> Floats:
     """The car and the stop sign in the streets, three in a row, 4 to 3."""
     import torch
 
-    from advsearch.engine.loading import load_scene
+    from advsearch.controls import Space
+    from advsearch.engine.loading import framed, load_scene, make_renderer
 
-    cells = []
+    cells, resolution = [], (3 * size // 2, 2 * size)
     for name, light, azimuth, elevation in STREET:
         scene = load_scene(name, light, settings={"camera.azimuth": azimuth, "camera.elevation": elevation})
-        renderer = scene.renderer({}, resolution=(3 * size // 2, 2 * size))
+        renderer = make_renderer(framed(scene.description, resolution), Space(()), resolution, "oidn", 0, None)
         with torch.no_grad():
             cells.append(renderer(renderer.start, 0, spp).numpy())
     return np.concatenate([np.concatenate(cells[i : i + 3], axis=1) for i in (0, 3)], axis=0)
