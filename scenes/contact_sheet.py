@@ -1,4 +1,4 @@
-"""Draws docs/images/objects.png and docs/images/environments.png: all objects and environments, to be looked at.
+"""Draws docs/images/objects.png, environments.png and street.webp: all objects and environments, to be looked at.
 
 Run as ``python -m advsearch.bundled.contact_sheet [--out docs/images] [--size 256] [--spp 64]``. It needs
 `mitsuba-oidn` and takes some minutes.
@@ -18,7 +18,7 @@ from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import mesh_part
 
 from .environments import ENVIRONMENTS
-from .objects import OBJECTS
+from .objects import HOUSEHOLD, OBJECTS
 
 Floats = npt.NDArray[np.float32]
 VARIANTS = 3
@@ -85,8 +85,11 @@ def picture(
 def _save(path: Path, image: Floats) -> None:
     from PIL import Image
 
-    levels = (image * 127 + 0.5).astype(np.uint8) * 2  # seven bits are enough to look at, and make a smaller file
-    Image.fromarray(levels).save(path, optimize=True)
+    if path.suffix == ".webp":
+        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(path, quality=86, method=6)
+    else:
+        levels = (image * 127 + 0.5).astype(np.uint8) * 2  # seven bits are enough to look at, and make a smaller file
+        Image.fromarray(levels).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size // 1024} KiB")
 
 
@@ -108,12 +111,12 @@ def objects(size: int, spp: int, names: list[str]) -> Floats:
 
 
 def environments(size: int, spp: int) -> Floats:
-    """For every environment its map and the mug under it, two in a row."""
+    """For every environment that goes with household objects its map and the mug under it, two in a row."""
     from PIL import Image
 
     mug = OBJECTS["mug"].generate(None)
     cells = []
-    for family in ENVIRONMENTS.values():
+    for family in (one for one in ENVIRONMENTS.values() if one.ground is None):
         light = family.make()
         chart = linear_to_srgb(light.radiance)
         wide = Image.fromarray((chart * 255 + 0.5).astype(np.uint8)).resize((2 * size, size), Image.Resampling.BICUBIC)
@@ -122,20 +125,46 @@ def environments(size: int, spp: int) -> Floats:
     return np.concatenate([np.concatenate(cells[i : i + 2], axis=1) for i in range(0, len(cells), 2)], axis=0)
 
 
+STREET = (
+    ("car", "street", 40.0, 12.0), ("car", "street", 205.0, 14.0), ("stop-sign", "street", -20.0, 4.0),
+    ("car", "street-wet", 325.0, 10.0), ("car", "street-dusk", 145.0, 8.0), ("stop-sign", "street-dusk", 25.0, 8.0),
+)  # fmt: skip
+"""Object, environment, azimuth and elevation of the pictures of the street."""
+
+
+def street(size: int, spp: int) -> Floats:
+    """The car and the stop sign in the streets, three in a row, 4 to 3."""
+    import torch
+
+    from advsearch.controls import Space
+    from advsearch.engine.loading import framed, load_scene, make_renderer
+
+    cells, resolution = [], (3 * size // 2, 2 * size)
+    for name, light, azimuth, elevation in STREET:
+        scene = load_scene(name, light, settings={"camera.azimuth": azimuth, "camera.elevation": elevation})
+        renderer = make_renderer(framed(scene.description, resolution), Space(()), resolution, "oidn", 0, None)
+        with torch.no_grad():
+            cells.append(renderer(renderer.start, 0, spp).numpy())
+    return np.concatenate([np.concatenate(cells[i : i + 3], axis=1) for i in (0, 3)], axis=0)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     parser.add_argument("--size", type=int, default=256, help="pixels across one picture")
     parser.add_argument("--spp", type=int, default=64, help="samples per pixel")
-    parser.add_argument("--only", nargs="*", default=list(OBJECTS), help="names of objects")
+    parser.add_argument("--only", nargs="*", default=list(HOUSEHOLD), help="names of objects")
     parser.add_argument("--no-environments", action="store_true")
     parser.add_argument("--no-objects", action="store_true")
+    parser.add_argument("--no-street", action="store_true")
     args = parser.parse_args()
     os.makedirs(args.out, exist_ok=True)
     if not args.no_objects:
         _save(args.out / "objects.png", objects(args.size, args.spp, args.only))
     if not args.no_environments:
         _save(args.out / "environments.png", environments(args.size, args.spp))
+    if not args.no_street:
+        _save(args.out / "street.webp", street(args.size, args.spp))
 
 
 if __name__ == "__main__":

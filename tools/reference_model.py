@@ -156,8 +156,8 @@ def default_views(spp: int = 64) -> dict[str, float]:
     import torch
     from reference_scenes import SIZE
 
-    from advsearch.controls import Space
     from advsearch.bundled.objects import HOUSEHOLD
+    from advsearch.controls import Space
     from advsearch.models import reference
     from advsearch.scene.description import describe
     from advsearch.scene.formation import ImageFormation

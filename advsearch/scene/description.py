@@ -295,7 +295,7 @@ def describe(
     file, node = split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)
     mitsuba = plugins is not None or (node is not None and str(file).lower().endswith(MITSUBA_FILE))
     if mitsuba:
-        around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up, given or {})
+        around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up)
     else:
         around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
     shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
@@ -322,6 +322,10 @@ def describe(
         metered=not mitsuba,
     )
     check_meshes(described, values)
+    idle = [name for name in given or {} if name.startswith("material.")]
+    if described.object.surface is not None and idle:
+        whose = "several materials" if described.object.finishes else "a surface of Mitsuba's own"
+        raise InputError(f"`set` {idle[0]}: the object has {whose}, without it; leave it out")
     return on_its_ground(described)
 
 
@@ -376,17 +380,13 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         )
 
 
-def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None, given: settings.Given) -> ImportedScene:
+def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None) -> ImportedScene:
     from advsearch.scene.mitsuba_backend.files.scene import import_plugins
 
     if up is not None:
         raise InputError("up: the first camera of a Mitsuba scene says which way is up; leave `up` out")
     with reading(scene) if isinstance(scene, Path) else nullcontext():
-        found = import_plugins(scene, shape)
-    idle = [name for name in given if name.startswith("material.")]
-    if found.object.surface is not None and idle:
-        raise InputError(f"`set` {idle[0]}: the object has a surface of Mitsuba's own, without it; leave it out")
-    return found
+        return import_plugins(scene, shape)
 
 
 def _scene(path: Path, node: str, up: str | None) -> ImportedScene:

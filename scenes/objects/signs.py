@@ -1,4 +1,8 @@
-"""A stop sign on its post. Units are metres; it is read from +x."""
+"""A stop sign as it stands at road works, on a low stand. Units are metres; it is read from +x.
+
+The stand is low because data sets draw the box of a stop sign around its plate: on a tall post the box of all that is
+there would be another one.
+"""
 
 from __future__ import annotations
 
@@ -65,24 +69,29 @@ def _plate(radius: float, thick: float) -> list[Patch]:
 
 
 def _stop_sign(draw: Draw) -> Instance:
-    radius, height = draw(0.41, 0.36, 0.46), draw(2.1, 1.8, 2.5)
+    radius, height = draw(0.45, 0.4, 0.5), draw(0.74, 0.66, 0.84)
     red = colour(draw, "b3121d", "a8161f", "c0202a", wild=0.0)
     plate = placed(_plate(radius, 0.004), offset=(0.036, 0.0, height))
     tube = rounded([(0.03, 0.0), (0.03, height + 0.7 * radius), (0.0, height + 0.7 * radius + 0.004)], 0.004, 2)
     post = lathe([("post", np.array([(0.0, 0.0), (0.03, 0.0)])), ("post", tube[:-1]), ("post", tube[-2:])], 20)
-    foot = lathe([("post", np.array([(0.0, 0.0), (0.09, 0.0), (0.09, 0.03), (0.03, 0.06)]))], 24)
+    foot = [
+        *box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2),
+        *box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1),
+    ]
     clamps = []
     for z in (height - 0.5 * radius, height + 0.5 * radius):
         clamps += box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)
     grey = colour(draw, "9a9da0", "7d8083", wild=0.0)
     paints: dict[str, Paint] = {"face": _face(red, radius), "metal": solid(hexed("a4a7aa")), "post": solid(grey)}
+    paints["rubber"] = solid(hexed("1d1d1f"))
     finishes = {
         "face": Material(roughness=0.35, clearcoat=0.4),
         "metal": Material(roughness=0.5, metallic=0.6),
         "post": Material(roughness=0.45, metallic=0.7),
+        "rubber": Material(roughness=0.85),
     }
     turned = placed([*plate, *post, *foot, *clamps], rotation("z", draw(0.0, -25.0, 25.0)))
-    return Instance(turned, paints, finishes["face"], {"metal": 0.25, "post": 0.18}, finishes)
+    return Instance(turned, paints, finishes["face"], {"metal": 0.25, "post": 0.18, "rubber": 0.3}, finishes)
 
 
 STOP_SIGN = ObjectFamily("stop-sign", _stop_sign, metres=1.0)
