@@ -112,7 +112,7 @@ class CameraModel:
         to the branch that the axis lies on is outside.
 
         Returns:
-            (N, 3) float64 unit vectors, and (N,) float64, over 0 where something is seen; it changes its sign along the
+            (N, 3) float64, of a fisheye and a panorama unit vectors, else with z = 1; and (N,) float64, over 0 where something is seen; it changes its sign along the
             edge of what is seen.
         """
         u, v = places.double().unbind(dim=-1)
@@ -129,7 +129,7 @@ class CameraModel:
         high = min(self._last, FAR)
         most = float(self._radial(torch.tensor([high], dtype=torch.float64)))
         if self.kind == FISHEYE:
-            angle, converged = self._inverted(radius, high)
+            angle, converged = self._inverted(radius, min(self.fold, math.pi))  # past its circle too, for its edge
             directions = torch.cat([axis * angle.sin()[..., None], angle.cos()[..., None]], dim=-1)
             return directions, _inside(most - radius, converged)
         start, converged = self._inverted(radius, high)
@@ -138,7 +138,7 @@ class CameraModel:
             flat, converged = self._newton(flat, bent, high)
             radius = (bent - self._decentred(flat)).norm(dim=-1)
         directions = torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1)
-        return directions / directions.norm(dim=-1, keepdim=True), _inside(most - radius, converged)
+        return directions, _inside(most - radius, converged)
 
     def _inverted(self, wanted: Tensor, high: float) -> tuple[Tensor, Tensor]:
         """Solve radial(found) = wanted within [0, high], where it grows; and which of them are solved."""
@@ -367,5 +367,5 @@ def _evaluated(coefficients: np.ndarray, at: Tensor) -> Tensor:
 
 
 def _inside(margin: Tensor, converged: Tensor) -> Tensor:
-    """The margin, below zero where an inversion has not converged."""
-    return torch.where(converged | (margin <= 0.0), margin, torch.full_like(margin, -1e-6))
+    """The margin, at most 1, below zero where an inversion has not converged."""
+    return torch.where(converged | (margin <= 0.0), margin, torch.full_like(margin, -1e-6)).clamp(-1.0, 1.0)
