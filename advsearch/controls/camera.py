@@ -86,7 +86,9 @@ class CameraControl(NumberControl):
         lacking = [name for name in bent if name not in OF_KIND[model.kind]]
         if lacking:
             has = ", ".join(OF_KIND[model.kind]) or "none"
-            raise InputError(f"`controls` {self.name}: a {model.kind} lens has the coefficients {has}, not {lacking[0]}")
+            raise InputError(
+                f"`controls` {self.name}: a {model.kind} lens has the coefficients {has}, not {lacking[0]}"
+            )
         own = ("fov", "focal_length") if model.name else ()
         shift = () if OF_KIND[model.kind] else ("shift_x", "shift_y")
         for name in (*own, *shift, "aperture", "focus"):

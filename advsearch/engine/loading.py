@@ -26,6 +26,7 @@ from advsearch.scene.description import (
     NO_MAP,
     ORBIT_CAMERA,
     SceneDescription,
+    check_fov,
     check_ground,
     check_meshes,
     check_one_environment,
@@ -135,6 +136,7 @@ class Scene:
         resolved = settings.resolve(given)
         own = self.description
         check_meshes(own, given)
+        check_fov(own.camera_model, given)
         values = {**own.values, **{name: resolved[name] for name in given}}
         return Scene(replace(own, values=values, given=own.given | set(given)), self.only_here)
 

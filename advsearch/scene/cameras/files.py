@@ -86,7 +86,9 @@ def read_camera(spec: str) -> CameraModel:
     if cameras:
         return _of_kalibr(spec, _chosen(path, which, cameras))
     if which:
-        raise FileFormatError(f"{path}: expected several cameras, as {which!r} is asked for, got one; leave #{which} out")
+        raise FileFormatError(
+            f"{path}: expected several cameras, as {which!r} is asked for, got one; leave #{which} out"
+        )
     if "intrinsics" in data and "camera_model" in data:
         return _of_kalibr(spec, data)
     return _of_opencv(spec, {re.sub(r"[_\s]", "", name).lower(): one for name, one in data.items()})
@@ -99,7 +101,9 @@ def _yaml(path: str, text: str) -> dict[str, Any]:
     try:
         data = parse_yaml(text)
     except ValueError as error:
-        raise FileFormatError(f"{path}: expected YAML, or COLMAP's cameras.txt, got {error}; correct the file") from None
+        raise FileFormatError(
+            f"{path}: expected YAML, or COLMAP's cameras.txt, got {error}; correct the file"
+        ) from None
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else f"a {type(data).__name__}"
         raise FileFormatError(
@@ -113,7 +117,9 @@ def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
     names = list(map(str, cameras))
     shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     if which and which not in names:
-        raise FileFormatError(f"{path}: expected one of its cameras {shown}, got {which[:40]!r}; write {path}#{names[0]}")
+        raise FileFormatError(
+            f"{path}: expected one of its cameras {shown}, got {which[:40]!r}; write {path}#{names[0]}"
+        )
     if not which and len(names) > 1:
         raise FileFormatError(
             f"{path}: has {len(names)} cameras, {shown}: say which one takes the picture, as in {path}#{names[0]}"

@@ -119,7 +119,9 @@ class CameraModel:
         if self.kind == EQUIRECTANGULAR:
             longitude, latitude = (u - 0.5) * (2.0 * torch.pi), (v - 0.5) * torch.pi
             level = latitude.cos()
-            return torch.stack([level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1), torch.ones_like(u)
+            return torch.stack([level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1), torch.ones_like(
+                u
+            )
         one = self.values
         y = (v - one["cy"]) / one["fy"]
         x = (u - one["cx"] - one["skew"] * y) / one["fx"]

@@ -226,7 +226,10 @@ def _walk(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[_F
 
     context = mi.BSDFContext()
     through = mi.Spectrum(1.0)
-    active, sharp = dr.any(weight > 0.0) & dr.full(mi.Bool, True, dr.width(ray.o)), dr.full(mi.Bool, True, dr.width(ray.o))
+    active, sharp = (
+        dr.any(weight > 0.0) & dr.full(mi.Bool, True, dr.width(ray.o)),
+        dr.full(mi.Bool, True, dr.width(ray.o)),
+    )
     cut_out = any(mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.Null) for one in scene.shapes() if one.bsdf())
     passed = mi.Bool(cut_out)
     last, last_pdf, last_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
