@@ -1,9 +1,9 @@
 """The `camera` control: an orbit around the object, the lens, and the exposure.
 
-The camera looks at the middle of the object in its default pose. Its lens bends as a calibrated one does
-(`advsearch.scene.cameras.model`) where a coefficient is asked for, or a camera file has one. While the distance is not searched or set, it follows
-the field of view so that the object keeps its place in the picture (a dolly zoom), down to where the camera would enter
-the sphere around the object: see `advsearch.scene.framing`.
+The camera looks at the middle of the object in its default pose. Its lens bends as a calibrated one does where a
+coefficient is asked for, or a camera file has one: see `advsearch.scene.cameras.model`. While the distance is not
+searched or set, it follows the field of view so that the object keeps its place in the picture (a dolly zoom), down to
+where the camera would enter the sphere around the object: see `advsearch.scene.framing`.
 """
 
 from __future__ import annotations

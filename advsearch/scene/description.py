@@ -358,8 +358,8 @@ def check_fov(model: CameraModel | None, given: Iterable[str]) -> None:
     """
     if model is not None and "camera.fov" in given:
         raise InputError(
-            f"`camera={model.name}` and `set` camera.fov contradict each other: the camera has focal lengths of its own; "
-            "leave one of the two out"
+            f"`camera={model.name}` and `set` camera.fov contradict each other: the camera has focal lengths of its own"
+            "; leave one of the two out"
         )
 
 

@@ -40,8 +40,8 @@ COLMAP: Mapping[str, tuple[str, str]] = {
     "RADIAL_FISHEYE": (FISHEYE, "f cx cy k1 k2"),
     "EQUIRECTANGULAR": (EQUIRECTANGULAR, "w h"),
 }
-"""COLMAP's models that are one of ours, with their parameters. FOV, EUCM, the division models and those with a thin prism
-on a fisheye are not."""
+"""COLMAP's models that are one of ours, with their parameters. FOV, EUCM, the division models and those with a thin
+prism on a fisheye are not."""
 OF_DISTORTION = {
     "plumb_bob": BROWN_CONRADY,
     "rational_polynomial": BROWN_CONRADY,
@@ -135,8 +135,8 @@ def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> Camera
     _, name, *rest = _chosen(path, which, rows)
     if name not in COLMAP:
         raise FileFormatError(
-            f"{path}: expected one of COLMAP's models {', '.join(COLMAP)}, got {name[:40]}, which is another projection; "
-            "fit one of these to it (colmap model_converter does not), or undistort the pictures"
+            f"{path}: expected one of COLMAP's models {', '.join(COLMAP)}, got {name[:40]}, which is another projection"
+            "; fit one of these to it (colmap model_converter does not), or undistort the pictures"
         )
     kind, names = COLMAP[name]
     wanted = ["width", "height", *names.split()]
@@ -267,8 +267,8 @@ def _made(spec: str, kind: str, size: tuple[float, float], found: Mapping[str, f
     for name, side in (("fx", width), ("fy", height)):
         if not side / LARGEST_FOCAL <= found[name] <= side * LARGEST_FOCAL:
             raise FileFormatError(
-                f"{path}: {name}: expected a focal length from {side / LARGEST_FOCAL:g} to {side * LARGEST_FOCAL:g} pixels "
-                f"for a side of {side:g}, got {found[name]:g}"
+                f"{path}: {name}: expected a focal length from {side / LARGEST_FOCAL:g} to {side * LARGEST_FOCAL:g} "
+                f"pixels for a side of {side:g}, got {found[name]:g}"
             )
     for name, side in (("cx", width), ("cy", height)):
         if not 0.0 < found[name] < side:

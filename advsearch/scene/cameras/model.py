@@ -8,11 +8,11 @@
     equirectangular: longitude over the width, latitude over the height
 
 These are the models of OpenCV's `projectPoints` and `fisheye::projectPoints`, after Brown 1971 (Close-range camera
-calibration) and Kannala and Brandt 2006 (A generic camera model and calibration method for conventional, wide-angle, and
-fish-eye lenses, equation 6). theta is the angle to the axis.
+calibration) and Kannala and Brandt 2006 (A generic camera model and calibration method for conventional, wide-angle,
+and fish-eye lenses, equation 6). theta is the angle to the axis.
 
 Points are in the camera's coordinates: x to the right, y down, z ahead. Places in the picture are shares of its width
-and height from the top left corner, and so are the focal lengths: a picture of another size is the same picture, scaled.
+and height from the top left corner, and so are the focal lengths: a picture of another size is the same one, scaled.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class CameraModel:
         kind: `BROWN_CONRADY`, `FISHEYE` or `EQUIRECTANGULAR`.
         numbers: (17,) in the order of `NUMBERS`: fx, cx and skew in picture widths, fy and cy in picture heights, and
             the coefficients.
-        name: how it was asked for: a file, or the name of a bundled one; empty where `camera.fov` says its focal length.
+        name: how it was asked for: a file, or a bundled one; empty where `camera.fov` says its focal length.
         size: (height, width) in pixels that it was calibrated for; None for any.
         reach: largest angle to the axis that it sees, degrees.
     """
@@ -106,14 +106,14 @@ class CameraModel:
         return torch.stack([column, one["fy"] * bent[..., 1] + one["cy"]], dim=-1), seen
 
     def rays(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the directions in which places (N, 2) in the picture look, and how far inside the lens's view they are.
+        """Return the directions in which places (N, 2) in the picture look, and how far inside the view they are.
 
         Found by Newton's method, kept within bounds by halving, and checked: a place whose inversion has not converged
         to the branch that the axis lies on is outside.
 
         Returns:
-            (N, 3) float64, of a fisheye and a panorama unit vectors, else with z = 1; and (N,) float64, over 0 where something is seen; it changes its sign along the
-            edge of what is seen.
+            (N, 3) float64, of a fisheye and a panorama unit vectors, else with z = 1; and (N,) float64, over 0 where
+            something is seen: it changes its sign along the edge of that.
         """
         u, v = places.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
@@ -324,8 +324,8 @@ class CameraModel:
         shape = wide * height / (tall * width)
         squeezed = f", which makes things {shape:.3g} times as high for their width" if abs(shape - 1.0) > 0.005 else ""
         return (
-            f"{self.name} is for {wide} x {tall} pixels (width x height): its focal lengths and its principal point are "
-            f"scaled to {width} x {height}{squeezed}.",
+            f"{self.name} is for {wide} x {tall} pixels (width x height): its focal lengths and its principal point "
+            f"are scaled to {width} x {height}{squeezed}.",
         )
 
 

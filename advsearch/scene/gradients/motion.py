@@ -77,7 +77,7 @@ class Motion:
         return projected, seen & (projected.abs() <= 1.2 * self._frame.double()).all(dim=1)
 
     def _projected(self, points: Tensor, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Where points (N, 3) in the camera's coordinates are seen, in pixels from the middle, and which are before it."""
+        """Where points (N, 3) in camera coordinates are seen, in pixels from the middle, and which are before it."""
         if self._model is not None:
             model = self._model.with_numbers(inputs["camera.lens"]) if "camera.lens" in inputs else self._model
             places, seen = model.project(points * torch.tensor([-1.0, -1.0, 1.0]).to(points))

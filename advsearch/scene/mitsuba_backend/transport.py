@@ -220,7 +220,7 @@ class _Step:
 
 
 def _walk(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[_First, list[_Step]]:
-    """Trace paths; return what the camera sees, and the vertices, the first one first. A ray of weight 0 sees nothing."""
+    """Trace paths; return what the camera sees, and the vertices, the first one first. Rays of weight 0 see nothing."""
     mi = mitsuba()
     import drjit as dr
 
