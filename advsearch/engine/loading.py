@@ -26,7 +26,6 @@ from advsearch.scene.description import (
     NO_MAP,
     ORBIT_CAMERA,
     SceneDescription,
-    check_fov,
     check_ground,
     check_meshes,
     check_one_environment,
@@ -136,7 +135,8 @@ class Scene:
         resolved = settings.resolve(given)
         own = self.description
         check_meshes(own, given)
-        check_fov(own.camera_model, given)
+        if own.camera_model is not None:
+            own.camera_model.check_given(given)
         values = {**own.values, **{name: resolved[name] for name in given}}
         return Scene(replace(own, values=values, given=own.given | set(given)), self.only_here)
 

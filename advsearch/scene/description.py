@@ -138,7 +138,7 @@ class SceneDescription:
         else:
             known = (ORBIT_CAMERA, *self.cameras, *bundled())
             raise UnknownNameError("camera", name, known, "Or give the path of a camera file, such as calib.yaml.")
-        check_fov(model, self.given)
+        model.check_given(self.given)
         return replace(self, camera=ORBIT_CAMERA, camera_model=model)
 
     @cached_property
@@ -348,19 +348,6 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
         mesh = settings.mesh_of(name)
         if mesh is not None and mesh not in scene.around:
             raise UnknownNameError("mesh around the object", mesh, scene.around, f"It stands in `set` {name}.")
-
-
-def check_fov(model: CameraModel | None, given: Iterable[str]) -> None:
-    """Check that nobody asks for the field of view of a camera that has focal lengths of its own.
-
-    Raises:
-        InputError: it is among the settings that are given.
-    """
-    if model is not None and "camera.fov" in given:
-        raise InputError(
-            f"`camera={model.name}` and `set` camera.fov contradict each other: the camera has focal lengths of its own"
-            "; leave one of the two out"
-        )
 
 
 def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:

@@ -314,10 +314,13 @@ def test_a_picture_of_another_size_is_scaled_and_said(tmp_path: Path) -> None:
         (None, {}, {"k1": 0.1, "aperture": 0.1}, "aperture is not supported with a lens with distortion"),
         ("fish", {}, {}, "unknown camera 'fish'"),
         ("no.yaml", {}, {}, "No such file"),
+        (None, {"camera.fov": 60.0}, {"k1": -1.5}, "background: it would show where the camera's lens sees nothing"),
     ],
 )
 def test_what_contradicts_a_lens_is_refused(
     camera: str | None, settings: dict[str, float], control: dict[str, object], words: str
 ) -> None:
     with pytest.raises(InputError, match=words):
-        advsearch.load_scene("mug", camera=camera, settings=settings).renderer({"camera": control}, resolution=16)
+        advsearch.load_scene("mug", camera=camera, settings=settings).renderer(
+            {"camera": control, **({"background": {}} if "background" in words else STILL)}, resolution=16
+        )

@@ -177,7 +177,7 @@ def _of_opencv(spec: str, data: Mapping[str, Any]) -> CameraModel:
     matrix = _numbers(path, "camera_matrix", _there(path, data, MATRIX, "camera_matrix"), (9,))
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got other numbers")
-    given = next((data[name] for name in DISTORTION if data.get(name) is not None), [])
+    given: object = next((data[name] for name in DISTORTION if data.get(name) is not None), [])
     coefficients = _numbers(path, "distortion_coefficients", given, (0, 4) if kind == FISHEYE else LENGTHS)
     names = COEFFICIENTS[:4] if kind == FISHEYE else IN_OPENCV
     found = dict(zip(names, coefficients, strict=False))

@@ -18,7 +18,7 @@ and height from the top left corner, and so are the focal lengths: a picture of 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,6 +26,8 @@ import numpy as np
 import torch
 from numpy.polynomial import polynomial
 from torch import Tensor
+
+from advsearch.errors import InputError
 
 BROWN_CONRADY, FISHEYE, EQUIRECTANGULAR = "brown-conrady", "fisheye", "equirectangular"
 LINEAR = ("fx", "fy", "cx", "cy", "skew")
@@ -78,6 +80,18 @@ class CameraModel:
     def with_numbers(self, numbers: Tensor) -> CameraModel:
         """Return the model with other numbers (17,)."""
         return replace(self, numbers=tuple(float(one) for one in numbers.double()))
+
+    def check_given(self, given: Iterable[str]) -> None:
+        """Check that nobody asks for the field of view of a camera that has focal lengths of its own.
+
+        Raises:
+            InputError: it is among the settings that are given.
+        """
+        if "camera.fov" in given:
+            raise InputError(
+                f"`camera={self.name}` and `set` camera.fov contradict each other: the camera has focal lengths of its "
+                "own; leave one of the two out"
+            )
 
     # ---- both ways --------------------------------------------------------------------------------------------------
 

@@ -92,6 +92,11 @@ def _lens(description: SceneDescription) -> Plugin:
     """The plugin of a camera, with what is before its place and its film."""
     model = description.camera_model
     if model is not None:
+        if description.backdrop and model.black > 0.0:
+            raise InputError(
+                "background: it would show where the camera's lens sees nothing as well; leave the plain background "
+                "out, or take a lens that fills the picture"
+            )
         import advsearch.scene.mitsuba_backend.sensor  # noqa: F401  (registers the sensor)
 
         return {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values}

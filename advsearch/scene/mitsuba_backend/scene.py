@@ -104,11 +104,6 @@ class MitsubaScene:
                     "background: Mitsuba hides surfaces that emit light together with the environment; leave the plain "
                     "background out, or take an object and surroundings without emission"
                 )
-            if description.backdrop and description.camera_model is not None and description.camera_model.black > 0.0:
-                raise InputError(
-                    "background: it would show where the camera's lens sees nothing as well; leave the plain "
-                    "background out, or take a lens that fills the picture"
-                )
             self._guides: Plugin = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
             if description.cut_out:
                 import advsearch.scene.mitsuba_backend.guides  # noqa: F401  (registers the integrator)
