@@ -20,6 +20,7 @@ from advsearch.models.switches import plainly
 from advsearch.options import told
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
+from advsearch.scene.cameras.model import bundled
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -136,6 +137,8 @@ class Scene:
         resolved = settings.resolve(given)
         own = self.description
         check_meshes(own, given)
+        if own.camera_model is not None:
+            own.camera_model.check_given(given)
         values = {**own.values, **{name: resolved[name] for name in given}}
         return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
 
@@ -161,7 +164,8 @@ def load_scene(
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
-        camera: name of a camera of a scene file; "orbit" or None for the one around the object.
+        camera: a camera file (OpenCV, Kalibr, ROS, COLMAP), "fisheye" or "equirectangular", whose lens the camera
+            around the object then has; the name of a camera of a scene file; "orbit" or None for a pinhole.
         texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
             top; `result.artifacts["texture"]`, say.
 
@@ -213,14 +217,20 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
 
 
 def named_camera(description: SceneDescription) -> str | None:
-    """Return the camera of a scene file in use, as `load_scene` takes it; None for the one around the object."""
+    """Return the camera in use, as `load_scene` takes it; None for the pinhole around the object."""
+    if description.camera_model is not None and description.camera_model.name:
+        return description.camera_model.name
     return None if description.camera == ORBIT_CAMERA else description.camera
 
 
 def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> SceneDescription:
     """Return the scene as it is seen in a picture of this size (side, or height and width)."""
     height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
-    return replace(description, aspect=width / height)
+    model, remarks = description.camera_model, description.remarks
+    if model is not None:
+        model = bundled(width / height).get(model.name, model)
+        remarks = tuple(dict.fromkeys((*remarks, *model.scaling((height, width)))))
+    return replace(description, aspect=width / height, camera_model=model, remarks=remarks)
 
 
 def make_renderer(

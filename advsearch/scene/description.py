@@ -21,6 +21,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import reading
 from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
+from advsearch.scene.cameras.files import read_camera
+from advsearch.scene.cameras.model import CameraModel, bundled
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
@@ -65,6 +67,7 @@ class SceneDescription:
         aspect: width over height of the picture.
         cameras: those with poses of their own, by name.
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
+        camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
         remarks: what a user should know of further files that controls have read.
     """
@@ -82,6 +85,7 @@ class SceneDescription:
     aspect: float = 1.0
     cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
     camera: str = ORBIT_CAMERA
+    camera_model: CameraModel | None = None
     metered: bool = True
     remarks: tuple[str, ...] = ()
 
@@ -105,21 +109,37 @@ class SceneDescription:
         return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
 
     def seen_by(self, camera: str) -> SceneDescription:
-        """Return the scene as one of its cameras sees it.
+        """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens.
+
+        Args:
+            camera: name of a camera of the scene, a path to a camera file, or the name of a bundled camera model.
 
         Raises:
             UnknownNameError: it has no such camera.
-            InputError: a setting of the camera around the object was given, and another is to see it.
+            InputError: a setting of the camera around the object was given, and another is to see it; or a file cannot
+                be used.
         """
         if camera not in (ORBIT_CAMERA, *self.cameras):
-            raise UnknownNameError("camera of the scene", camera, (ORBIT_CAMERA, *self.cameras))
+            return self._with_model(camera)
         idle = sorted(name for name in self.given if name.startswith("camera.") and name != "camera.exposure")
         if camera != ORBIT_CAMERA and idle:
             raise InputError(
                 f"`camera={camera}` and `set` {idle[0]} contradict each other: the camera of the file has a place and "
                 "a field of view of its own; leave one of the two out"
             )
-        return replace(self, camera=camera)
+        return replace(self, camera=camera, camera_model=None)
+
+    def _with_model(self, name: str) -> SceneDescription:
+        if is_path(name):
+            with reading(name.partition("#")[0]):
+                model = read_camera(name)
+        elif name in bundled():
+            model = bundled()[name]
+        else:
+            known = (ORBIT_CAMERA, *self.cameras, *bundled())
+            raise UnknownNameError("camera", name, known, "Or give the path of a camera file, such as calib.yaml.")
+        model.check_given(self.given)
+        return replace(self, camera=ORBIT_CAMERA, camera_model=model)
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
@@ -186,7 +206,8 @@ class SceneDescription:
     def notes(self) -> tuple[str, ...]:
         """What a user should know of how object and environment were read, and what controls name."""
         lit = () if self.environment is None else self.environment.warnings
-        return tuple(dict.fromkeys((*self.object.notes, *lit, *self.remarks)))
+        seen = () if self.camera_model is None else self.camera_model.notes
+        return tuple(dict.fromkeys((*self.object.notes, *lit, *seen, *self.remarks)))
 
     @property
     def bundled_environment(self) -> str | None:

@@ -60,7 +60,7 @@ def metered_gain(scene: SceneDescription) -> float:
     Where the camera sees nothing of the object, the card lies on the ground; where no light arrives the factor is 1.
     """
     default = {name: value for name, value in resolve({}).items() if name.startswith(MOVED)}
-    scene = replace(scene, values={**scene.values, **default}, aspect=1.0, camera=ORBIT_CAMERA)
+    scene = replace(scene, values={**scene.values, **default}, aspect=1.0, camera=ORBIT_CAMERA, camera_model=None)
     seen = visible_irradiance(scene)
     metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen
     return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0

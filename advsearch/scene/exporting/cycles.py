@@ -149,7 +149,7 @@ class Cycles:
         unknown += [
             f"a surface of Mitsuba's own on the {name}" for name, one in description.meshes.items() if one.surface
         ]
-        unknown += ["a lens"] if description.thin_lens else []
+        unknown += ["a lens"] if description.thin_lens or description.camera_model else []
         unknown += ["a plain background"] if description.backdrop else []
         if unknown:
             raise BlenderError(f"the scene has {', '.join(unknown[:5])}, which is not carried over to Blender")
