@@ -8,10 +8,10 @@ from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer, SuiteResult
 from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
+from advsearch.report.claims import Claim, Kind
 from advsearch.report.phrases import percent, with_article
 from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.report.claims import Claim, Kind
 
 TABLE_HEADS = ("claim", "answer", "pictures", "why")
 
