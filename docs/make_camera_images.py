@@ -37,7 +37,7 @@ KALIBR = """cam0:
   intrinsics: [190.0, 190.0, 319.5, 319.5]
   resolution: [640, 640]
 """
-FOLDING = "1 SIMPLE_RADIAL 640 640 420 320 320 -0.55\n"
+FOLDING = "1 SIMPLE_RADIAL 640 640 420 320 320 -0.3\n"
 
 
 def main() -> None:
@@ -48,7 +48,7 @@ def main() -> None:
         ("Kalibr: equidistant", "camchain.yaml", KALIBR),
         ("fisheye", "fisheye", ""),
         ("equirectangular", "equirectangular", ""),
-        ("COLMAP: k1 = -0.55, folds", "cameras.txt", FOLDING),
+        ("COLMAP: k1 = -0.3, folds", "cameras.txt", FOLDING),
     ]
     sheet = Image.new("RGB", (3 * SIDE + 20, 2 * (SIDE + CAPTION) + 10), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)

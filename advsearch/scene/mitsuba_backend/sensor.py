@@ -1,8 +1,8 @@
 """A camera with a model of its own inside Mitsuba. Import it only where a scene has one.
 
 The directions of rays are kept on a grid over the picture, from Newton's method, and in between are bilinear: the grid
-is so fine that this is off by less than a hundredth of a pixel, but for the last pixels before a fold. Every sample of a
-picture has a ray of its own, so that edges are as sharp as a pinhole's.
+is so fine that this is off by less than a hundredth of a pixel, but for the last pixels before a fold. Every sample of
+a picture has a ray of its own, so that edges are as sharp as a pinhole's.
 """
 
 from __future__ import annotations
