@@ -1,0 +1,548 @@
+"""Rays and look-ups of surface light: what texels see of the scene, what a surface does to light, what cameras see.
+
+A grid of texels is laid over each surface (`Grid`). Rays from texels say which texels and which cells of the
+environment they see (`gather`); the BSDF of each shape is measured as a table over the angle of view (`measured`); and
+cameras see texels, directly and in a lobe about the mirrored direction (`Views`). All of it is free of noise but for
+where rays are sent, and nothing of it depends on the light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time, population, recorded
+
+Floats = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int32]
+
+ANGLES = 32
+"""Entries of a table over the cosine of the angle of view."""
+LOBE_SAMPLES = 4096
+SHIFT = 1e-4
+"""How far from a surface rays begin, object sizes."""
+PASS = 1 << 20
+"""Rays of one launch of `gather`."""
+TABLES = ("diffuse", "gloss", "up", "along", "spread")
+CAMERA = 16
+"""Numbers of a camera."""
+PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
+"""Where the rays of a pixel go through it: a turned grid, which sees upright and level edges at four places."""
+RAYS = len(PATTERN)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The texels over one surface.
+
+    Attributes:
+        name: of the shape in Mitsuba's scene.
+        first: number of its first texel among those of all grids.
+        shape: rows and columns.
+        warp: None where it lies over texture coordinates; else (middle x, middle y, scale, rate) of a level plane whose
+            cells are small about its middle: coordinate = middle + scale sinh(rate s), s in [-1, 1].
+    """
+
+    name: str
+    first: int
+    shape: tuple[int, int]
+    warp: tuple[float, float, float, float] | None = None
+
+    @property
+    def count(self) -> int:
+        return self.shape[0] * self.shape[1]
+
+
+def gather(
+    scene: MitsubaScene,
+    grids: Sequence[Grid],
+    cells: tuple[int, int],
+    places: Floats,
+    normals: Floats,
+    rays: int,
+    seed: int,
+) -> Ints:
+    """Return what rays from texels see, over the cosine: (n, rays) numbers of texels; from the count of all texels on,
+    of cells of the environment; or -1, where there is no light: the back of a surface that has texels, or a shape that
+    has none.
+
+    Args:
+        scene: with its inputs set.
+        grids: of all surfaces.
+        cells: rows and columns of the cells of the environment.
+        places: (n, 3) where texels lie.
+        normals: (n, 3) unit shading normals.
+        rays: of each texel; the same well-spread points for all, shifted by chance.
+        seed: number of the shifts.
+    """
+    mi = mitsuba()
+    import drjit as dr
+
+    held, to_local = scene._scene, to_map(scene)
+    count, texels = len(places), grids[-1].first + grids[-1].count
+    steps = (np.arange(1, rays + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])) % 1.0
+    points = mi.Point2f(mi.Float(steps[:, 0].astype(np.float32)), mi.Float(steps[:, 1].astype(np.float32)))
+    shifts = np.random.default_rng(seed).random((count, 2), dtype=np.float32)
+    found = np.empty((count, rays), dtype=np.int32)
+    for begin in range(0, count, max(1, PASS // rays)):
+        some = slice(begin, min(count, begin + max(1, PASS // rays)))
+        lane = dr.arange(mi.UInt32, (some.stop - begin) * rays)
+        texel, number = lane // rays, lane % rays
+        shift = dr.gather(mi.Point2f, _points(mi.Point2f, shifts[some]), texel)
+        square = dr.gather(mi.Point2f, points, number) + shift
+        square -= dr.floor(square)
+        normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals[some]), texel)
+        place = dr.gather(mi.Point3f, _points(mi.Point3f, places[some]), texel)
+        way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
+        hit = held.ray_intersect(mi.Ray3f(place + normal * SHIFT, way))
+        column, row = _map_place(way, to_local)
+        across, down = mi.UInt32(column * cells[1]) % cells[1], mi.UInt32(dr.minimum(row * cells[0], cells[0] - 1))
+        seen = dr.select(hit.is_valid(), mi.Int32(-1), mi.Int32(texels + down * cells[1] + across))
+        front = dr.dot(hit.n, way) < 0.0
+        for grid, shape in zip(grids, _shapes(held, grids), strict=True):
+            on = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (front | (grid.warp is not None))
+            y, x = _grid_place(grid, hit.p, hit.uv)
+            nearest = mi.Int32(grid.first + _cell(y, grid.shape[0]) * grid.shape[1] + _cell(x, grid.shape[1]))
+            seen = dr.select(on, nearest, seen)
+        found[some] = seen.numpy().reshape(-1, rays)
+    return found
+
+
+def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) -> Floats:
+    """Return how much of what comes from directions texels receive: (n, k) cosines; 0 where something is in between.
+
+    Args:
+        scene: with its inputs set.
+        places, normals: (n, 3), as of `gather`.
+        ways: (k, 3) unit directions, in the axes of the environment's map.
+    """
+    mi = mitsuba()
+    import drjit as dr
+
+    world = (ways @ np.array(to_map(scene))).astype(np.float32)  # the transpose turns back
+    lane = dr.arange(mi.UInt32, len(places) * len(world))
+    texel, number = lane // len(world), lane % len(world)
+    place = dr.gather(mi.Point3f, _points(mi.Point3f, places), texel)
+    normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals), texel)
+    way = dr.gather(mi.Vector3f, _points(mi.Vector3f, world), number)
+    cosine = dr.dot(normal, way)
+    above = cosine > 0.0
+    hidden = scene._scene.ray_test(mi.Ray3f(place + normal * SHIFT, way), above)
+    found: Floats = dr.select(above & ~hidden, cosine, 0.0).numpy().reshape(len(places), len(world))
+    return found
+
+
+# ---- what a surface does to light -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Lobes:
+    """What a surface does to light, by the cosine of the angle of view (`ANGLES` entries, the first at grazing).
+
+    Attributes:
+        diffuse: (k,) share of even light that it reflects for a base colour of one, without the gloss.
+        gloss: (k,) share of even light that it reflects whatever the base colour.
+        up, along: (k,) of the gloss's mean direction: its parts along the normal, and away from the viewer.
+        spread: (k,) root mean square angle about that direction, radians.
+    """
+
+    diffuse: Floats
+    gloss: Floats
+    up: Floats
+    along: Floats
+    spread: Floats
+
+    @classmethod
+    def matt(cls) -> Lobes:
+        """Those of a diffuse surface."""
+        one, none = np.ones(ANGLES, dtype=np.float32), np.zeros(ANGLES, dtype=np.float32)
+        return cls(one, none, one, none, none)
+
+    @property
+    def mean_shares(self) -> tuple[float, float]:
+        """Both shares under even light from everywhere, over all angles of view."""
+        weight = (np.arange(ANGLES) + 0.5) * 2.0 / ANGLES**2
+        return float((weight * self.diffuse).sum()), float((weight * self.gloss).sum())
+
+
+def measured(scene: MitsubaScene, inputs: Mapping[str, Tensor], grid: Grid, place: Floats, normal: Floats) -> Lobes:
+    """Measure the BSDF of a shape, by sampling it, at one of its texels: a (3,) place and the unit normal there."""
+    mi = mitsuba()
+    import drjit as dr
+
+    key = f"{grid.name}.base_color"
+    with one_at_a_time:
+        middle = (np.arange(ANGLES) + 0.5) / ANGLES
+        cosine = dr.repeat(mi.Float(middle.astype(np.float32)), LOBE_SAMPLES)
+        towards = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
+        noise = mi.load_dict({"type": "independent"})
+        noise.seed(0, ANGLES * LOBE_SAMPLES)
+        one, two = noise.next_1d(), noise.next_2d()
+        even = mi.warp.square_to_cosine_hemisphere(two)
+        found = []
+        for level in (0.5, 0.0):
+            changed = {key: torch.full_like(scene.base(key), level)} if key in scene.names else {}
+            held = scene.held({**inputs, **changed})
+            start = mi.Point3f([float(x) for x in place + 1e-3 * normal])
+            ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
+            hit = held.ray_intersect(dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, ANGLES * LOBE_SAMPLES)))
+            bsdf = hit.bsdf()
+            hit.wi = towards
+            value = bsdf.eval(mi.BSDFContext(), hit, even)
+            if level:
+                found.append(dr.mean(value))
+                continue
+            sampled, weight = bsdf.sample(mi.BSDFContext(), hit, one, two)
+            back = dr.select((sampled.pdf > 0.0) & (sampled.wo.z > 0.0), dr.mean(weight), 0.0)
+            back = dr.select(dr.isfinite(back), back, 0.0)
+            found += [dr.mean(value), back, back * sampled.wo.x, back * sampled.wo.z]
+    density = (even.z / math.pi).numpy()
+    lit, dark, share, x, z = (_means(one) for one in (found[0].numpy() / density, found[1].numpy() / density, *found[2:]))
+    length = np.sqrt(x * x + z * z)
+    kept = np.maximum(share, 1e-12)
+    spread = np.sqrt(np.maximum(0.0, 2.0 * (1.0 - length / kept)))
+    mirrored = share < 1e-6
+    up = np.where(mirrored, middle, z / np.maximum(length, 1e-12))
+    along = np.where(mirrored, -np.sqrt(1.0 - middle**2), x / np.maximum(length, 1e-12))
+    parts = (np.maximum(lit - dark, 0.0) / 0.5, share, up, -along, np.where(mirrored, 0.0, spread))
+    return Lobes(*(part.astype(np.float32) for part in parts))
+
+
+def _means(values: Any) -> npt.NDArray[np.float64]:
+    array = values if isinstance(values, np.ndarray) else values.numpy()
+    return np.asarray(array.reshape(ANGLES, LOBE_SAMPLES).mean(axis=1), dtype=np.float64)
+
+
+# ---- what cameras see -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Lit:
+    """The light of one moment, as `Views` looks it up; flat arrays of Dr.Jit.
+
+    Attributes:
+        texels: radiance that leaves each texel of all grids; of a photographed ground, the share of the photograph that
+            it shows. Three numbers each.
+        sky: the environment's map, three numbers each.
+        sky_shape: its rows and columns, the copied columns at both ends among them.
+        blurred: the map, blurred by each of `widths`, three numbers each.
+        blurred_shape: their rows and columns.
+    """
+
+    texels: Any
+    sky: Any
+    sky_shape: tuple[int, int]
+    blurred: Any
+    blurred_shape: tuple[int, int]
+
+
+def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
+    """Return light for look-ups, in memory of its own.
+
+    Args:
+        texels: (cells of all grids, 3).
+        padded: (H, W + 2, 3).
+        blurred: (widths, h, w, 3).
+    """
+    mi = mitsuba()
+    arrays = [mi.Float(one.contiguous().numpy().ravel()) for one in (texels, padded, blurred)]
+    shapes = [(one.shape[-3], one.shape[-2]) for one in (padded, blurred)]
+    return Lit(arrays[0], arrays[1], shapes[0], arrays[2], shapes[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What cameras see.
+
+    Attributes:
+        rest: (n, H, W, 3) radiance but for what the searched texture reflects diffusely.
+        covered: (n, H, W, 1) share of each pixel that shows surfaces.
+        sample: (k,) int64, the rays that see the searched texture, ascending; `samples` a pixel, row by row.
+        uv: (k, 2) where; as Mitsuba has them.
+        weight: (k,) the diffuse share over pi, and over the rays of a pixel.
+    """
+
+    rest: Tensor
+    covered: Tensor
+    sample: Tensor
+    uv: Tensor
+    weight: Tensor
+
+
+class Views:
+    """Looks through many cameras in one launch, which is recorded.
+
+    Args:
+        scene: whose cameras and shapes these are; the inputs that it is asked with have to be set in it.
+        grids: of all surfaces that take part, that of the searched texture first.
+        lobes: of each.
+        widths: root mean square angles of the blurred maps, each twice the one before, radians.
+        photographed: height of the camera of a photographed ground; None where the ground is none.
+    """
+
+    def __init__(
+        self,
+        scene: MitsubaScene,
+        grids: Sequence[Grid],
+        lobes: Sequence[Lobes],
+        widths: Sequence[float],
+        photographed: float | None,
+    ) -> None:
+        self._scene, self._grids, self._widths, self._photographed = scene, tuple(grids), tuple(widths), photographed
+        tables = [np.concatenate([getattr(one, name) for name in TABLES]) for one in lobes]
+        self._tables = np.concatenate(tables).astype(np.float32)
+        self._recorded: dict[tuple[Any, ...], Any] = {}
+        self._recorded_at = (0, 0)
+
+    def __call__(self, cameras: Sequence[Mapping[str, Tensor]], lit: Lit) -> Seen:
+        """Look at a lit scene.
+
+        Args:
+            cameras: the inputs of each: `camera.to_world` (4, 4), `camera.fov`, `camera.shift_x` and `camera.shift_y`
+                (1,).
+            lit: what it looks like.
+        """
+        with one_at_a_time:
+            mi = mitsuba()
+            import drjit as dr
+
+            height, width = self._scene.resolution
+            count = len(cameras)
+            rows = np.stack([_camera(one, height, width) for one in cameras]).astype(np.float32)
+            now = (population.changes, dr.thread_count())
+            if self._recorded_at != now:
+                self._recorded.clear()
+                self._recorded_at = now
+            key = count, lit.sky_shape, lit.blurred_shape
+            if key not in self._recorded:
+
+                def look(held: Any, tables: Any, given: Any, texels: Any, sky: Any, blurred: Any) -> Any:
+                    there = Lit(texels, sky, lit.sky_shape, blurred, lit.blurred_shape)
+                    return self._look(held, tables, given, there, count)
+
+                self._recorded[key] = recorded(look, [])
+            arrays = [mi.Float(one) for one in (self._tables, rows.ravel())]
+            found = self._recorded[key](self._scene._scene, *arrays, lit.texels, lit.sky, lit.blurred)
+            *rest, covered, u, v, weight = (one.numpy() for one in found)
+            size = (count, height, width)
+            (sample,) = np.nonzero(weight)
+            return Seen(
+                rest=torch.from_numpy(np.stack(rest, axis=-1)).reshape(*size, 3),
+                covered=torch.from_numpy(covered.copy()).reshape(*size, 1),
+                sample=torch.from_numpy(sample),
+                uv=torch.from_numpy(np.stack([u[sample], v[sample]], axis=1)),
+                weight=torch.from_numpy(weight[sample]),
+            )
+
+    def _look(self, held: Any, tables: Any, cameras: Any, lit: Lit, count: int) -> list[Any]:
+        """The kernel: radiance but for the searched texture, coverage, and where and how much each ray sees of it."""
+        mi = mitsuba()
+        import drjit as dr
+
+        height, width = self._scene.resolution
+        lane = dr.arange(mi.UInt32, count * height * width * RAYS)
+        pixel, number = lane // RAYS, lane % RAYS
+        view, pixel = pixel // (height * width), pixel % (height * width)
+        across, down = (_chosen(number, [one[axis] for one in PATTERN]) for axis in (0, 1))
+        entry = [dr.gather(mi.Float, cameras, view * CAMERA + k) for k in range(CAMERA)]
+        x = (entry[14] - 2.0 * (mi.Float(pixel % width) + across) / width) * entry[12]
+        y = (entry[15] - 2.0 * (mi.Float(pixel // width) + down) / height) * entry[13]
+        way = dr.normalize(mi.Vector3f(*(entry[k] * x + entry[3 + k] * y + entry[6 + k] for k in range(3))))
+        hit = held.ray_intersect(mi.Ray3f(mi.Point3f(*entry[9:12]), way))
+        valid, to_local = hit.is_valid(), to_map(self._scene)
+        shapes = _shapes(held, self._grids)
+        ons = [valid & (hit.shape == mi.ShapePtr(shape)) for shape in shapes]
+        normal = dr.select(dr.dot(hit.sh_frame.n, way) > 0.0, -hit.sh_frame.n, hit.sh_frame.n)
+        cosine = -dr.dot(normal, way)
+        table = mi.UInt32(0)
+        for number_of, on in enumerate(ons):
+            table = dr.select(on, mi.UInt32(number_of * len(TABLES) * ANGLES), table)
+        diffuse, gloss, up, along, spread = self._measured(tables, table, cosine)
+        shown = self._shown(hit, ons, lit, to_local, way)
+        radiance = dr.select(ons[0], 0.0, shown * dr.select(valid, diffuse, 1.0))
+        # the gloss: a ray in the mean direction of the lobe says what is there, the blurred map how bright it is
+        glossy = valid & (gloss > 1e-4)
+        beside = dr.normalize(way + normal * cosine + 1e-8)
+        mirrored = dr.normalize(normal * up + beside * along)
+        second = held.ray_intersect(mi.Ray3f(hit.p + normal * SHIFT, mirrored), glossy)
+        seconds = [second.is_valid() & (second.shape == mi.ShapePtr(shape)) for shape in shapes]
+        reflected = self._shown(second, seconds, lit, to_local, mirrored)
+        blurred = _blurred(lit, mirrored, to_local, spread, self._widths)
+        reflected = dr.select(second.is_valid(), reflected, blurred)
+        radiance += dr.select(glossy, gloss * reflected, 0.0)
+        radiance += dr.select(valid, 0.0, _sky(lit, way, to_local))
+        covered = dr.select(valid, mi.Float(1.0 / RAYS), 0.0)
+        weight = dr.select(ons[0], diffuse / (math.pi * RAYS), 0.0)
+        sums = [dr.block_sum(one, RAYS) for one in (*(radiance / RAYS), covered)]
+        return [*sums, hit.uv.x, hit.uv.y, weight]
+
+    def _measured(self, tables: Any, first: Any, cosine: Any) -> list[Any]:
+        """The entries of the tables at a cosine."""
+        mi = mitsuba()
+        import drjit as dr
+
+        place = dr.clip(cosine * ANGLES - 0.5, 0.0, ANGLES - 1.0)
+        low = dr.minimum(mi.UInt32(place), ANGLES - 2)
+        share = place - mi.Float(low)
+        found = []
+        for number in range(len(TABLES)):
+            one, other = (dr.gather(mi.Float, tables, first + (number * ANGLES + k) + low) for k in (0, 1))
+            found.append(one + share * (other - one))
+        return found
+
+    def _shown(self, hit: Any, ons: Sequence[Any], lit: Lit, to_local: Any, way: Any) -> Any:
+        """Diffuse radiance of what was hit."""
+        mi = mitsuba()
+        import drjit as dr
+
+        first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
+        y, x, level = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
+        for grid, on in zip(self._grids, ons, strict=True):
+            down, across = _grid_place(grid, hit.p, hit.uv)
+            y, x = dr.select(on, down, y), dr.select(on, across, x)
+            first = dr.select(on, mi.UInt32(grid.first), first)
+            rows = dr.select(on, mi.UInt32(grid.shape[0]), rows)
+            columns = dr.select(on, mi.UInt32(grid.shape[1]), columns)
+            level |= on & (grid.warp is not None)
+        found = _bilinear(lit.texels, first, rows, columns, y * mi.Float(rows) - 0.5, x * mi.Float(columns) - 0.5)
+        if self._photographed is not None:
+            below = dr.normalize(hit.p - mi.Point3f(0.0, 0.0, self._photographed))
+            found *= dr.select(level, _sky(lit, below, to_local), 1.0)
+        any_of_them = mi.Bool(False)
+        for on in ons:
+            any_of_them |= on
+        return dr.select(any_of_them, found, 0.0)
+
+
+# ---- places ---------------------------------------------------------------------------------------------------------
+
+
+def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
+    """The 16 numbers of a camera: its axes to the left, up and forward, its place, half its extent, its middle."""
+    matrix = inputs["camera.to_world"].detach().double().numpy()
+    half = math.tan(math.radians(float(inputs["camera.fov"])) / 2.0)
+    longer = max(height, width)
+    shift = [float(inputs[name]) if name in inputs else 0.0 for name in ("camera.shift_x", "camera.shift_y")]
+    extent = [half * width / longer, half * height / longer]
+    middle = [1.0 + 2.0 * shift[0], 1.0 + 2.0 * shift[1]]
+    return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, middle])
+
+
+def _shapes(held: Any, grids: Sequence[Grid]) -> list[Any]:
+    """Mitsuba's shapes of grids."""
+    by_name = {one.id(): one for one in held.shapes()}
+    return [by_name[grid.name] for grid in grids]
+
+
+def to_map(scene: MitsubaScene) -> Any:
+    """The turn from the world to the axes of the environment's map, three rows."""
+    matrix = scene.parameters["environment.to_world"].matrix
+    return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3].T.tolist()
+
+
+def _map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
+    """Where in the environment's map a direction lies: shares of its width and of its height."""
+    mi = mitsuba()
+    import drjit as dr
+
+    x, y, z = (row[0] * way.x + row[1] * way.y + row[2] * way.z for row in to_local)
+    across = dr.atan2(x, -z) / (2.0 * math.pi)
+    return across - dr.floor(across), dr.safe_acos(y) / math.pi
+
+
+def _grid_place(grid: Grid, place: Any, uv: Any) -> tuple[Any, Any]:
+    """Where in a grid something lies: shares of its height and of its width."""
+    import drjit as dr
+
+    if grid.warp is None:
+        return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
+    middle_x, middle_y, scale, rate = grid.warp
+    shares = []
+    for along, middle in ((place.y, middle_y), (place.x, middle_x)):
+        far = (along - middle) / scale
+        shares.append(dr.clip(0.5 + dr.asinh(far) / (2.0 * rate), 0.0, 1.0))
+    return shares[0], shares[1]
+
+
+def _cell(share: Any, count: int) -> Any:
+    mi = mitsuba()
+    import drjit as dr
+
+    return mi.Int32(dr.minimum(share * count, count - 1.0))
+
+
+def _chosen(number: Any, values: Sequence[float]) -> Any:
+    """The value with a number."""
+    mi = mitsuba()
+    import drjit as dr
+
+    found = mi.Float(values[0])
+    for index, value in enumerate(values[1:], 1):
+        found = dr.select(number == index, value, found)
+    return found
+
+
+def _bilinear(values: Any, first: Any, rows: Any, columns: Any, y: Any, x: Any, *, wraps: bool = False) -> Any:
+    """Look three numbers up in a grid of a flat array, which ends at its border or goes round in its columns."""
+    mi = mitsuba()
+    import drjit as dr
+
+    y = dr.clip(y, 0.0, mi.Float(rows) - 1.0)
+    upper, share = mi.UInt32(y), y - dr.floor(y)
+    lower = dr.minimum(upper + 1, rows - 1)
+    if wraps:
+        x = dr.select(x < 0.0, x + mi.Float(columns), x)
+    else:
+        x = dr.clip(x, 0.0, mi.Float(columns) - 1.0)
+    left, across = mi.UInt32(x), x - dr.floor(x)
+    right = (left + 1) % columns if wraps else dr.minimum(left + 1, columns - 1)
+    left = left % columns if wraps else left
+
+    def at(row: Any, column: Any) -> Any:
+        return dr.gather(mi.Color3f, values, first + row * columns + column)
+
+    above = at(upper, left) * (1.0 - across) + at(upper, right) * across
+    below = at(lower, left) * (1.0 - across) + at(lower, right) * across
+    return above * (1.0 - share) + below * share
+
+
+def _sky(lit: Lit, way: Any, to_local: Any) -> Any:
+    """The environment in a direction, as Mitsuba has it: rows from pole to pole, columns with a copy at both ends."""
+    mi = mitsuba()
+
+    rows, columns = lit.sky_shape
+    across, down = _map_place(way, to_local)
+    x, y = across * (columns - 2) + 0.5, down * (rows - 1)
+    return _bilinear(lit.sky, mi.UInt32(0), mi.UInt32(rows), mi.UInt32(columns), y, x)
+
+
+def _blurred(lit: Lit, way: Any, to_local: Any, spread: Any, widths: Sequence[float]) -> Any:
+    """The environment in a direction, blurred by an angle (root mean square)."""
+    mi = mitsuba()
+    import drjit as dr
+
+    rows, columns = lit.blurred_shape
+    level = dr.clip(dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0)
+    low = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
+    share = level - mi.Float(low)
+    across, down = _map_place(way, to_local)
+    y, x = down * rows - 0.5, across * columns - 0.5
+    one, other = (
+        _bilinear(lit.blurred, (low + k) * (rows * columns), mi.UInt32(rows), mi.UInt32(columns), y, x, wraps=True)
+        for k in (0, 1)
+    )
+    return one + share * (other - one)
+
+
+def _points(kind: Any, values: Floats) -> Any:
+    """Rows of numbers as Dr.Jit's points, vectors or normals."""
+    mi = mitsuba()
+    return kind(*(mi.Float(np.ascontiguousarray(values[:, k], dtype=np.float32)) for k in range(values.shape[1])))
