@@ -27,6 +27,8 @@ Ints = npt.NDArray[np.int32]
 ANGLES = 32
 """Entries of a table over the cosine of the angle of view."""
 LOBE_SAMPLES = 4096
+SHARP, WIDE = 0.15, 0.4
+"""Spreads of gloss between which what one ray meets on the ground gives way to what surrounds the object."""
 SHIFT = 1e-4
 """How far from a surface rays begin, object sizes."""
 PASS = 1 << 20
@@ -229,11 +231,11 @@ class Lit:
     """The light of one moment, as `Views` looks it up; flat arrays of Dr.Jit.
 
     Attributes:
-        texels: radiance that leaves each texel of all grids; of a photographed ground, the share of the photograph that
-            it shows. Three numbers each.
+        texels: radiance that leaves each texel of all grids, and in the end that of the ground far off; of a
+            photographed ground, the share of the photograph that it shows. Three numbers each.
         sky: the environment's map, three numbers each.
         sky_shape: its rows and columns, the copied columns at both ends among them.
-        blurred: the map, blurred by each of `widths`, three numbers each.
+        blurred: what surrounds the object, the ground too, blurred by each of `widths`, three numbers each.
         blurred_shape: their rows and columns.
     """
 
@@ -366,7 +368,7 @@ class Views:
         for number_of, on in enumerate(ons):
             table = dr.select(on, mi.UInt32(number_of * len(TABLES) * ANGLES), table)
         diffuse, gloss, up, along, spread = self._measured(tables, table, cosine)
-        shown = self._shown(hit, ons, lit, to_local, way)
+        shown = self._shown(hit, ons, lit, to_local)
         radiance = dr.select(ons[0], 0.0, shown * dr.select(valid, diffuse, 1.0))
         # the gloss: a ray in the mean direction of the lobe says what is there, the blurred map how bright it is
         glossy = valid & (gloss > 1e-4)
@@ -374,15 +376,23 @@ class Views:
         mirrored = dr.normalize(normal * up + beside * along)
         second = held.ray_intersect(mi.Ray3f(hit.p + normal * SHIFT, mirrored), glossy)
         seconds = [second.is_valid() & (second.shape == mi.ShapePtr(shape)) for shape in shapes]
-        reflected = self._shown(second, seconds, lit, to_local, mirrored)
         blurred = _blurred(lit, mirrored, to_local, spread, self._widths)
-        reflected = dr.select(second.is_valid(), reflected, blurred)
+        texel = self._texel(second, seconds, lit)
+        shade = texel / dr.gather(mi.Color3f, lit.texels, mi.UInt32(self._grids[-1].first + self._grids[-1].count))
+        level = mi.Bool(False)
+        for grid, on in zip(self._grids, seconds, strict=True):
+            level |= on & (grid.warp is not None)
+        wide = dr.clip((spread - SHARP) / (WIDE - SHARP), 0.0, 1.0)
+        traced = self._shown(second, seconds, lit, to_local)
+        ground = traced + wide * (blurred * shade - traced)
+        reflected = dr.select(second.is_valid(), dr.select(level, ground, texel), blurred)
         radiance += dr.select(glossy, gloss * reflected, 0.0)
         radiance += dr.select(valid, 0.0, _sky(lit, way, to_local))
         covered = dr.select(valid, mi.Float(1.0 / RAYS), 0.0)
         weight = dr.select(ons[0], diffuse / (math.pi * RAYS), 0.0)
-        sums = [dr.block_sum(one, RAYS) for one in (*(radiance / RAYS), covered)]
-        return [*sums, hit.uv.x, hit.uv.y, weight]
+        radiance /= RAYS
+        dr.eval(radiance, covered, hit.uv, weight)  # a sum of its own kernel each would send all rays again
+        return [*(dr.block_sum(one, RAYS) for one in (*radiance, covered)), hit.uv.x, hit.uv.y, weight]
 
     def _measured(self, tables: Any, first: Any, cosine: Any) -> list[Any]:
         """The entries of the tables at a cosine."""
@@ -398,28 +408,33 @@ class Views:
             found.append(one + share * (other - one))
         return found
 
-    def _shown(self, hit: Any, ons: Sequence[Any], lit: Lit, to_local: Any, way: Any) -> Any:
+    def _shown(self, hit: Any, ons: Sequence[Any], lit: Lit, to_local: Any) -> Any:
         """Diffuse radiance of what was hit."""
         mi = mitsuba()
         import drjit as dr
 
+        found = self._texel(hit, ons, lit)
+        if self._photographed is not None:
+            below = dr.normalize(hit.p - mi.Point3f(0.0, 0.0, self._photographed))
+            for grid, on in zip(self._grids, ons, strict=True):
+                found = dr.select(on, found * _sky(lit, below, to_local), found) if grid.warp is not None else found
+        return found
+
+    def _texel(self, hit: Any, ons: Sequence[Any], lit: Lit) -> Any:
+        """What the texels say of what was hit; 0 where it has none."""
+        mi = mitsuba()
+        import drjit as dr
+
         first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
-        y, x, level = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
+        y, x, known = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
         for grid, on in zip(self._grids, ons, strict=True):
             down, across = _grid_place(grid, hit.p, hit.uv)
-            y, x = dr.select(on, down, y), dr.select(on, across, x)
+            y, x, known = dr.select(on, down, y), dr.select(on, across, x), known | on
             first = dr.select(on, mi.UInt32(grid.first), first)
             rows = dr.select(on, mi.UInt32(grid.shape[0]), rows)
             columns = dr.select(on, mi.UInt32(grid.shape[1]), columns)
-            level |= on & (grid.warp is not None)
         found = _bilinear(lit.texels, first, rows, columns, y * mi.Float(rows) - 0.5, x * mi.Float(columns) - 0.5)
-        if self._photographed is not None:
-            below = dr.normalize(hit.p - mi.Point3f(0.0, 0.0, self._photographed))
-            found *= dr.select(level, _sky(lit, below, to_local), 1.0)
-        any_of_them = mi.Bool(False)
-        for on in ons:
-            any_of_them |= on
-        return dr.select(any_of_them, found, 0.0)
+        return dr.select(known, found, 0.0)
 
 
 # ---- places ---------------------------------------------------------------------------------------------------------

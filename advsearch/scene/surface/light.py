@@ -40,14 +40,14 @@ class Sky:
     Attributes:
         padded: (H, W + 2, 3), as the scene takes it.
         cells: (rows x columns, 3) mean radiance of each of `CELLS`, without what is hot.
-        blurred: (widths, h, w, 3).
+        map: `BLURRED`, (h, w, 3).
         hot: (k, 3) unit directions in the map's own axes towards what is hot, and (k, 3) radiance times solid angle
             of each.
     """
 
     padded: Tensor
     cells: Tensor
-    blurred: Tensor
+    map: Tensor
     hot: tuple[Tensor, Tensor]
 
 
@@ -66,7 +66,7 @@ def sky_of(padded: Tensor) -> Sky:
         even = radiance * (1.0 - spare[..., None])
     else:
         hot, even = (torch.zeros(0, 3), torch.zeros(0, 3)), radiance
-    return Sky(padded, _pooled(even, sine, CELLS).reshape(-1, 3), blurred(_pooled(radiance, sine, BLURRED)), hot)
+    return Sky(padded, _pooled(even, sine, CELLS).reshape(-1, 3), _pooled(radiance, sine, BLURRED), hot)
 
 
 def _hot(radiance: Tensor, power: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,6 +110,14 @@ def blurred(radiance: Tensor) -> Tensor:
         spectrum = torch.fft.rfft((down @ radiance.reshape(rows, -1)).reshape(rows, columns, 3), dim=1)
         found.append(torch.fft.irfft(spectrum * across[..., None], n=columns, dim=1))
     return torch.stack(found).clamp_min(0.0)
+
+
+def directions(size: tuple[int, int]) -> Tensor:
+    """Return the unit directions (h, w, 3) of the cells of a map, in its own axes."""
+    rows, columns = size
+    polar, across = (torch.arange(rows) + 0.5) * math.pi / rows, (torch.arange(columns) + 0.5) * 2.0 * math.pi / columns
+    polar, across = torch.meshgrid(polar, across, indexing="ij")
+    return torch.stack([polar.sin() * across.sin(), polar.cos(), -polar.sin() * across.cos()], dim=-1)
 
 
 def irradiance(

@@ -30,8 +30,8 @@ from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.surface import RAYS, Lit, Lobes, Seen, Views, gather, lit_arrays, measured, to_map, towards
 from advsearch.scene.photograph import irradiance as unshadowed
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.light import WIDTHS, Sky, irradiance, looked_up, seen_of, sky_of
-from advsearch.scene.surface.texels import SIDE, Texels, between, on_ground, on_mesh, together
+from advsearch.scene.surface.light import BLURRED, CELLS, WIDTHS, blurred, directions, irradiance, looked_up, seen_of, sky_of
+from advsearch.scene.surface.texels import SIDE, Texels, between, on_ground, on_mesh, smoothed, together
 from advsearch.scene.surface_map import rasterised
 from advsearch.scene.transport.renderer import PredictingRenderer
 
@@ -154,11 +154,15 @@ class Arrangement:
         self._between = between(self.texels, charts, self.fine, vertices, normals)
         self._finer = None if factor == 1 else self._enlarging(texture)
         places, facing = self.texels.places, self.texels.normals
-        seen = gather(scene, self.texels.grids, (32, 64), places, facing, GATHERED, seed)
+        seen = gather(scene, self.texels.grids, CELLS, places, facing, GATHERED, seed)
         self._sees = seen_of(seen, self.texels.of_cell, len(places))
+        if len(some) > 1:
+            above = (seen[self.texels.of(1)] >= len(self.texels.of_cell)).any(axis=1)
+            self._smooth = smoothed(some[1], above)
         self.lobes = [self._measured(0), *(Lobes.matt() for _ in some[1:])]
         self._photographed = None if photograph is None else description.number("ground.height")
         self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
+        self._below = self._seen_below(middle)
         self.views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed)
 
     def _value(self, name: str) -> Tensor:
@@ -179,6 +183,20 @@ class Arrangement:
         starts = np.arange(rows * columns + 1, dtype=np.int32) * 4
         return scipy.sparse.csr_matrix((shares.ravel(), places.ravel(), starts), (rows * columns, texture[0] * texture[1]))
 
+    def _seen_below(self, middle: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Which cells of the blurred maps (h, w) the ground hides, seen from the object's middle, and the directions
+        (h, w, 3) in the map's axes in which its photograph has what is seen there."""
+        ways = directions(BLURRED)
+        world = ways @ self.to_map
+        if len(self.texels.grids) == 1:
+            return torch.zeros(BLURRED, dtype=torch.bool), ways
+        far = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
+        places = torch.from_numpy(middle).float() + world * far[..., None]
+        reach = self._scene.made[0].number("ground.size") / 2.0 if self._photographed is None else math.inf
+        hidden = (world[..., 2] < -1e-3) & (places[..., :2].abs() <= reach).all(dim=-1)
+        camera = torch.tensor([0.0, 0.0, self._photographed or 0.0])
+        return hidden, (places - camera) @ self.to_map.T
+
     def finer(self, color: Tensor) -> Tensor:
         """Return a base colour (h, w, 3) on the fine grid, (cells, 3); differentiable."""
         flat = color.reshape(-1, 3)
@@ -198,11 +216,25 @@ class Arrangement:
             reflectance = self._reflectance(color, padded)
             arriving = irradiance(self._sees, sky, direct, reflectance, BOUNCES)
             leaving = reflectance * arriving / math.pi
-            if self._photographed is not None:
-                ground = self.texels.of(1)
-                leaving[ground] = arriving[ground] / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+            shown, unhidden = sky.map, torch.ones(1, 3)
+            if len(self.texels.grids) > 1:
+                ground, (hidden, below) = self.texels.of(1), self._below
+                if self._photographed is not None:
+                    leaving[ground] = arriving[ground] / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+                leaving[ground] = self._smooth @ leaving[ground]
+                unhidden = self._border(leaving[ground])
+                seen = unhidden
+                if self._photographed is not None:
+                    seen = unhidden * looked_up(padded, below.reshape(-1, 3)).reshape(*BLURRED, 3)
+                shown = torch.where(hidden[..., None], seen, shown)
             on_object = self._between @ arriving[self.texels.of(0)]
-            return Light(on_object, lit_arrays(leaving[torch.from_numpy(self.texels.of_cell)], sky.padded, sky.blurred))
+            cells = torch.cat([leaving[torch.from_numpy(self.texels.of_cell)], unhidden])
+            return Light(on_object, lit_arrays(cells, padded, blurred(shown)))
+
+    def _border(self, ground: Tensor) -> Tensor:
+        """The mean (1, 3) of a ground's light at its border, where the object hides little of it."""
+        cells = ground.reshape(*self.texels.grids[1].shape, 3)
+        return torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]]).mean(dim=0, keepdim=True).clamp_min(1e-9)
 
     def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """(n, 3) of each texel, the gloss counted as if it were diffuse."""

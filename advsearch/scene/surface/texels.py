@@ -18,9 +18,9 @@ from advsearch.scene.surface_map import BORDER, Charts, rasterised
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
 
-SIDE = 96
+SIDE = 128
 """Texels a side over the searched object."""
-GROUND = 64
+GROUND = 80
 """Texels a side over the ground."""
 NEAR = 12.0
 """Half the side of the ground that has texels, object sizes; further out there is the light of its border."""
@@ -33,6 +33,8 @@ WIDTH = 0.8
 SAME = 1.5
 """Standard deviation of the weight of their distance in space, sides of a texel: those of another chart take no part,
 nor those of the other wall of a cup."""
+
+BINOMIAL = (1, 4, 6, 4, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +160,36 @@ def between(texels: Texels, charts: Charts, shape: tuple[int, int], vertices: Fl
     cell = np.broadcast_to((rows * shape[1] + columns)[:, None], chosen.shape)[taken]
     size = shape[0] * shape[1], texels.begin[1]
     return by_rows(scipy.sparse.coo_matrix((weight[taken], (cell, chosen[taken])), size).tocsr())
+
+
+def smoothed(ground: Texels, lit: npt.NDArray[np.bool_]) -> Tensor:
+    """Return the matrix (cells x texels of a ground) that smooths its light, by the binomial of 5 x 5 texels.
+
+    Those that see nothing of the sky lie under something. What is next to it takes no part of their darkness, which a
+    look-up beside the edge would mix in.
+
+    Args:
+        ground: its texels alone.
+        lit: (n,) which of them see the sky; none of them is the same as all.
+    """
+    side = ground.grids[0].shape[0]
+    inside = (lit if lit.any() else ~lit).reshape(side, side)
+    source = _nearest(inside)
+    row, column = np.divmod(np.arange(side * side), side)
+    chosen, weights = [], []
+    for down, tall in zip(range(-2, 3), BINOMIAL, strict=True):
+        for across, wide in zip(range(-2, 3), BINOMIAL, strict=True):
+            y, x = row + down, column + across
+            there = (y >= 0) & (y < side) & (x >= 0) & (x < side)
+            at = y.clip(0, side - 1) * side + x.clip(0, side - 1)
+            chosen.append(at)
+            weights.append(tall * wide * (there & inside.ravel()[at]))
+    places, weight = np.stack(chosen, axis=1), np.stack(weights, axis=1).astype(np.float64)
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+    every = scipy.sparse.csr_matrix(
+        (weight.ravel(), places.ravel(), np.arange(side * side + 1) * 25), (side * side, side * side)
+    )
+    return by_rows(every[source])
 
 
 def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
