@@ -245,6 +245,11 @@ class Lit:
     blurred: Any
     blurred_shape: tuple[int, int]
 
+    @property
+    def numbers(self) -> int:
+        """How many numbers there are."""
+        return len(self.texels) + len(self.sky) + len(self.blurred)
+
 
 def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
     """Return light for look-ups, in memory of its own.

@@ -1,254 +1,106 @@
-"""A renderer of pictures from many cameras: light is kept on surfaces, and a picture is rays and look-ups.
-
-Where object, surroundings and lights stand still, the irradiance E of a point is the same for every camera, so that
-
-    radiance(pixel) = mean over its rays of [ share(angle) base colour E / pi + gloss(angle) x light in its lobe ]
-                      or of the environment where a ray escapes
-
-with the shares and the lobe of the surface measured by sampling its BSDF. Nothing in it is random.
-"""
+"""A renderer of pictures from many cameras and under many environments: light is kept on surfaces."""
 
 from __future__ import annotations
 
-import math
+import copy
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from collections.abc import Mapping, Sequence
 
-import numpy as np
-import scipy.sparse
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from advsearch.errors import InputError
-from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import OBJECT
-from advsearch.scene.mitsuba_backend.surface import RAYS, Lit, Lobes, Seen, Views, gather, lit_arrays, measured, to_map, towards
-from advsearch.scene.photograph import irradiance as unshadowed
+from advsearch.files import scaled
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.light import BLURRED, CELLS, WIDTHS, blurred, directions, irradiance, looked_up, seen_of, sky_of
-from advsearch.scene.surface.texels import SIDE, Texels, between, on_ground, on_mesh, smoothed, together
-from advsearch.scene.surface_map import rasterised
-from advsearch.scene.transport.renderer import PredictingRenderer
-
-GATHERED = 256
-"""Rays from each texel that say what it sees."""
-BOUNCES = 4
-"""How often light goes from texel to texel: that and the camera's and the sky's segments make a path of `MAX_DEPTH`."""
-FINE = 96
-"""Least side of the grid on which base colour and light are multiplied."""
-WHITE = 0.95
-"""Reflectance that a photographed ground has at most, where light goes from surface to surface."""
-HELD = 96
-"""Lights that are kept, the latest ones."""
-COLOR, MAP, GROUND = f"{OBJECT}.base_color", "environment.padded", "ground"
-CAMERAS = frozenset({"camera.to_world", "camera.fov", "camera.shift_x", "camera.shift_y"})
-FREE = CAMERAS | ON_PICTURE | {MAP, COLOR, "ground.reflectance"}
-"""Inputs that may change without anything being found anew but the light."""
+from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light
+from advsearch.scene.surface.view import View
+from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """Light on the surfaces.
+class SurfaceRenderer(PredictingRenderer):
+    """A renderer whose pictures come from light on surfaces; for spaces that `plan.why_not` says nothing against.
+
+    A picture is linear in the base colour of the object. Light that goes from the object to the object or the ground and
+    back is that of the base colour `there`.
+
+    Args:
+        renderer: the one that traces paths.
+        u: everything but cameras, environment and base colour stays as it is there.
+        seed: number of the noise of the rays that say what texels see.
 
     Attributes:
-        on_object: (cells of the fine grid, 3) irradiance.
-        lit: the rest, for look-ups.
+        arrangement: object and surroundings.
+        there: (h, w, 3) the base colour whose light between surfaces is kept; see `renew`.
+        dropped: lights that made room for others.
     """
 
-    on_object: Tensor
-    lit: Lit
-
-
-class View:
-    """What one camera sees: `rest`, and a sparse matrix from the fine grid to the pixels.
-
-    Args:
-        seen: by several cameras.
-        number: of this one.
-        shape: rows and columns of the fine grid.
-    """
-
-    def __init__(self, seen: Seen, number: int, shape: tuple[int, int]) -> None:
-        self.rest, self.covered = seen.rest[number], seen.covered[number]
-        height, width = self.rest.shape[:2]
-        ends = torch.tensor([number, number + 1]) * (height * width * RAYS)
-        begin, end = torch.searchsorted(seen.sample, ends).tolist()
-        pixel = (seen.sample[begin:end] - int(ends[0])) // RAYS
-        columns, shares = bilinear(seen.uv[begin:end].numpy(), shape)
-        weights = shares * seen.weight[begin:end].numpy()[:, None]
-        starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
-        size = height * width, shape[0] * shape[1]
-        self.matrix = scipy.sparse.csr_matrix(
-            (weights.ravel(), columns.ravel(), starts.astype(np.int32)), size, copy=False
-        )
-
-    def radiance(self, reflected: Tensor) -> Tensor:
-        """Return (H, W, 3) for what the fine grid reflects (cells, 3); differentiable in it."""
-        found: Tensor = _Product.apply(self.matrix, reflected)  # type: ignore[no-untyped-call]
-        return self.rest + found.reshape(self.rest.shape)
-
-
-class _Product(torch.autograd.Function):
-    """A sparse matrix times columns, with its transpose as the derivative."""
-
-    @staticmethod
-    def forward(ctx: Any, matrix: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
-        ctx.matrix = matrix
-        return torch.from_numpy(matrix @ values.detach().numpy())
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, cotangent: Tensor) -> tuple[None, Tensor]:
-        return None, torch.from_numpy(ctx.matrix.T @ cotangent.numpy())
-
-
-def bilinear(uv: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """The four texels (n, 4) of the look-up at texture coordinates (n, 2), which repeats at the border, and their
-    shares (n, 4)."""
-    rows, columns = shape
-    x, y = uv[:, 0] * np.float32(columns) - np.float32(0.5), uv[:, 1] * np.float32(rows) - np.float32(0.5)
-    left, low = np.floor(x), np.floor(y)
-    across, up = x - left, y - low
-    left, low = left.astype(np.int32), low.astype(np.int32)
-    x0, x1, y0, y1 = left % columns, (left + 1) % columns, low % rows * columns, (low + 1) % rows * columns
-    places = np.stack([y0 + x0, y0 + x1, y1 + x0, y1 + x1], axis=1)
-    down, beside = 1.0 - up, 1.0 - across
-    shares = np.stack([down * beside, down * across, up * beside, up * across], axis=1)
-    return places, shares
-
-
-class Arrangement:
-    """Object and surroundings as they stand, and what they see of each other and of the environment.
-
-    Args:
-        renderer: of the scene.
-        inputs: the scene's own, assembled.
-        seed: number of the noise of the rays.
-    """
-
-    def __init__(self, renderer: Renderer, inputs: Mapping[str, Tensor], seed: int) -> None:
-        scene = renderer.scene
-        self._scene, self.inputs = scene, {name: one for name, one in inputs.items() if name not in ON_PICTURE}
-        scene.held(self.inputs)
-        description = scene.made[0]
-        vertices, normals = (
-            self._value(f"{OBJECT}.{what}").reshape(-1, 3).numpy() for what in ("vertices", "normals")
-        )
-        mesh = description.meshes[OBJECT].mesh
-        charts = rasterised(mesh, SIDE)
-        some = [on_mesh(OBJECT, charts, vertices, normals)]
-        middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        photograph = description.photograph
-        if description.number("ground.size") > 0.0:
-            reach = math.inf if photograph is not None else description.number("ground.size") / 2.0
-            some.append(on_ground(GROUND, 0.0, reach, (float(middle[0]), float(middle[1]))))
-        self.texels: Texels = together(some)
-        texture = tuple(self._value(COLOR).shape[:2])
-        factor = max(1, math.ceil(FINE / min(texture)))
-        self.fine = texture[0] * factor, texture[1] * factor
-        self._between = between(self.texels, charts, self.fine, vertices, normals)
-        self._finer = None if factor == 1 else self._enlarging(texture)
-        places, facing = self.texels.places, self.texels.normals
-        seen = gather(scene, self.texels.grids, CELLS, places, facing, GATHERED, seed)
-        self._sees = seen_of(seen, self.texels.of_cell, len(places))
-        if len(some) > 1:
-            above = (seen[self.texels.of(1)] >= len(self.texels.of_cell)).any(axis=1)
-            self._smooth = smoothed(some[1], above)
-        self.lobes = [self._measured(0), *(Lobes.matt() for _ in some[1:])]
-        self._photographed = None if photograph is None else description.number("ground.height")
-        self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
-        self._below = self._seen_below(middle)
-        self.views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed)
-
-    def _value(self, name: str) -> Tensor:
-        return self.inputs[name] if name in self.inputs else self._scene.base(name)
-
-    def _measured(self, number: int) -> Lobes:
-        here = self.texels.of(number)
-        at = here.start + (here.stop - here.start) // 2
-        return measured(
-            self._scene, self.inputs, self.texels.grids[number], self.texels.places[at], self.texels.normals[at]
-        )
-
-    def _enlarging(self, texture: tuple[int, int]) -> scipy.sparse.csr_matrix:
-        """From the texels of a small texture to the fine grid."""
-        rows, columns = self.fine
-        y, x = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
-        places, shares = bilinear(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32), texture)
-        starts = np.arange(rows * columns + 1, dtype=np.int32) * 4
-        return scipy.sparse.csr_matrix((shares.ravel(), places.ravel(), starts), (rows * columns, texture[0] * texture[1]))
-
-    def _seen_below(self, middle: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Which cells of the blurred maps (h, w) the ground hides, seen from the object's middle, and the directions
-        (h, w, 3) in the map's axes in which its photograph has what is seen there."""
-        ways = directions(BLURRED)
-        world = ways @ self.to_map
-        if len(self.texels.grids) == 1:
-            return torch.zeros(BLURRED, dtype=torch.bool), ways
-        far = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
-        places = torch.from_numpy(middle).float() + world * far[..., None]
-        reach = self._scene.made[0].number("ground.size") / 2.0 if self._photographed is None else math.inf
-        hidden = (world[..., 2] < -1e-3) & (places[..., :2].abs() <= reach).all(dim=-1)
-        camera = torch.tensor([0.0, 0.0, self._photographed or 0.0])
-        return hidden, (places - camera) @ self.to_map.T
-
-    def finer(self, color: Tensor) -> Tensor:
-        """Return a base colour (h, w, 3) on the fine grid, (cells, 3); differentiable."""
-        flat = color.reshape(-1, 3)
-        if self._finer is None:
-            return flat
-        found: Tensor = _Product.apply(self._finer, flat)  # type: ignore[no-untyped-call]
-        return found
-
-    def light(self, padded: Tensor, color: Tensor) -> Light:
-        """Return the light of an environment (H, W + 2, 3) where the object has a base colour (h, w, 3)."""
+    def __init__(self, renderer: Renderer, u: Tensor, seed: int) -> None:
+        vars(self).update(vars(copy.copy(renderer)))
+        self.products = self.dropped = 0
+        self._lights: OrderedDict[bytes, Light] = OrderedDict()
         with torch.no_grad():
-            sky = sky_of(padded)
-            direct = None
-            if len(sky.hot[0]):
-                found = towards(self._scene, self.texels.places, self.texels.normals, sky.hot[0].numpy())
-                direct = torch.from_numpy(found)
-            reflectance = self._reflectance(color, padded)
-            arriving = irradiance(self._sees, sky, direct, reflectance, BOUNCES)
-            leaving = reflectance * arriving / math.pi
-            shown, unhidden = sky.map, torch.ones(1, 3)
-            if len(self.texels.grids) > 1:
-                ground, (hidden, below) = self.texels.of(1), self._below
-                if self._photographed is not None:
-                    leaving[ground] = arriving[ground] / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
-                leaving[ground] = self._smooth @ leaving[ground]
-                unhidden = self._border(leaving[ground])
-                seen = unhidden
-                if self._photographed is not None:
-                    seen = unhidden * looked_up(padded, below.reshape(-1, 3)).reshape(*BLURRED, 3)
-                shown = torch.where(hidden[..., None], seen, shown)
-            on_object = self._between @ arriving[self.texels.of(0)]
-            cells = torch.cat([leaving[torch.from_numpy(self.texels.of_cell)], unhidden])
-            return Light(on_object, lit_arrays(cells, padded, blurred(shown)))
+            inputs = self.scene.assembly(self.space.inputs(u))
+            self.there = self._color(inputs)
+            self.arrangement = Arrangement(renderer, {name: inputs[name] for name in inputs if name not in FREE}, seed)
 
-    def _border(self, ground: Tensor) -> Tensor:
-        """The mean (1, 3) of a ground's light at its border, where the object hides little of it."""
-        cells = ground.reshape(*self.texels.grids[1].shape, 3)
-        return torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]]).mean(dim=0, keepdim=True).clamp_min(1e-9)
+    def renew(self, u: Tensor) -> None:
+        """Take the light between surfaces from the base colour at u from now on."""
+        with torch.no_grad():
+            self.there = self._color(self.scene.assembly(self.space.inputs(u)))
+        self._lights.clear()
 
-    def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
-        """(n, 3) of each texel, the gloss counted as if it were diffuse."""
-        rows, columns = self.texels.grids[0].shape
-        fine = self.finer(color).reshape(*self.fine, 3).permute(2, 0, 1)[None]
-        pooled = functional.adaptive_avg_pool2d(fine, (rows, columns))[0].permute(1, 2, 0).reshape(-1, 3)
-        found = [pooled[torch.from_numpy(self.texels.cells[self.texels.of(0)])]]
-        if len(self.texels.grids) > 1:
-            ground = self.texels.places[self.texels.of(1)]
-            if self._photographed is None:
-                found.append(srgb_to_linear(torch.tensor(self._scene.made[0].ground_color)).expand(len(ground), 3))
-            else:
-                below = torch.from_numpy(ground) - torch.tensor([0.0, 0.0, self._photographed])
-                shown = looked_up(padded, below @ self.to_map.T)
-                found.append((shown * math.pi / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)).clamp_max(WHITE))
-        shares = [torch.tensor(one.mean_shares) for one in self.lobes]
-        return torch.cat([one * share[0] + share[1] for one, share in zip(found, shares, strict=True)])
+    @property
+    def entries(self) -> int:
+        return self.arrangement.entries
+
+    @property
+    def bytes(self) -> int:
+        return self.arrangement.bytes + sum(one.bytes for one in self._lights.values())
+
+    def light(self, inputs: Mapping[str, Tensor]) -> Light:
+        """Return the light under the environment of scene inputs, made on first use; `MOST_BYTES` of them are kept."""
+        padded = inputs[MAP].detach() if MAP in inputs else self.scene.base(MAP)
+        flat = padded.reshape(-1)
+        key = torch.cat([flat[:: max(1, flat.numel() // 997)], flat.sum()[None]]).numpy().tobytes()
+        if key not in self._lights:
+            self._lights[key] = self.arrangement.light(padded, self.there)
+            while len(self._lights) > 1 and self.bytes > scaled(MOST_BYTES):
+                self._lights.popitem(last=False)
+                self.dropped += 1
+        return self._lights[key]
+
+    def pictures(self, inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]) -> Tensor:
+        """Return the pictures (n, H, W, 3) sRGB of a base colour for several cameras and environments; those under one
+        environment in one launch. Differentiable in the base colour.
+
+        Args:
+            inputs: of the scene, for each; their base colour does not count.
+            color: (h, w, 3) base colour.
+            wholes: (d,) configurations of the space, for what controls do to the finished picture.
+        """
+        lights = [self.light(one) for one in inputs]
+        views: dict[int, View] = {}
+        for light in dict.fromkeys(lights):
+            numbers = [number for number, one in enumerate(lights) if one is light]
+            cameras = [self._camera(inputs[number]) for number in numbers]
+            seen = self.arrangement.seen(cameras, light)
+            views |= {number: View(seen, place, self.arrangement.fine) for place, number in enumerate(numbers)}
+        fine = self.arrangement.finer(color)
+        self.products += len(inputs)
+        return torch.stack(
+            [
+                self._shown(views[number].radiance(fine * light.on_object), one, wholes[number])
+                for number, (one, light) in enumerate(zip(inputs, lights, strict=True))
+            ]
+        )
+
+    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
+        light = self.light(inputs)
+        view = View(self.arrangement.seen([self._camera(inputs)], light), 0, self.arrangement.fine)
+        self.products += 1
+        return view.radiance(self.arrangement.finer(self._color(inputs)) * light.on_object)
+
+    def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {name: inputs[name] if name in inputs else self.scene.base(name) for name in CAMERAS}
+
+    def _color(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        return inputs[COLOR] if COLOR in inputs else self.scene.base(COLOR)
