@@ -39,13 +39,13 @@ class SurfaceRenderer(PredictingRenderer):
         self._lights: OrderedDict[bytes, Light] = OrderedDict()
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
-            self.there = self._color(inputs)
+            self.there = self.color(inputs)
             self.arrangement = Arrangement(renderer, {name: inputs[name] for name in inputs if name not in FREE}, seed)
 
     def renew(self, u: Tensor) -> None:
         """Take the light between surfaces from the base colour at u from now on."""
         with torch.no_grad():
-            self.there = self._color(self.scene.assembly(self.space.inputs(u)))
+            self.there = self.color(self.scene.assembly(self.space.inputs(u)))
         self._lights.clear()
 
     @property
@@ -97,10 +97,11 @@ class SurfaceRenderer(PredictingRenderer):
         light = self.light(inputs)
         view = View(self.arrangement.seen([self._camera(inputs)], light), 0, self.arrangement.fine)
         self.products += 1
-        return view.radiance(self.arrangement.finer(self._color(inputs)) * light.on_object)
+        return view.radiance(self.arrangement.finer(self.color(inputs)) * light.on_object)
 
     def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {name: inputs[name] if name in inputs else self.scene.base(name) for name in CAMERAS}
 
-    def _color(self, inputs: Mapping[str, Tensor]) -> Tensor:
+    def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """The base colour (h, w, 3) of scene inputs."""
         return inputs[COLOR] if COLOR in inputs else self.scene.base(COLOR)
