@@ -33,6 +33,8 @@ from advsearch.scene.surface.view import Product, bilinear
 
 GATHERED = 256
 """Rays from each texel that say what it sees."""
+BURIED = 0.3
+"""Share of a texel's rays that meet the back of a surface from which on it lies inside of something."""
 BOUNCES = 4
 """How often light goes from texel to texel: that and the camera's and the sky's segments make a path of `MAX_DEPTH`."""
 FINE = 96
@@ -92,11 +94,12 @@ class Arrangement:
         texture = tuple(self._value(COLOR).shape[:2])
         factor = max(1, math.ceil(FINE / min(texture)))
         self.fine = texture[0] * factor, texture[1] * factor
-        self._between = between(self.texels, charts, self.fine, vertices, normals)
         self._finer = None if factor == 1 else self._enlarging(texture)
         places, facing = self.texels.places, self.texels.normals
         seen = gather(scene, self.texels.grids, CELLS, places, facing, GATHERED, seed)
         self._sees = seen_of(seen, self.texels.of_cell, len(places))
+        buried = (seen[self.texels.of(0)] < 0).mean(axis=1) > BURIED
+        self._between = between(self.texels, charts, self.fine, vertices, normals, buried)
         if len(some) > 1:
             above = (seen[self.texels.of(1)] >= len(self.texels.of_cell)).any(axis=1)
             self._smooth = smoothed(some[1], above)

@@ -118,7 +118,14 @@ def on_ground(name: str, height: float, reach: float, middle: tuple[float, float
     return Texels((grid,), places, up, every, every, (0, GROUND * GROUND))
 
 
-def between(texels: Texels, charts: Charts, shape: tuple[int, int], vertices: Floats, normals: Floats) -> Tensor:
+def between(
+    texels: Texels,
+    charts: Charts,
+    shape: tuple[int, int],
+    vertices: Floats,
+    normals: Floats,
+    buried: npt.NDArray[np.bool_],
+) -> Tensor:
     """Return the matrix (cells of a finer grid x texels of the first surface) that smooths light and looks it up.
 
     The weights are those of a joint bilateral filter (Petschnigg et al. 2004, section 4.1): near in the grid, near in
@@ -129,7 +136,9 @@ def between(texels: Texels, charts: Charts, shape: tuple[int, int], vertices: Fl
         charts: as they were rasterised for its texels.
         shape: rows and columns of the finer grid.
         vertices, normals: (V, 3) in world space.
+        buried: (n,) texels that lie inside of something, whose darkness does not count outside.
     """
+    buried = buried & ~buried.all()
     fine = rasterised(charts.mesh, shape)
     place, normal = _surface(fine, vertices, normals)
     rows, columns = np.nonzero(fine.distance <= BORDER)
@@ -148,7 +157,7 @@ def between(texels: Texels, charts: Charts, shape: tuple[int, int], vertices: Fl
             apart = ((texels.places[one] - at) ** 2).sum(axis=1) / (2.0 * (SAME * side) ** 2)
             alike = np.clip((texels.normals[one] * facing).sum(axis=1), 0.0, 1.0) ** 8
             found.append(one)
-            weights.append(np.where(one >= 0, np.exp(-far - apart) * alike, 0.0))
+            weights.append(np.where((one >= 0) & ~buried[one], np.exp(-far - apart) * alike, 0.0))
     chosen, weight = np.stack(found, axis=1), np.stack(weights, axis=1)
     lost = weight.sum(axis=1) < 1e-6
     chosen[lost, 0] = texels.of_cell[
