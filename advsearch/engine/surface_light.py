@@ -23,7 +23,7 @@ from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
-from advsearch.engine.transport import Conditions, Deviation, Predictor, Tick, deviation_under_light
+from advsearch.engine.transport import BOUND, CHECK_SPP, Conditions, Deviation, Predictor, Tick
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.surface.arrangement import MAP
 from advsearch.scene.surface.plan import varied
@@ -32,7 +32,7 @@ from advsearch.scene.surface.renderer import SurfaceRenderer
 LIGHTS = 64
 """Environments in the bank, where they vary."""
 EVERY = 100
-COMPARED = 3
+COMPARED = 2
 """Pictures of a comparison."""
 TOGETHER = 8
 """Pictures that the model is asked about at once."""
@@ -193,26 +193,30 @@ class SurfaceLight(Predictor):
             self.renewals.append(query.number)
             self.seconds += time.perf_counter() - begun
 
-    def _objective(self, whole: Tensor, picture: Tensor) -> float:
-        return float(self.problem.judge(picture, whole).objective or 0.0)
+    def _deviation(self, whole: Tensor, seed: int) -> Deviation:
+        """Compare a predicted picture and a rendered one with two that are traced without the denoiser, which leaves
+        its own marks in all that it is given. The mean product of the differences to both is the squared error without
+        their noise, which a square would count."""
+        problem, renderer = self.problem, self.problem.renderer
+        undenoised = renderer.like(denoiser="none")
+        with torch.no_grad():
+            predicted, rendered = self.renderer(whole), renderer(whole, seeds.stream(seed, "rendered"), problem.spp)
+            traced = [undenoised(whole, seeds.stream(seed, "traced", half), CHECK_SPP) for half in range(2)]
+            shown = renderer(whole, seeds.stream(seed, "shown"), CHECK_SPP)
+
+        def off(picture: Tensor) -> float:
+            return 255.0 * max(0.0, float(((picture - traced[0]) * (picture - traced[1])).mean())) ** 0.5
+
+        values = [problem.judge(one, whole).objective or 0.0 for one in (predicted, shown)]
+        return Deviation(off(predicted), values[0] - values[1], max(BOUND, off(rendered)), pictures=4)
 
     def _compare(self, u: Tensor, index: int) -> Deviation:
         """Compare predicted pictures with traced ones under conditions, and keep what was found: of all pictures the
         root mean square difference, and the mean of what it may be."""
         begun, problem = time.perf_counter(), self.problem
         query = Query(u, 0, kind="surface check", number=index)
-        seed = seeds.stream(problem.seed, "surface check", index)
-        found = [
-            deviation_under_light(
-                problem.renderer,
-                partial(self._objective, whole),
-                self.renderer,
-                whole,
-                seeds.stream(seed, "picture", number),
-                problem.spp,
-            )
-            for number, whole in enumerate(torch.cat([u, one]) for one in self._drawn(query)[:COMPARED])
-        ]
+        wholes = [torch.cat([u, one]) for one in self._drawn(query)[:COMPARED]]
+        found = [self._deviation(whole, seeds.stream(problem.seed, query.kind, index)) for whole in wholes]
         self.deviations.append(
             Deviation(
                 levels=statistics.fmean(one.levels**2 for one in found) ** 0.5,
