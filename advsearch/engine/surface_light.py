@@ -8,6 +8,7 @@ so the time before, too, or before the search, pictures are traced from there on
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Sequence
@@ -127,8 +128,8 @@ class SurfaceLight(Predictor):
         if first is None or first.levels <= first.most:
             return None
         return (
-            f"light on surfaces is {first.levels:.1f} levels off, where {first.most:.1f} would do: the surface mirrors, "
-            "or lets light through"
+            f"light on surfaces is {first.levels:.1f} levels of 255 off, where {first.most:.1f} would do: the surface "
+            "mirrors, or lets light through"
         )
 
     def passed(self, query: Query) -> None:
@@ -161,7 +162,8 @@ class SurfaceLight(Predictor):
         generator = torch.Generator().manual_seed(seeds.stream(problem.seed, f"surface {query.kind}", query.number))
         order = torch.randint(len(self._lights), (count,), generator=generator).tolist()
         fresh = problem.conditions.sample(generator, count)
-        return [torch.where(self._of_light, self._lights[number], one) for number, one in zip(order, fresh, strict=True)]
+        lights = [self._lights[number] for number in order]
+        return [torch.where(self._of_light, *both) for both in zip(lights, fresh, strict=True)]
 
     def _inputs(self, numbers: Tensor) -> dict[str, Tensor]:
         """What conditions set in the scene."""
@@ -205,7 +207,8 @@ class SurfaceLight(Predictor):
             shown = renderer(whole, seeds.stream(seed, "shown"), CHECK_SPP)
 
         def off(picture: Tensor) -> float:
-            return 255.0 * max(0.0, float(((picture - traced[0]) * (picture - traced[1])).mean())) ** 0.5
+            product = float(((picture - traced[0]) * (picture - traced[1])).mean())
+            return 255.0 * math.sqrt(max(0.0, product))
 
         values = [problem.judge(one, whole).objective or 0.0 for one in (predicted, shown)]
         return Deviation(off(predicted), values[0] - values[1], max(BOUND, off(rendered)), pictures=4)

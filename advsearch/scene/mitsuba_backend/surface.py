@@ -1,9 +1,7 @@
-"""Rays and look-ups of surface light: what texels see of the scene, what a surface does to light, what cameras see.
+"""What cameras see of light on surfaces, by rays and look-ups in one recorded launch.
 
-A grid of texels is laid over each surface (`Grid`). Rays from texels say which texels and which cells of the
-environment they see (`gather`); the BSDF of each shape is measured as a table over the angle of view (`measured`); and
-cameras see texels, directly and in a lobe about the mirrored direction (`Views`). All of it is free of noise but for
-where rays are sent, and nothing of it depends on the light.
+A ray of a pixel sees a texel, or the environment; another one, in the mean direction of the surface's gloss, sees what
+is reflected. Where a pixel's rays go through it is the same for all pixels, so that nothing is random.
 """
 
 from __future__ import annotations
@@ -14,216 +12,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from advsearch.scene.mitsuba_backend.lobes import ANGLES, TABLES, Lobes
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.texel_rays import SHIFT, Floats, Grid, grid_place, map_place, shapes_of, to_map
 from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time, population, recorded
 
-Floats = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int32]
-
-ANGLES = 32
-"""Entries of a table over the cosine of the angle of view."""
-LOBE_SAMPLES = 4096
 SHARP, WIDE = 0.15, 0.4
 """Spreads of gloss between which what one ray meets on the ground gives way to what surrounds the object."""
-SHIFT = 1e-4
-"""How far from a surface rays begin, object sizes."""
-PASS = 1 << 20
-"""Rays of one launch of `gather`."""
-TABLES = ("diffuse", "gloss", "up", "along", "spread")
 CAMERA = 16
 """Numbers of a camera."""
 PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
 """Where the rays of a pixel go through it: a turned grid, which sees upright and level edges at four places."""
 RAYS = len(PATTERN)
-
-
-@dataclass(frozen=True)
-class Grid:
-    """The texels over one surface.
-
-    Attributes:
-        name: of the shape in Mitsuba's scene.
-        first: number of its first texel among those of all grids.
-        shape: rows and columns.
-        warp: None where it lies over texture coordinates; else (middle x, middle y, scale, rate) of a level plane whose
-            cells are small about its middle: coordinate = middle + scale sinh(rate s), s in [-1, 1].
-    """
-
-    name: str
-    first: int
-    shape: tuple[int, int]
-    warp: tuple[float, float, float, float] | None = None
-
-    @property
-    def count(self) -> int:
-        return self.shape[0] * self.shape[1]
-
-
-def gather(
-    scene: MitsubaScene,
-    grids: Sequence[Grid],
-    cells: tuple[int, int],
-    places: Floats,
-    normals: Floats,
-    rays: int,
-    seed: int,
-) -> Ints:
-    """Return what rays from texels see, over the cosine: (n, rays) numbers of texels; from the count of all texels on,
-    of cells of the environment; or -1, where there is no light: the back of a surface that has texels, or a shape that
-    has none.
-
-    Args:
-        scene: with its inputs set.
-        grids: of all surfaces.
-        cells: rows and columns of the cells of the environment.
-        places: (n, 3) where texels lie.
-        normals: (n, 3) unit shading normals.
-        rays: of each texel; the same well-spread points for all, shifted by chance.
-        seed: number of the shifts.
-    """
-    mi = mitsuba()
-    import drjit as dr
-
-    held, to_local = scene._scene, to_map(scene)
-    count, texels = len(places), grids[-1].first + grids[-1].count
-    steps = (np.arange(1, rays + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])) % 1.0
-    points = mi.Point2f(mi.Float(steps[:, 0].astype(np.float32)), mi.Float(steps[:, 1].astype(np.float32)))
-    shifts = np.random.default_rng(seed).random((count, 2), dtype=np.float32)
-    found = np.empty((count, rays), dtype=np.int32)
-    for begin in range(0, count, max(1, PASS // rays)):
-        some = slice(begin, min(count, begin + max(1, PASS // rays)))
-        lane = dr.arange(mi.UInt32, (some.stop - begin) * rays)
-        texel, number = lane // rays, lane % rays
-        shift = dr.gather(mi.Point2f, _points(mi.Point2f, shifts[some]), texel)
-        square = dr.gather(mi.Point2f, points, number) + shift
-        square -= dr.floor(square)
-        normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals[some]), texel)
-        place = dr.gather(mi.Point3f, _points(mi.Point3f, places[some]), texel)
-        way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
-        hit = held.ray_intersect(mi.Ray3f(place + normal * SHIFT, way))
-        column, row = _map_place(way, to_local)
-        across, down = mi.UInt32(column * cells[1]) % cells[1], mi.UInt32(dr.minimum(row * cells[0], cells[0] - 1))
-        seen = dr.select(hit.is_valid(), mi.Int32(-1), mi.Int32(texels + down * cells[1] + across))
-        front = dr.dot(hit.n, way) < 0.0
-        for grid, shape in zip(grids, _shapes(held, grids), strict=True):
-            on = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (front | (grid.warp is not None))
-            y, x = _grid_place(grid, hit.p, hit.uv)
-            nearest = mi.Int32(grid.first + _cell(y, grid.shape[0]) * grid.shape[1] + _cell(x, grid.shape[1]))
-            seen = dr.select(on, nearest, seen)
-        found[some] = seen.numpy().reshape(-1, rays)
-    return found
-
-
-def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) -> Floats:
-    """Return how much of what comes from directions texels receive: (n, k) cosines; 0 where something is in between.
-
-    Args:
-        scene: with its inputs set.
-        places, normals: (n, 3), as of `gather`.
-        ways: (k, 3) unit directions, in the axes of the environment's map.
-    """
-    mi = mitsuba()
-    import drjit as dr
-
-    world = (ways @ np.array(to_map(scene))).astype(np.float32)  # the transpose turns back
-    lane = dr.arange(mi.UInt32, len(places) * len(world))
-    texel, number = lane // len(world), lane % len(world)
-    place = dr.gather(mi.Point3f, _points(mi.Point3f, places), texel)
-    normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals), texel)
-    way = dr.gather(mi.Vector3f, _points(mi.Vector3f, world), number)
-    cosine = dr.dot(normal, way)
-    above = cosine > 0.0
-    hidden = scene._scene.ray_test(mi.Ray3f(place + normal * SHIFT, way), above)
-    found: Floats = dr.select(above & ~hidden, cosine, 0.0).numpy().reshape(len(places), len(world))
-    return found
-
-
-# ---- what a surface does to light -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Lobes:
-    """What a surface does to light, by the cosine of the angle of view (`ANGLES` entries, the first at grazing).
-
-    Attributes:
-        diffuse: (k,) share of even light that it reflects for a base colour of one, without the gloss.
-        gloss: (k,) share of even light that it reflects whatever the base colour.
-        up, along: (k,) of the gloss's mean direction: its parts along the normal, and away from the viewer.
-        spread: (k,) root mean square angle about that direction, radians.
-    """
-
-    diffuse: Floats
-    gloss: Floats
-    up: Floats
-    along: Floats
-    spread: Floats
-
-    @classmethod
-    def matt(cls) -> Lobes:
-        """Those of a diffuse surface."""
-        one, none = np.ones(ANGLES, dtype=np.float32), np.zeros(ANGLES, dtype=np.float32)
-        return cls(one, none, one, none, none)
-
-    @property
-    def mean_shares(self) -> tuple[float, float]:
-        """Both shares under even light from everywhere, over all angles of view."""
-        weight = (np.arange(ANGLES) + 0.5) * 2.0 / ANGLES**2
-        return float((weight * self.diffuse).sum()), float((weight * self.gloss).sum())
-
-
-def measured(scene: MitsubaScene, inputs: Mapping[str, Tensor], grid: Grid, place: Floats, normal: Floats) -> Lobes:
-    """Measure the BSDF of a shape, by sampling it, at one of its texels: a (3,) place and the unit normal there."""
-    mi = mitsuba()
-    import drjit as dr
-
-    key = f"{grid.name}.base_color"
-    with one_at_a_time:
-        middle = (np.arange(ANGLES) + 0.5) / ANGLES
-        cosine = dr.repeat(mi.Float(middle.astype(np.float32)), LOBE_SAMPLES)
-        towards = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
-        noise = mi.load_dict({"type": "independent"})
-        noise.seed(0, ANGLES * LOBE_SAMPLES)
-        one, two = noise.next_1d(), noise.next_2d()
-        even = mi.warp.square_to_cosine_hemisphere(two)
-        found = []
-        for level in (0.5, 0.0):
-            changed = {key: torch.full_like(scene.base(key), level)} if key in scene.names else {}
-            held = scene.held({**inputs, **changed})
-            start = mi.Point3f([float(x) for x in place + 1e-3 * normal])
-            ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
-            hit = held.ray_intersect(dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, ANGLES * LOBE_SAMPLES)))
-            bsdf = hit.bsdf()
-            hit.wi = towards
-            value = bsdf.eval(mi.BSDFContext(), hit, even)
-            if level:
-                found.append(dr.mean(value))
-                continue
-            sampled, weight = bsdf.sample(mi.BSDFContext(), hit, one, two)
-            back = dr.select((sampled.pdf > 0.0) & (sampled.wo.z > 0.0), dr.mean(weight), 0.0)
-            back = dr.select(dr.isfinite(back), back, 0.0)
-            found += [dr.mean(value), back, back * sampled.wo.x, back * sampled.wo.z]
-    density = (even.z / math.pi).numpy()
-    lit, dark, share, x, z = (_means(one) for one in (found[0].numpy() / density, found[1].numpy() / density, *found[2:]))
-    length = np.sqrt(x * x + z * z)
-    kept = np.maximum(share, 1e-12)
-    spread = np.sqrt(np.maximum(0.0, 2.0 * (1.0 - length / kept)))
-    mirrored = share < 1e-6
-    up = np.where(mirrored, middle, z / np.maximum(length, 1e-12))
-    along = np.where(mirrored, -np.sqrt(1.0 - middle**2), x / np.maximum(length, 1e-12))
-    parts = (np.maximum(lit - dark, 0.0) / 0.5, share, up, -along, np.where(mirrored, 0.0, spread))
-    return Lobes(*(part.astype(np.float32) for part in parts))
-
-
-def _means(values: Any) -> npt.NDArray[np.float64]:
-    array = values if isinstance(values, np.ndarray) else values.numpy()
-    return np.asarray(array.reshape(ANGLES, LOBE_SAMPLES).mean(axis=1), dtype=np.float64)
-
-
-# ---- what cameras see -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +168,7 @@ class Views:
         way = dr.normalize(mi.Vector3f(*(entry[k] * x + entry[3 + k] * y + entry[6 + k] for k in range(3))))
         hit = held.ray_intersect(mi.Ray3f(mi.Point3f(*entry[9:12]), way))
         valid, to_local = hit.is_valid(), to_map(self._scene)
-        shapes = _shapes(held, self._grids)
+        shapes = shapes_of(held, self._grids)
         ons = [valid & (hit.shape == mi.ShapePtr(shape)) for shape in shapes]
         normal = dr.select(dr.dot(hit.sh_frame.n, way) > 0.0, -hit.sh_frame.n, hit.sh_frame.n)
         cosine = -dr.dot(normal, way)
@@ -433,7 +236,7 @@ class Views:
         first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
         y, x, known = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
         for grid, on in zip(self._grids, ons, strict=True):
-            down, across = _grid_place(grid, hit.p, hit.uv)
+            down, across = grid_place(grid, hit.p, hit.uv)
             y, x, known = dr.select(on, down, y), dr.select(on, across, x), known | on
             first = dr.select(on, mi.UInt32(grid.first), first)
             rows = dr.select(on, mi.UInt32(grid.shape[0]), rows)
@@ -442,7 +245,7 @@ class Views:
         return dr.select(known, found, 0.0)
 
 
-# ---- places ---------------------------------------------------------------------------------------------------------
+# ---- look-ups -------------------------------------------------------------------------------------------------------
 
 
 def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
@@ -454,49 +257,6 @@ def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
     extent = [half * width / longer, half * height / longer]
     middle = [1.0 + 2.0 * shift[0], 1.0 + 2.0 * shift[1]]
     return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, middle])
-
-
-def _shapes(held: Any, grids: Sequence[Grid]) -> list[Any]:
-    """Mitsuba's shapes of grids."""
-    by_name = {one.id(): one for one in held.shapes()}
-    return [by_name[grid.name] for grid in grids]
-
-
-def to_map(scene: MitsubaScene) -> Any:
-    """The turn from the world to the axes of the environment's map, three rows."""
-    matrix = scene.parameters["environment.to_world"].matrix
-    return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3].T.tolist()
-
-
-def _map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
-    """Where in the environment's map a direction lies: shares of its width and of its height."""
-    mi = mitsuba()
-    import drjit as dr
-
-    x, y, z = (row[0] * way.x + row[1] * way.y + row[2] * way.z for row in to_local)
-    across = dr.atan2(x, -z) / (2.0 * math.pi)
-    return across - dr.floor(across), dr.safe_acos(y) / math.pi
-
-
-def _grid_place(grid: Grid, place: Any, uv: Any) -> tuple[Any, Any]:
-    """Where in a grid something lies: shares of its height and of its width."""
-    import drjit as dr
-
-    if grid.warp is None:
-        return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
-    middle_x, middle_y, scale, rate = grid.warp
-    shares = []
-    for along, middle in ((place.y, middle_y), (place.x, middle_x)):
-        far = (along - middle) / scale
-        shares.append(dr.clip(0.5 + dr.asinh(far) / (2.0 * rate), 0.0, 1.0))
-    return shares[0], shares[1]
-
-
-def _cell(share: Any, count: int) -> Any:
-    mi = mitsuba()
-    import drjit as dr
-
-    return mi.Int32(dr.minimum(share * count, count - 1.0))
 
 
 def _chosen(number: Any, values: Sequence[float]) -> Any:
@@ -539,7 +299,7 @@ def _sky(lit: Lit, way: Any, to_local: Any) -> Any:
     mi = mitsuba()
 
     rows, columns = lit.sky_shape
-    across, down = _map_place(way, to_local)
+    across, down = map_place(way, to_local)
     x, y = across * (columns - 2) + 0.5, down * (rows - 1)
     return _bilinear(lit.sky, mi.UInt32(0), mi.UInt32(rows), mi.UInt32(columns), y, x)
 
@@ -553,16 +313,10 @@ def _blurred(lit: Lit, way: Any, to_local: Any, spread: Any, widths: Sequence[fl
     level = dr.clip(dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0)
     low = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
     share = level - mi.Float(low)
-    across, down = _map_place(way, to_local)
+    across, down = map_place(way, to_local)
     y, x = down * rows - 0.5, across * columns - 0.5
     one, other = (
         _bilinear(lit.blurred, (low + k) * (rows * columns), mi.UInt32(rows), mi.UInt32(columns), y, x, wraps=True)
         for k in (0, 1)
     )
     return one + share * (other - one)
-
-
-def _points(kind: Any, values: Floats) -> Any:
-    """Rows of numbers as Dr.Jit's points, vectors or normals."""
-    mi = mitsuba()
-    return kind(*(mi.Float(np.ascontiguousarray(values[:, k], dtype=np.float32)) for k in range(values.shape[1])))

@@ -23,13 +23,26 @@ from torch.nn import functional
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
-from advsearch.scene.mitsuba_backend.surface import Lit, Lobes, Seen, Views, gather, lit_arrays, measured, to_map, towards
+from advsearch.scene.mitsuba_backend.lobes import Lobes, measured
+from advsearch.scene.mitsuba_backend.surface import Lit, Seen, Views, lit_arrays
+from advsearch.scene.mitsuba_backend.texel_rays import gather, to_map, towards
 from advsearch.scene.photograph import irradiance as unshadowed
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.light import BLURRED, CELLS, WIDTHS, blurred, directions, irradiance, looked_up, seen_of, sky_of
+from advsearch.scene.surface.light import (
+    BLURRED,
+    CELLS,
+    WIDTHS,
+    blurred,
+    directions,
+    irradiance,
+    looked_up,
+    seen_of,
+    sky_of,
+)
 from advsearch.scene.surface.texels import SIDE, Texels, between, on_ground, on_mesh, smoothed, together
+from advsearch.scene.surface.view import Product
 from advsearch.scene.surface_map import rasterised
-from advsearch.scene.surface.view import Product, bilinear
+from advsearch.scene.transport.matrix import bilinear
 
 GATHERED = 256
 """Rays from each texel that say what it sees."""
@@ -79,9 +92,7 @@ class Arrangement:
         self._scene, self.inputs = scene, {name: one for name, one in inputs.items() if name not in ON_PICTURE}
         scene.held(self.inputs)
         description = scene.made[0]
-        vertices, normals = (
-            self._value(f"{OBJECT}.{what}").reshape(-1, 3).numpy() for what in ("vertices", "normals")
-        )
+        vertices, normals = (self._value(f"{OBJECT}.{what}").reshape(-1, 3).numpy() for what in ("vertices", "normals"))
         mesh = description.meshes[OBJECT].mesh
         charts = rasterised(mesh, SIDE)
         some = [on_mesh(OBJECT, charts, vertices, normals)]
@@ -91,17 +102,17 @@ class Arrangement:
             reach = math.inf if photograph is not None else description.number("ground.size") / 2.0
             some.append(on_ground(GROUND, 0.0, reach, (float(middle[0]), float(middle[1]))))
         self.texels: Texels = together(some)
-        texture = tuple(self._value(COLOR).shape[:2])
+        texture = self._value(COLOR).shape[0], self._value(COLOR).shape[1]
         factor = max(1, math.ceil(FINE / min(texture)))
         self.fine = texture[0] * factor, texture[1] * factor
         self._finer = None if factor == 1 else self._enlarging(texture)
         places, facing = self.texels.places, self.texels.normals
         seen = gather(scene, self.texels.grids, CELLS, places, facing, GATHERED, seed)
         self._sees = seen_of(seen, self.texels.of_cell, len(places))
-        buried = (seen[self.texels.of(0)] < 0).mean(axis=1) > BURIED
+        buried = np.asarray((seen[self.texels.of(0)] < 0).mean(axis=1) > BURIED)
         self._between = between(self.texels, charts, self.fine, vertices, normals, buried)
         if len(some) > 1:
-            above = (seen[self.texels.of(1)] >= len(self.texels.of_cell)).any(axis=1)
+            above = np.asarray((seen[self.texels.of(1)] >= len(self.texels.of_cell)).any(axis=1))
             self._smooth = smoothed(some[1], above)
         self.lobes = [self._measured(0), *(Lobes.matt() for _ in some[1:])]
         self._photographed = None if photograph is None else description.number("ground.height")
@@ -125,7 +136,9 @@ class Arrangement:
         y, x = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
         places, shares = bilinear(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32), texture)
         starts = np.arange(rows * columns + 1, dtype=np.int32) * 4
-        return scipy.sparse.csr_matrix((shares.ravel(), places.ravel(), starts), (rows * columns, texture[0] * texture[1]))
+        return scipy.sparse.csr_matrix(
+            (shares.ravel(), places.ravel(), starts), (rows * columns, texture[0] * texture[1])
+        )
 
     def _seen_below(self, middle: np.ndarray) -> tuple[Tensor, Tensor]:
         """Which cells of the blurred maps (h, w) the ground hides, seen from the object's middle, and the directions

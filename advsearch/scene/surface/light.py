@@ -14,9 +14,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
+import scipy.sparse
 import torch
 from torch import Tensor
 from torch.nn import functional
+
+from advsearch.scene.transport.matrix import by_rows
 
 CELLS = (32, 64)
 """Rows and columns of the cells of the environment."""
@@ -62,14 +66,14 @@ def sky_of(padded: Tensor) -> Sky:
     spare = (1.0 - HOT * mean / luminance.clamp_min(1e-12)).clamp_min(0.0)
     power = spare * luminance * sine
     if float(power.sum()) > LITTLE * mean * float(sine.sum()):
-        hot = _hot(radiance * spare[..., None], power, sine)
+        hot = _hot(radiance * spare[..., None], power)
         even = radiance * (1.0 - spare[..., None])
     else:
         hot, even = (torch.zeros(0, 3), torch.zeros(0, 3)), radiance
     return Sky(padded, _pooled(even, sine, CELLS).reshape(-1, 3), _pooled(radiance, sine, BLURRED), hot)
 
 
-def _hot(radiance: Tensor, power: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
+def _hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     """Directions spread over what is hot by its power, and what comes from each."""
     rows, columns = power.shape
     total = power.sum()
@@ -81,7 +85,6 @@ def _hot(radiance: Tensor, power: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]
     ways = torch.stack([polar.sin() * across.sin(), polar.cos(), -polar.sin() * across.cos()], dim=1).float()
     angle = math.pi / (rows - 1) * 2.0 * math.pi / columns
     colour = radiance[row, column] / (radiance[row, column] @ LUMINANCE)[:, None].clamp_min(1e-12)
-    del sine
     return ways, colour * (float(total) * angle / HOT_RAYS)
 
 
@@ -142,19 +145,17 @@ def irradiance(
     return found
 
 
-def seen_of(columns: np.ndarray, of_cell: np.ndarray, texels: int) -> tuple[Tensor, Tensor]:
+def seen_of(columns: npt.NDArray[np.int32], of_cell: npt.NDArray[np.int64], texels: int) -> tuple[Tensor, Tensor]:
     """Return the sparse matrices of `irradiance` from what rays met, as `gather` has it."""
-    import scipy.sparse
-
-    from advsearch.scene.surface.texels import by_rows
-
     count, rays = columns.shape
-    cells = CELLS[0] * CELLS[1]
     row = np.repeat(np.arange(count), rays)
     flat = columns.ravel()
     found = []
-    for taken, width, shift in ((flat >= len(of_cell), cells, len(of_cell)), ((flat >= 0) & (flat < len(of_cell)), texels, 0)):
-        column = flat[taken] - shift if shift else of_cell[flat[taken]]
+    of_sky, of_texel = flat >= len(of_cell), (flat >= 0) & (flat < len(of_cell))
+    for taken, column, width in (
+        (of_sky, flat[of_sky] - len(of_cell), CELLS[0] * CELLS[1]),
+        (of_texel, of_cell[flat[of_texel]], texels),
+    ):
         values = np.full(len(column), math.pi / rays, dtype=np.float32)
         found.append(by_rows(scipy.sparse.coo_matrix((values, (row[taken], column)), (count, width)).tocsr()))
     return found[0], found[1]

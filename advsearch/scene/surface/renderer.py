@@ -19,8 +19,8 @@ from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
 class SurfaceRenderer(PredictingRenderer):
     """A renderer whose pictures come from light on surfaces; for spaces that `plan.why_not` says nothing against.
 
-    A picture is linear in the base colour of the object. Light that goes from the object to the object or the ground and
-    back is that of the base colour `there`.
+    A picture is linear in the base colour of the object. Light that goes from the object to itself, or to the ground
+    and back, is that of the base colour `there`.
 
     Args:
         renderer: the one that traces paths.

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse
-import torch
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.surface import Grid
+from advsearch.scene.mitsuba_backend.texel_rays import Grid
 from advsearch.scene.surface_map import BORDER, Charts, rasterised
+from advsearch.scene.transport.matrix import by_rows
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
@@ -168,7 +168,7 @@ def between(
     taken = weight > 1e-3
     cell = np.broadcast_to((rows * shape[1] + columns)[:, None], chosen.shape)[taken]
     size = shape[0] * shape[1], texels.begin[1]
-    return by_rows(scipy.sparse.coo_matrix((weight[taken], (cell, chosen[taken])), size).tocsr())
+    return by_rows(scipy.sparse.coo_matrix((weight[taken].astype(np.float32), (cell, chosen[taken])), size).tocsr())
 
 
 def smoothed(ground: Texels, lit: npt.NDArray[np.bool_]) -> Tensor:
@@ -196,19 +196,9 @@ def smoothed(ground: Texels, lit: npt.NDArray[np.bool_]) -> Tensor:
     places, weight = np.stack(chosen, axis=1), np.stack(weights, axis=1).astype(np.float64)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     every = scipy.sparse.csr_matrix(
-        (weight.ravel(), places.ravel(), np.arange(side * side + 1) * 25), (side * side, side * side)
+        (weight.ravel().astype(np.float32), places.ravel(), np.arange(side * side + 1) * 25), (side * side, side * side)
     )
     return by_rows(every[source])
-
-
-def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
-    """The same for torch, float32."""
-    import warnings
-
-    parts = (matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
-        return torch.sparse_csr_tensor(*map(torch.from_numpy, parts), matrix.shape, check_invariants=False)
 
 
 def _surface(charts: Charts, vertices: Floats, normals: Floats) -> tuple[Floats, Floats]:
@@ -224,7 +214,7 @@ def _side_squared(charts: Charts, vertices: Floats) -> float:
     """The area of a texel in world space, the mean over those on the surface."""
     areas, mesh = charts.areas(), charts.mesh
     scale = np.ptp(vertices, axis=0).max() / max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-12)
-    return float(areas[charts.covered].mean()) * scale**2
+    return float(areas[charts.covered].mean()) * float(scale) ** 2
 
 
 def _nearest(covered: npt.NDArray[np.bool_]) -> Ints:

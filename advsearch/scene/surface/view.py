@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse
 import torch
 from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.surface import RAYS, Seen
+from advsearch.scene.transport.matrix import bilinear
 
 
 class View:
@@ -54,18 +54,3 @@ class Product(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[None, Tensor]:
         return None, torch.from_numpy(ctx.matrix.T @ cotangent.numpy())
-
-
-def bilinear(uv: npt.NDArray[np.float32], shape: tuple[int, int]) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """The four texels (n, 4) of the look-up at texture coordinates (n, 2), which repeats at the border, and their
-    shares (n, 4)."""
-    rows, columns = shape
-    x, y = uv[:, 0] * np.float32(columns) - np.float32(0.5), uv[:, 1] * np.float32(rows) - np.float32(0.5)
-    left, low = np.floor(x), np.floor(y)
-    across, up = x - left, y - low
-    left, low = left.astype(np.int32), low.astype(np.int32)
-    x0, x1, y0, y1 = left % columns, (left + 1) % columns, low % rows * columns, (low + 1) % rows * columns
-    places = np.stack([y0 + x0, y0 + x1, y1 + x0, y1 + x1], axis=1)
-    down, beside = 1.0 - up, 1.0 - across
-    shares = np.stack([down * beside, down * across, up * beside, up * across], axis=1)
-    return places, shares
