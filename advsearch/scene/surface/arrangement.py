@@ -83,11 +83,14 @@ class Arrangement:
 
     Args:
         renderer: of the scene.
-        inputs: the scene's own, assembled.
+        inputs: the scene's own, assembled, but for what may change.
+        texture: rows and columns of the base colour.
         seed: number of the noise of the rays.
     """
 
-    def __init__(self, renderer: Renderer, inputs: Mapping[str, Tensor], seed: int) -> None:
+    def __init__(
+        self, renderer: Renderer, inputs: Mapping[str, Tensor], texture: tuple[int, int], seed: int
+    ) -> None:
         scene = renderer.scene
         self._scene, self.inputs = scene, {name: one for name, one in inputs.items() if name not in ON_PICTURE}
         scene.held(self.inputs)
@@ -102,7 +105,6 @@ class Arrangement:
             reach = math.inf if photograph is not None else description.number("ground.size") / 2.0
             some.append(on_ground(GROUND, 0.0, reach, (float(middle[0]), float(middle[1]))))
         self.texels: Texels = together(some)
-        texture = self._value(COLOR).shape[0], self._value(COLOR).shape[1]
         factor = max(1, math.ceil(FINE / min(texture)))
         self.fine = texture[0] * factor, texture[1] * factor
         self._finer = None if factor == 1 else self._enlarging(texture)

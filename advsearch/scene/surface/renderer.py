@@ -40,7 +40,9 @@ class SurfaceRenderer(PredictingRenderer):
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
             self.there = self.color(inputs)
-            self.arrangement = Arrangement(renderer, {name: inputs[name] for name in inputs if name not in FREE}, seed)
+            standing = {name: inputs[name] for name in inputs if name not in FREE}
+            texture = self.there.shape[0], self.there.shape[1]
+            self.arrangement = Arrangement(renderer, standing, texture, seed)
 
     def renew(self, u: Tensor) -> None:
         """Take the light between surfaces from the base colour at u from now on."""
