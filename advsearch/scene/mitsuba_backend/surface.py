@@ -255,7 +255,7 @@ def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
     longer = max(height, width)
     shift = [float(inputs[name]) if name in inputs else 0.0 for name in ("camera.shift_x", "camera.shift_y")]
     extent = [half * width / longer, half * height / longer]
-    middle = [1.0 + 2.0 * shift[0], 1.0 + 2.0 * shift[1]]
+    middle = [1.0 - 2.0 * shift[0], 1.0 - 2.0 * shift[1]]
     return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, middle])
 
 

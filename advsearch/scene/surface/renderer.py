@@ -37,6 +37,7 @@ class SurfaceRenderer(PredictingRenderer):
         vars(self).update(vars(copy.copy(renderer)))
         self.products = self.dropped = 0
         self._lights: OrderedDict[bytes, Light] = OrderedDict()
+        self._base = {name: self.scene.base(name) for name in (*CAMERAS, MAP, COLOR)}
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
             self.there = self.color(inputs)
@@ -60,7 +61,7 @@ class SurfaceRenderer(PredictingRenderer):
 
     def light(self, inputs: Mapping[str, Tensor]) -> Light:
         """Return the light under the environment of scene inputs, made on first use; `MOST_BYTES` of them are kept."""
-        padded = inputs[MAP].detach() if MAP in inputs else self.scene.base(MAP)
+        padded = inputs.get(MAP, self._base[MAP]).detach()
         flat = padded.reshape(-1)
         key = torch.cat([flat[:: max(1, flat.numel() // 997)], flat.sum()[None]]).numpy().tobytes()
         if key not in self._lights:
@@ -102,8 +103,8 @@ class SurfaceRenderer(PredictingRenderer):
         return view.radiance(self.arrangement.finer(self.color(inputs)) * light.on_object)
 
     def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {name: inputs[name] if name in inputs else self.scene.base(name) for name in CAMERAS}
+        return {name: inputs.get(name, self._base[name]) for name in CAMERAS}
 
     def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """The base colour (h, w, 3) of scene inputs."""
-        return inputs[COLOR] if COLOR in inputs else self.scene.base(COLOR)
+        return inputs.get(COLOR, self._base[COLOR])
