@@ -313,7 +313,8 @@ def _transport(findings: Findings) -> LinearTransport:
         return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
     return LinearTransport(
         used=True,
-        reason=transport.given_up,
+        way=transport.way,
+        reason=transport.given_up or findings.surface_refused or None,
         conditions=None if transport.conditions is None else BankOfConditions.of(transport.conditions),
         entries=transport.size()[0],
         bytes=transport.size()[1],

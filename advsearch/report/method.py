@@ -38,7 +38,8 @@ def transport_text(summary: AttackSummary) -> str:
         return ""
     if not transport.used:
         return f"every picture was rendered: {transport.reason}" if transport.reason else "every picture was rendered"
-    parts = [f"a matrix predicted {count(summary.renders.get('products'), 'picture')}"]
+    what = "light on surfaces" if transport.way == "surface light" else "a matrix"
+    parts = [f"{what} predicted {count(summary.renders.get('products'), 'picture')}"]
     if transport.error is not None:
         levels, logits = map(_short, (transport.error.levels, transport.error.logits))
         parts.append(

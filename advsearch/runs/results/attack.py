@@ -226,10 +226,14 @@ class BankOfConditions(Fields):
 
 
 class LinearTransport(Fields):
-    """The matrix that predicted the pictures of the searches."""
+    """What predicted the pictures of the searches."""
 
     used: bool
-    reason: str | None = Field(default=None, description="why pictures were rendered, all or from some evaluation on")
+    way: str | None = Field(default=None, description="by what: `matrix`, or `surface light`")
+    reason: str | None = Field(
+        default=None,
+        description="why pictures were rendered, all or from some evaluation on, or not predicted by surface light",
+    )
     conditions: BankOfConditions | None = Field(default=None, description="with `over`")
     entries: int | None = Field(default=None, description="of the matrix")
     bytes: int | None = Field(default=None, description="of its memory")

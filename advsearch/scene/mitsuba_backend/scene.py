@@ -239,6 +239,12 @@ class MitsubaScene:
             self._set(inputs)
             return self._scene
 
+    def stand(self, inputs: Mapping[str, Tensor]) -> None:
+        """Set the vertices and normals that these inputs have, if others are set; everything else may be anything."""
+        wanted, now = ({n: one[n] for n in one if n in self._buffers} for one in (inputs, self._applied))
+        if wanted.keys() != now.keys() or not all(torch.equal(wanted[n].float(), now[n]) for n in wanted):
+            self.held(inputs)
+
     def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; arguments as for `Renderer.surfaces`."""
         with one_at_a_time:
