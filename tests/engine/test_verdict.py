@@ -43,7 +43,7 @@ def test_the_pictures_that_choose_the_sample_count_are_the_first_trials(
     with RunDirectory.resume(tmp_path / "run") as run:
         stored = [row for row in run.store.rows() if row.phase is None]
     counted = Counter(row.kind for row in stored if row.renders == 0)
-    assert sum(row.renders for row in stored) == len(made)
+    assert sum(row.renders or 0 for row in stored) == len(made)
     assert counted["verification"] >= 4 and counted["control"] >= 4
     chosen = {
         (r.kind, r.seed): (r.score, r.label) for r in stored if r.kind.startswith("sample") and r.spp == findings.spp
