@@ -1,4 +1,6 @@
-"""Draws docs/images/objects.png, environments.png and street.webp: all objects and environments, to be looked at.
+"""Draws docs/images/objects.png and docs/images/environments.png: all objects and environments, to be looked at.
+
+Those of the street are drawn by docs/make_street_image.py.
 
 Run as ``python -m advsearch.bundled.contact_sheet [--out docs/images] [--size 256] [--spp 64]``. It needs
 `mitsuba-oidn` and takes some minutes.
@@ -85,11 +87,8 @@ def picture(
 def _save(path: Path, image: Floats) -> None:
     from PIL import Image
 
-    if path.suffix == ".webp":
-        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(path, quality=86, method=6)
-    else:
-        levels = (image * 127 + 0.5).astype(np.uint8) * 2  # seven bits are enough to look at, and make a smaller file
-        Image.fromarray(levels).save(path, optimize=True)
+    levels = (image * 127 + 0.5).astype(np.uint8) * 2  # seven bits are enough to look at, and make a smaller file
+    Image.fromarray(levels).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size // 1024} KiB")
 
 
@@ -125,29 +124,6 @@ def environments(size: int, spp: int) -> Floats:
     return np.concatenate([np.concatenate(cells[i : i + 2], axis=1) for i in range(0, len(cells), 2)], axis=0)
 
 
-STREET = (
-    ("car", "street", 40.0, 12.0), ("car", "street", 205.0, 14.0), ("stop-sign", "street", -20.0, 4.0),
-    ("car", "street-wet", 325.0, 10.0), ("car", "street-dusk", 145.0, 8.0), ("stop-sign", "street-dusk", 25.0, 8.0),
-)  # fmt: skip
-"""Object, environment, azimuth and elevation of the pictures of the street."""
-
-
-def street(size: int, spp: int) -> Floats:
-    """The car and the stop sign in the streets, three in a row, 4 to 3."""
-    import torch
-
-    from advsearch.controls import Space
-    from advsearch.engine.loading import framed, load_scene, make_renderer
-
-    cells, resolution = [], (3 * size // 2, 2 * size)
-    for name, light, azimuth, elevation in STREET:
-        scene = load_scene(name, light, settings={"camera.azimuth": azimuth, "camera.elevation": elevation})
-        renderer = make_renderer(framed(scene.description, resolution), Space(()), resolution, "oidn", 0, None)
-        with torch.no_grad():
-            cells.append(renderer(renderer.start, 0, spp).numpy())
-    return np.concatenate([np.concatenate(cells[i : i + 3], axis=1) for i in (0, 3)], axis=0)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
@@ -156,15 +132,12 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=list(HOUSEHOLD), help="names of objects")
     parser.add_argument("--no-environments", action="store_true")
     parser.add_argument("--no-objects", action="store_true")
-    parser.add_argument("--no-street", action="store_true")
     args = parser.parse_args()
     os.makedirs(args.out, exist_ok=True)
     if not args.no_objects:
         _save(args.out / "objects.png", objects(args.size, args.spp, args.only))
     if not args.no_environments:
         _save(args.out / "environments.png", environments(args.size, args.spp))
-    if not args.no_street:
-        _save(args.out / "street.webp", street(args.size, args.spp))
 
 
 if __name__ == "__main__":

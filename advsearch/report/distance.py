@@ -2,9 +2,9 @@
 
 The share of pictures in which it is seen is taken to fall with the distance. The estimate is where the falling line
 through the counts crosses one half (isotonic regression by pooling adjacent violators, Ayer et al. 1955, linear in
-the logarithm of the distance). The interval is exact: with m distances each share gets a Clopper-Pearson interval of
-confidence 1 - 0.05 / m, so that all hold together with 95 %; it begins at the farthest distance at which the share is
-above one half for sure, and ends at the nearest one beyond it at which the share is below one half for sure.
+the logarithm of the distance). The interval is exact: with m distances each share is judged by the binomial test of one
+half at 0.025 / m on each side, so that all hold together with 95 %; it begins at the farthest distance at which the
+share is above one half for sure, and ends at the nearest one beyond it at which the share is below one half for sure.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from advsearch.attacks.trials import CONFIDENCE, clopper_pearson
 from advsearch.errors import InputError
 from advsearch.report.drawing import BLUE, GREY
 from advsearch.runs.results.sweep import AxisRow, SweepSummary
@@ -63,19 +62,19 @@ def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
     Raises:
         InputError: there are fewer than two distances.
     """
-    counted = sorted((_middle(row), row.correct, row.configurations) for row in rows)
+    rows = sorted(rows, key=_middle)
+    counted = [(_middle(row), row.correct, row.configurations) for row in rows]
     if len(counted) < 2:
         raise InputError(f"detection distance: expected at least two distances, got {len(counted)}; sweep over more")
     distances = tuple(at for at, _, _ in counted)
-    sure = [clopper_pearson(k, n, 1.0 - (1.0 - CONFIDENCE) / len(counted)) for _, k, n in counted]
-    above = [at for at, (low, _) in zip(distances, sure, strict=True) if low > HALF]
-    low = max(above, default=None)
-    below = [at for at, (_, high) in zip(distances, sure, strict=True) if high < HALF and at > (low or 0.0)]
+    chance = 0.025 / len(counted)
+    low = max((at for at, k, n in counted if _at_least(k, n) < chance), default=None)
+    below = [at for at, k, n in counted if _at_least(n - k, n) < chance and at > (low or 0.0)]
     return SeenFrom(
         unit=rows[0].unit,
         distances=distances,
         shares=tuple(k / n for _, k, n in counted),
-        intervals=tuple(clopper_pearson(k, n) for _, k, n in counted),
+        intervals=tuple(row.interval or (0.0, 1.0) for row in rows),
         distance=_crossing(distances, _falling([(float(k), float(n)) for _, k, n in counted])),
         low=low,
         high=min(below, default=None),
@@ -109,6 +108,11 @@ def distance_axes(found: SeenFrom, axes: Any) -> None:
     axes.set_title("How far away it is seen")
     axes.grid(True)
     axes.legend()
+
+
+def _at_least(successes: int, trials: int) -> float:
+    """The chance of so many successes or more, where each trial is one with a chance of a half."""
+    return sum(math.comb(trials, k) for k in range(successes, trials + 1)) / 2**trials
 
 
 def _middle(row: AxisRow) -> float:

@@ -202,7 +202,7 @@ DUSK = Weather(
 )
 
 _SCRIPT = "scenes/environments/streets.py"
-ROWS = 384
+ROWS = 320
 STREETS = (
     EnvironmentFamily("street", "street", lambda rays: street(rays, DAY), _SCRIPT, height=ROWS, ground="road"),
     EnvironmentFamily("street-wet", "street", lambda rays: street(rays, RAIN), _SCRIPT, height=ROWS, ground="wet-road"),

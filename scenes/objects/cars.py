@@ -24,7 +24,7 @@ AXLES = (1.29, -1.33)
 WHEEL, TYRE = 0.33, 0.215  # radius and width
 ARCH = 0.385
 MIDDLE = -0.5  # of the cabin
-COLUMNS = 112
+COLUMNS = 92
 
 
 # ------------------------------------------------------------------------------------------------------- outlines
@@ -218,8 +218,8 @@ def _side_windows(p: Array) -> Array:
 
 
 def _body(tag: str) -> list[Patch]:
-    rows = spline(np.array(_BODY), 26)
-    deck = np.array([(1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.93, 0.84, 0.74, 0.63, 0.52, 0.42)])
+    rows = spline(np.array(_BODY), 23)
+    deck = np.array([(1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)])
     points = _stack(np.concatenate([rows, deck]), _BODY_POWER, 0.0, _body_height)
     cut = int(COLUMNS * 0.085)
     half = COLUMNS // 2
@@ -235,7 +235,7 @@ def _body(tag: str) -> list[Patch]:
 
 
 def _cabin(tag: str) -> list[Patch]:
-    rows = spline(np.array(_CABIN), 18)
+    rows = spline(np.array(_CABIN), 16)
     roof = np.array([(1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8) for s in (0.75, 0.45, 0.15, 0.002)])
     points = _stack(np.concatenate([rows, roof]), _CABIN_POWER, MIDDLE, _cabin_height)
     half, cut = COLUMNS // 2, int(COLUMNS * 0.1)
@@ -255,8 +255,8 @@ def _wheel() -> list[Patch]:
     tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
     tyre = [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
     deep = half - 0.06
-    patches = lathe([("rubber", np.array(tyre))], 36)
-    patches += lathe([("rim", np.array([(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)]))], 36)
+    patches = lathe([("rubber", np.array(tyre))], 28)
+    patches += lathe([("rim", np.array([(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)]))], 28)
     patches += lathe([("well", np.array([(rim - 0.02, deep), (0.0, deep)]))], 24)
     spoke = np.array([(0.03, 0.0, half - 0.035), (0.11, 0.0, half - 0.022), (rim - 0.012, 0.0, half - 0.018)])
     section = rectangle(0.03, 0.03, 0.008, 1)
@@ -447,4 +447,4 @@ def _car(draw: Draw) -> Instance:
     return Instance(stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES)
 
 
-CAR = ObjectFamily("car", _car, metres=1.0, texels=512)
+CAR = ObjectFamily("car", _car, metres=1.0, texels=384)

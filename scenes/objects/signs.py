@@ -94,4 +94,4 @@ def _stop_sign(draw: Draw) -> Instance:
     return Instance(turned, paints, finishes["face"], {"metal": 0.25, "post": 0.18, "rubber": 0.3}, finishes)
 
 
-STOP_SIGN = ObjectFamily("stop-sign", _stop_sign, metres=1.0)
+STOP_SIGN = ObjectFamily("stop-sign", _stop_sign, metres=1.0, texels=192)

@@ -198,7 +198,7 @@ def test_half_of_the_environments_are_held_out() -> None:
 @pytest.mark.parametrize("name", sorted(ENVIRONMENTS))
 def test_a_shipped_environment_is_light_of_the_common_brightness(name: str) -> None:
     radiance = library.load_environment(name).radiance
-    assert radiance.shape == ((384, 768, 3) if name.startswith("street") else (HEIGHT, WIDTH, 3))
+    assert radiance.shape == ((320, 640, 3) if name.startswith("street") else (HEIGHT, WIDTH, 3))
     assert radiance.dtype == np.float32
     assert np.isfinite(radiance).all()
     assert radiance.min() >= 0.0
