@@ -73,10 +73,10 @@ def test_a_search_says_that_light_on_surfaces_predicted_it(whole: tuple[Path, At
 
 def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, AttackResult], tmp_path: Path) -> None:
     """Light and comparisons are found again."""
-    stopped = advsearch.attack("mug", run=tmp_path / "run", progress=Impatient(9), **SMALL)
-    assert stopped.status == "interrupted"
-    advsearch.resume(tmp_path / "run")
-    assert rows(tmp_path / "run") == rows(whole[0])
+    stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(9), **SMALL)
+    assert stopped.summary.ending == "interrupted"
+    advsearch.attack("mug", run=tmp_path / "parts", resume=True, **SMALL)
+    assert rows(tmp_path / "parts") == rows(whole[0])
 
 
 def test_light_is_renewed_and_then_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

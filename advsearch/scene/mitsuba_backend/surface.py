@@ -134,13 +134,15 @@ class Views:
             key = count, lit.sky_shape, lit.blurred_shape
             if key not in self._recorded:
 
-                def look(held: Any, tables: Any, given: Any, texels: Any, sky: Any, blurred: Any) -> Any:
+                def look(held: Any, lane: Any, tables: Any, given: Any, texels: Any, sky: Any, blurred: Any) -> Any:
                     there = Lit(texels, sky, lit.sky_shape, blurred, lit.blurred_shape)
-                    return self._look(held, tables, given, there, count)
+                    return self._look(held, lane, tables, given, there)
 
                 self._recorded[key] = recorded(look, [])
             arrays = [mi.Float(one) for one in (self._tables, rows.ravel())]
-            found = self._recorded[key](self._scene._scene, *arrays, lit.texels, lit.sky, lit.blurred)
+            lane = dr.arange(mi.UInt32, count * height * width * RAYS)
+            dr.eval(lane)  # a recording takes its size from what it is given, the size of the scene's map else
+            found = self._recorded[key](self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred)
             *rest, covered, u, v, weight = (one.numpy() for one in found)
             size = (count, height, width)
             (sample,) = np.nonzero(weight)
@@ -152,13 +154,12 @@ class Views:
                 weight=torch.from_numpy(weight[sample]),
             )
 
-    def _look(self, held: Any, tables: Any, cameras: Any, lit: Lit, count: int) -> list[Any]:
+    def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lit: Lit) -> list[Any]:
         """The kernel: radiance but for the searched texture, coverage, and where and how much each ray sees of it."""
         mi = mitsuba()
         import drjit as dr
 
         height, width = self._scene.resolution
-        lane = dr.arange(mi.UInt32, count * height * width * RAYS)
         pixel, number = lane // RAYS, lane % RAYS
         view, pixel = pixel // (height * width), pixel % (height * width)
         across, down = (_chosen(number, [one[axis] for one in PATTERN]) for axis in (0, 1))
@@ -166,7 +167,8 @@ class Views:
         x = (entry[14] - 2.0 * (mi.Float(pixel % width) + across) / width) * entry[12]
         y = (entry[15] - 2.0 * (mi.Float(pixel // width) + down) / height) * entry[13]
         way = dr.normalize(mi.Vector3f(*(entry[k] * x + entry[3 + k] * y + entry[6 + k] for k in range(3))))
-        hit = held.ray_intersect(mi.Ray3f(mi.Point3f(*entry[9:12]), way))
+        ray, wanted = mi.Ray3f(mi.Point3f(*entry[9:12]), way), mi.RayFlags.UV | mi.RayFlags.ShadingFrame
+        hit = held.ray_intersect(ray, wanted, coherent=True)
         valid, to_local = hit.is_valid(), to_map(self._scene)
         shapes = shapes_of(held, self._grids)
         ons = [valid & (hit.shape == mi.ShapePtr(shape)) for shape in shapes]
@@ -182,7 +184,7 @@ class Views:
         glossy = valid & (gloss > 1e-4)
         beside = dr.normalize(way + normal * cosine + 1e-8)
         mirrored = dr.normalize(normal * up + beside * along)
-        second = held.ray_intersect(mi.Ray3f(hit.p + normal * SHIFT, mirrored), glossy)
+        second = held.ray_intersect(mi.Ray3f(hit.p + normal * SHIFT, mirrored), mi.RayFlags.UV, False, glossy)
         seconds = [second.is_valid() & (second.shape == mi.ShapePtr(shape)) for shape in shapes]
         blurred = _blurred(lit, mirrored, to_local, spread, self._widths)
         texel = self._texel(second, seconds, lit)

@@ -88,9 +88,7 @@ class Arrangement:
         seed: number of the noise of the rays.
     """
 
-    def __init__(
-        self, renderer: Renderer, inputs: Mapping[str, Tensor], texture: tuple[int, int], seed: int
-    ) -> None:
+    def __init__(self, renderer: Renderer, inputs: Mapping[str, Tensor], texture: tuple[int, int], seed: int) -> None:
         scene = renderer.scene
         self._scene, self.inputs = scene, {name: one for name, one in inputs.items() if name not in ON_PICTURE}
         scene.held(self.inputs)

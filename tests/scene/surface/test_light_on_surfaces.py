@@ -97,6 +97,14 @@ def test_pictures_of_several_cameras_at_once_are_those_of_each(light: SurfaceRen
         assert torch.equal(together, torch.stack([light(one) for one in wholes]))
 
 
+def test_pictures_stay_when_the_scene_had_a_map_of_another_size(traced: Renderer, light: SurfaceRenderer) -> None:
+    """What is recorded goes on with the size of the picture."""
+    with torch.no_grad():
+        before = light(traced.start)
+        traced.scene.held({"environment.padded": torch.rand(31, 64, 3)})
+        assert torch.equal(light(traced.start), before)
+
+
 def test_the_derivative_is_that_of_differences(traced: Renderer) -> None:
     """Of radiance in the texture, in which it is linear but for the curve between both."""
     linear = SurfaceRenderer(traced.like(transfer="linear"), traced.start, seed=0)
@@ -216,7 +224,10 @@ def test_what_it_cannot_predict_has_a_reason() -> None:
     """In words, before anything is measured."""
     mug = load_scene("mug")
     assert why_not(renderer_of(mug), VARYING) is None
-    assert why_not(mug.renderer({"environment": {"exposure": [0, 1]}}, resolution=8), ["environment"]) == "no camera varies"
+    assert (
+        why_not(mug.renderer({"environment": {"exposure": [0, 1]}}, resolution=8), ["environment"])
+        == "no camera varies"
+    )
     assert "vertices" in str(why_not(mug.renderer({"pose": {"yaw": [0, 9]}}, resolution=8), ["pose"]))
     lit = mug.renderer({"texture": {"resolution": 2}, "light": {"power": [0, 9]}}, resolution=8)
     assert "more in the scene" in str(why_not(lit, ["light"]))
