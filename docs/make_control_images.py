@@ -46,12 +46,14 @@ SCENES: Mapping[str, tuple[str, str | None, dict[str, float]]] = {
     "sky": ("bowl", None, {}),
     "background": ("wine-glass", "studio", {}),
     "camera": ("teapot", "day-room", {}),
+    "path": ("teapot", "day-room", {}),
     "occlusion": ("teapot", "kitchen", {}),
 }
 """Object, environment and settings where the mug in the studio does not show it well."""
 
 CONTROLS: Mapping[str, Mapping[str, Any]] = {
     "camera": {"camera": {"azimuth": [0, 360], "elevation": [5, 70], "roll": [-20, 20], "fov": [20, 70]}},
+    "path": {"path": {"path": "approach", "reach": 4.0}},
     "environment": {"environment": {"which": ["own", "kitchen", "noon", "loft"], "rotation": [0, 360]}},
     "light": {
         "key": {"kind": "light", "power": [0.5, 4], "x": [-2, 2], "y": [-2, 2]},

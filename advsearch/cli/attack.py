@@ -84,6 +84,7 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
         "objective": wording.objective_text(summary),
         "printable": wording.print_cost_text(summary),
         "over": wording.over_text(summary),
+        "along the drive": wording.drive_text(summary),
         "smallest": wording.smallest_text(summary),
         "failures": failures_text(summary.failures) if summary.failures else "",
         "search": f"{summary.policy}, {wording.count(summary.steps, 'step')}: {summary.ending}",

@@ -11,7 +11,6 @@ import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
@@ -33,7 +32,9 @@ PATHS = (APPROACH, PASS, TURN)
 CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
 """Share of the time at which the scene is as it is described."""
 
-REACH, SECONDS, LONGEST = 8.0, 10.0, 3600.0
+REACH, SECONDS = 8.0, 10.0
+SHORTEST, LONGEST = 1e-3, 3600.0
+"""Seconds between waypoints at least, and of a path at most."""
 COLUMNS, LOOKING = ("time", "x", "y", "z"), ("look_x", "look_y", "look_z")
 MOST_WAYPOINTS, MOST_BYTES = 100_000, 16 * 2**20
 FARTHEST = 1e5
@@ -94,13 +95,14 @@ class PathControl(NumberControl):
         asked = self.chosen["path"]
         if asked not in PATHS and not (isinstance(asked, str) and asked.lower().endswith(".csv")):
             raise InputError(f"{self.name}.path: expected {', '.join(PATHS)} or a .csv file, got {asked!r}")
+        self._waypoints = None
         if asked not in PATHS:
-            waypoints = _read(str(asked), self.chosen["moves"] == "object")
+            self._waypoints = read_waypoints(Path(str(asked)), of_object=self.chosen["moves"] == "object")
             if "seconds" in self._given or "reach" in self._given:
                 raise InputError(
                     f"{self.name}: the file {asked} says how long and how far; leave seconds and reach out"
                 )
-            self.chosen["seconds"] = float(waypoints.times[-1])
+            self.chosen["seconds"] = float(self._waypoints.times[-1])
 
     @property
     def seconds(self) -> float:
@@ -146,8 +148,7 @@ class PathControl(NumberControl):
     def _camera(self, scene: SceneDescription, own: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         """Where the camera is, and what it looks at."""
         center, start, asked = _middle(scene), own[:3, 3], str(self.chosen["path"])
-        if asked not in PATHS:
-            waypoints = _read(asked, False)
+        if (waypoints := self._waypoints) is not None:
             targets = waypoints.targets
             target = center if targets is None else center + waypoints.at(time, targets)
             return center + waypoints.at(time, waypoints.places), target
@@ -167,8 +168,7 @@ class PathControl(NumberControl):
     def _object(self, scene: SceneDescription, own: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         """How far the object is shifted, and how many degrees it is turned by."""
         asked, still = str(self.chosen["path"]), torch.zeros(())
-        if asked not in PATHS:
-            waypoints = _read(asked, True)
+        if (waypoints := self._waypoints) is not None:
             heading = still if waypoints.headings is None else waypoints.at(time, waypoints.headings)
             return waypoints.at(time, waypoints.places), heading
         share, reach = self._share(time), float(str(self.chosen["reach"]))
@@ -205,27 +205,24 @@ def turned(scene: SceneDescription, shift: Tensor, heading: Tensor) -> Tensor:
     return affine(about, center - about @ center + shift) @ own
 
 
-def _read(path: str, of_object: bool) -> Waypoints:
-    """Waypoints of a file, which is read again when it has changed."""
-    try:
-        changed = Path(path).stat().st_mtime_ns
-    except OSError:
-        changed = 0
-    return _waypoints(path, of_object, changed)
-
-
-@lru_cache(maxsize=16)
-def _waypoints(path: str, of_object: bool, changed: int) -> Waypoints:
+def read_waypoints(path: Path, *, of_object: bool) -> Waypoints:
     """Read a file of waypoints.
+
+    Args:
+        path: a .csv file with the columns time, x, y, z, and look_x, look_y, look_z or heading.
+        of_object: whether the object travels, rather than the camera.
 
     Raises:
         FileFormatError: it is no table of numbers with the columns that a path needs, or its times do not ascend.
     """
     further = ("heading",) if of_object else LOOKING
-    text = read_text(Path(path), "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
+    try:
+        text = read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
+    except OSError as error:
+        raise FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
     header, *rows = [[one.strip() for one in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
-    missing = [one for one in COLUMNS if one not in header]
-    if missing or set(header) - {*COLUMNS, *further} or 0 < len(set(LOOKING) & set(header)) < len(LOOKING):
+    missing, twice = set(COLUMNS) - set(header), len(set(header)) < len(header)
+    if missing or twice or set(header) - {*COLUMNS, *further} or 0 < len({*LOOKING} & {*header}) < len(LOOKING):
         raise FileFormatError(
             f"{path}: expected columns {', '.join(COLUMNS)}, and perhaps {', '.join(further)}, got "
             f"{', '.join(header)[:200] or 'nothing'}"
@@ -236,16 +233,21 @@ def _waypoints(path: str, of_object: bool, changed: int) -> Waypoints:
         table = np.array([[float(one) for one in row] for row in rows], np.float64).reshape(len(rows), len(header))
     except ValueError as error:
         raise FileFormatError(f"{path}: expected {len(header)} numbers in each row, got something else") from error
-    column = {name: torch.from_numpy(table[:, place].astype(np.float32)) for place, name in enumerate(header)}
-    times = torch.from_numpy((table[:, header.index("time")] - table[0, header.index("time")]).astype(np.float32))
-    if not bool((times.diff() > 0).all()) or not float(times[-1]) <= LONGEST:
-        raise FileFormatError(f"{path}: expected times that ascend, {LONGEST:g} s in all at most, got others")
-    if not bool(np.isfinite(table).all()) or float(np.abs(table).max()) > FARTHEST:
+    times = table[:, header.index("time")] - table[0, header.index("time")]
+    if not (np.isfinite(times).all() and (np.diff(times) > SHORTEST).all() and times[-1] <= LONGEST):
+        raise FileFormatError(
+            f"{path}: expected times that ascend, by {SHORTEST:g} s at least and {LONGEST:g} s in all, got others"
+        )
+    column = {name: table[:, place] for place, name in enumerate(header) if name != "time"}
+    if not all(np.abs(one).max() <= FARTHEST for one in column.values()):
         raise FileFormatError(f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none")
 
-    def several(*names: str) -> Tensor | None:
-        return torch.stack([column[one] for one in names], dim=1) if set(names) <= set(header) else None
+    def several(*names: str) -> Tensor:
+        return torch.from_numpy(np.stack([column[one] for one in names], axis=1).astype(np.float32))
 
-    places = several("x", "y", "z")
-    assert places is not None
-    return Waypoints(times, places, several(*LOOKING), column.get("heading"))
+    return Waypoints(
+        times=torch.from_numpy(times.astype(np.float32)),
+        places=several("x", "y", "z"),
+        targets=several(*LOOKING) if LOOKING[0] in column else None,
+        headings=several("heading")[:, 0] if "heading" in column else None,
+    )

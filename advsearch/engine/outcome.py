@@ -15,6 +15,7 @@ from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.domains import domain_of
+from advsearch.engine.driving import answer_along
 from advsearch.engine.failures import described_failures, write_failures
 from advsearch.engine.journal import Journal
 from advsearch.engine.pictures import KeptPicture, trial_to_show, write_artifacts, write_object, write_pictures
@@ -101,7 +102,8 @@ def summarise(
             write_bytes(run.path / "artifacts" / name, data)
         write_answer(run.path, u.numpy())
     summary = _summary(config, objective, problem, findings, clean, adversarial)
-    kept = {"run": None if run is None else str(run.path), "warnings": warnings}
+    drive = None if findings.interrupted else answer_along(problem, None if search is None else u, findings.spp, run)
+    kept = {"run": None if run is None else str(run.path), "warnings": warnings, "drive": drive}
     shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
     summary = summary.model_copy(
         update={**kept, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}

@@ -25,6 +25,7 @@ p { margin: 0.5rem 0; max-width: 46rem; }
 header .remarks li, header .notes li, .eyebrow { overflow-wrap: anywhere; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(14rem, 44%), 1fr)); gap: 1.25rem 1rem; }
 .pictures.pair { max-width: 40rem; }
+.pictures.rows { grid-template-columns: 1fr; }
 .pictures.single { max-width: 24rem; }
 .pictures.large { grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); }
 .pictures.small { grid-template-columns: repeat(auto-fill, minmax(7rem, 1fr)); gap: 0.6rem; }

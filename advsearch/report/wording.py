@@ -119,6 +119,15 @@ def over_text(summary: AttackSummary) -> str:
     return f"{' and '.join(summary.over)}, drawn anew for every picture" if summary.over else ""
 
 
+def drive_text(summary: AttackSummary) -> str:
+    """Return in how many frames of a drive the model is right; empty where none was looked at."""
+    drive = summary.drive
+    if drive is None:
+        return ""
+    answer = "" if drive.answer is None else f", {drive.answer} with the answer"
+    return f"right in {drive.clean} of {drive.frames} frames of the clean scene{answer}"
+
+
 def smallest_text(summary: AttackSummary) -> str:
     """Return the bracket of the smallest epsilon; empty if it was not asked for."""
     bracket = summary.smallest

@@ -99,6 +99,7 @@ def attack_page_html(data: RunData) -> str:
         "main",
         _pictures(data),
         object_section(data.thing),
+        _along(data),
         _changes(summary),
         _textures(data),
         _failures(data),
@@ -147,6 +148,14 @@ def _pictures(data: RunData) -> Html:
         _details("Pictures of the verification", [_figure(data, name, "", _trial(name)) for name in trials], "small"),
         search if data.frames else None,
     )
+
+
+def _along(data: RunData) -> Html:
+    """Frames of the drive, of the clean scene and of the answer, one strip under the other."""
+    frames = "from the first frame to the last"
+    named = (("drive-clean", "Clean"), ("drive", "Adversarial"))
+    strips = [_figure(data, f"images/{name}.png", heading, frames) for name, heading in named]
+    return _section("Along the drive", strips, "rows", f"The model is {wording.drive_text(data.summary)}.")
 
 
 def _textures(data: RunData) -> Html:

@@ -31,6 +31,7 @@ from advsearch.settings import Config, Setting, all_finite, parse_assignment, re
 
 WRONG: dict[str, tuple[Any, str]] = {
     "object": ("", "expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got ''"),
+    "path": ("", "expected approach, pass, orbit, or a .csv file, got ''"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
     "camera": ("", "expected a name that advsearch import lists, or orbit, got ''"),
@@ -96,6 +97,7 @@ GIVEN: dict[str, Any] = {
     "labels": "labels.json", "prompt": "a photo of a {}", "task": "detection", "label": "coffee mug,cup",
     "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
     "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
+    "path": "orbit",
     "average": 50, "printable": True, "aov": "mask,uv", "metrics": {"feature": "own.metrics:seen"}, "log": "wandb",
     "norm": "l2", "texture_resolution": 64,
     "estimator": {"pose": "differences", "*": "adjoint"}, "measure": "no",
@@ -344,6 +346,7 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (RenderConfig, {"out": "a.png", "run": "it"}, "run: `advsearch render` has no such setting; leave it out"),
     (GapConfig, {"epsilon": "0.1,0.2"}, "epsilon: several make a curve, which only `advsearch attack` draws"),
     (SweepConfig, {"sampler": "random", "grid": {"pose.yaw": "0,90"}}, "sampler: is how `controls` are drawn"),
+    (SweepConfig, {"fps": 5, "grid": {"pose.yaw": "0,90"}}, "fps: is of a drive; add `path`, or leave `fps` out"),
     (SweepConfig, {"trials": 0, "verify_spp": 8}, "verify_spp: is of the trials, and `trials` is 0"),
     *(
         (PrecisionConfig, {name: value, "quantities": ",".join({*QUANTITIES} - {left})}, f"{name}: is of the {left}, ")

@@ -6,32 +6,30 @@ independent, so intervals are over drives (a bootstrap of their mean, Efron and 
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from advsearch import seeds
 from advsearch.config import SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.path import PathControl
 from advsearch.engine import run_settings
+from advsearch.engine.driving import write_drive
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.report.marks import marked
-from advsearch.runs.directory import IMAGES, RunDirectory
-from advsearch.runs.files import write_bytes
+from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import DriveRates, OverDrives
 from advsearch.runs.store import Row
 
 FEWEST, RESAMPLES, CONFIDENCE = 5, 2000, 0.95
 """Drives that an interval needs, and samples of the bootstrap."""
 
-STRIP, ANIMATED, SIDE = 8, 60, 160
-"""Frames of the strip, and of the animation at most; side in pixels of a picture of the strip."""
+ANIMATED = 60
+"""Frames of the animation at most."""
 
 UNKNOWN = -1
 
@@ -139,23 +137,6 @@ def picture_of(scenes: Scenes, number: int) -> npt.NDArray[np.float32]:
     view, query = scenes.named(sent[0][0]), sent[0][2]
     picture = view.pictures([query])[0]
     return np.asarray(marked(picture.numpy(), view.marks(0, query.u, picture)), dtype=np.float32)
-
-
-def write_drive(run: RunDirectory, name: str, pictures: Sequence[npt.NDArray[np.float32]], seconds: float) -> None:
-    """Write frames as an animation, NAME.webp, and some of them side by side, NAME.png, in the run's pictures."""
-    frames = [Image.fromarray((one * 255.0).round().clip(0, 255).astype(np.uint8)) for one in pictures]
-    file = io.BytesIO()
-    pause = max(40, round(1000.0 * seconds / len(frames)))
-    frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=pause, loop=0, quality=80)
-    write_bytes(run.path / IMAGES / f"{name}.webp", file.getvalue())
-    some = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), STRIP)).round().astype(int))
-    small = [frames[number].resize(_size(frames[number]), Image.Resampling.LANCZOS) for number in some]
-    strip = np.concatenate([np.asarray(one, dtype=np.float32) / 255.0 for one in small], axis=1)
-    run.save_image(name, strip)
-
-
-def _size(frame: Image.Image) -> tuple[int, int]:
-    return max(1, round(frame.width * SIDE / frame.height)), SIDE
 
 
 def longest(flags: npt.NDArray[np.bool_]) -> int:

@@ -41,6 +41,7 @@ class HardenConfig(AttackConfig):
         "minimise",
         "over",
         "draws",
+        "path",
         "average",
         "baseline",
         "seconds",

@@ -98,6 +98,16 @@ class TriedObjective(Fields):
     answer: ObjectiveValues | None = Field(description="of the answer; null where nothing was verified")
 
 
+class AnswerAlongDrive(Fields):
+    """The clean scene and the answer at evenly spaced times of the path that varied by chance."""
+
+    frames: int
+    seconds: float = Field(description="from the first frame to the last")
+    clean: int = Field(description="frames of the clean scene in which the model is right")
+    answer: int | None = Field(description="likewise, with the answer; null if nothing was searched")
+    spp: int = Field(description="samples a pixel")
+
+
 class BaselineSearch(Fields):
     """The random search beside it."""
 
@@ -323,6 +333,9 @@ class AttackSummary(SceneResult):
     baseline: BaselineSearch | None = Field(default=None, description="the random search; absent without `baseline`")
     answer_from: str | None = Field(default=None, description="`random` where the random search's answer is the run's")
     policy_verified: VerifiedRate | None = Field(default=None, description="of the policy's own answer then")
+    drive: AnswerAlongDrive | None = Field(
+        default=None, description="[along a drive](drives.md), with `over` a path; absent without"
+    )
     average: AverageCase | None = Field(default=None, description="only with `average`")
     smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")
     printability: Printability | None = Field(default=None, description="only with `printable`")

@@ -1,0 +1,176 @@
+"""The path control: the scene as it is where it is promised, distances that are right, and files, good and hostile."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.controls import BoundControl, make_space
+from advsearch.controls.path import CLEAN_AT, PATHS, PathControl
+from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.framing import middle
+from advsearch.scene.geometry import camera_to_world, object_to_world
+
+WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
+"""A way of four seconds; the middle one is passed after one of them."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("mug", given={"camera.roll": 20.0, "camera.azimuth": 70.0})
+
+
+def bound(scene: SceneDescription, **given: object) -> BoundControl:
+    return make_space([PathControl(**given)], scene).controls[0]
+
+
+def distance(control: BoundControl, share: float) -> float:
+    return float(str(control.describe(torch.tensor([share]))["path.distance"]["value"]))
+
+
+def placed(control: BoundControl, share: float) -> Tensor:
+    (pose,) = control.inputs(torch.tensor([share])).values()
+    return pose
+
+
+@pytest.mark.parametrize("moves", ["camera", "object"])
+@pytest.mark.parametrize("path", PATHS)
+def test_a_frame_of_each_path_is_the_scene_as_it_is_and_others_are_not(
+    scene: SceneDescription, path: str, moves: str
+) -> None:
+    control = bound(scene, path=path, moves=moves)
+    own = torch.from_numpy((camera_to_world if moves == "camera" else object_to_world)(scene)).float()
+    assert float(control.start) == CLEAN_AT[path]
+    torch.testing.assert_close(placed(control, float(control.start)), own, atol=1e-5, rtol=0)
+    assert float((placed(control, 0.3) - own).abs().max()) > 0.1
+    turning = placed(control, 0.3)[:3, :3] / float(own[:3, 0].norm())
+    torch.testing.assert_close(turning @ turning.T, torch.eye(3), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("moves", ["camera", "object"])
+def test_distances_are_those_of_the_geometry(moves: str) -> None:
+    scene = describe("mug", given={"camera.elevation": 0.0, "camera.distance": 2.0})
+    away = distance(bound(scene, path="orbit", moves=moves), 0.7)
+    assert away == pytest.approx(2.0, abs=1e-4)
+    near = [distance(bound(scene, path="approach", reach=5.0, moves=moves), share) for share in (0.0, 0.25, 1.0)]
+    assert near == pytest.approx([10.0, 8.0, 2.0], abs=1e-3)
+    past = [distance(bound(scene, path="pass", reach=3.0, moves=moves), share) for share in (0.0, 0.5, 1.0)]
+    assert past == pytest.approx([math.hypot(2.0, 6.0), 2.0, math.hypot(2.0, 6.0)], abs=1e-3)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_moving_the_camera_or_the_object_is_the_same_drive(path: str) -> None:
+    """Up to the sense of the turn: what the camera sees of the object's middle is as far away."""
+    scene = describe("mug", given={"camera.elevation": 30.0})
+    camera, thing = (bound(scene, path=path, moves=moves) for moves in ("camera", "object"))
+    for share in (0.0, 0.4, 0.8):
+        assert distance(camera, share) == pytest.approx(distance(thing, share), rel=1e-4)
+
+
+@pytest.mark.parametrize("moves", ["camera", "object"])
+@pytest.mark.parametrize("path", PATHS)
+def test_the_derivative_is_that_of_differences(scene: SceneDescription, path: str, moves: str) -> None:
+    control, share, step = bound(scene, path=path, moves=moves), 0.37, 1e-2
+    derivative = torch.autograd.functional.jacobian(
+        lambda u: next(iter(control.inputs(u).values())), torch.tensor([share])
+    )[..., 0]
+    difference = (placed(control, share + step) - placed(control, share - step)) / (2.0 * step)
+    torch.testing.assert_close(derivative, difference, atol=2e-2, rtol=2e-2)
+
+
+def test_a_way_of_a_file_is_followed(scene: SceneDescription, tmp_path: Path) -> None:
+    file, center = tmp_path / "way.csv", torch.from_numpy(middle(scene)).float()
+    file.write_text("\ufeff" + WAY)
+    control = bound(scene, path=str(file))
+    assert float(str(control.describe(torch.ones(1))["path.time"]["value"])) == pytest.approx(4.0)
+    for share, place in ((0.0, (2.0, 0.0, 1.0)), (0.125, (2.0, 1.0, 1.0)), (0.625, (0.0, 2.0, 1.0)), (1, (-2, 2, 1))):
+        pose = placed(control, share)
+        torch.testing.assert_close(pose[:3, 3] - center, torch.tensor(place, dtype=torch.float32), atol=1e-5, rtol=0)
+        ahead = (center - pose[:3, 3]) / (center - pose[:3, 3]).norm()
+        torch.testing.assert_close(pose[:3, 2], ahead, atol=1e-5, rtol=0)
+
+
+def test_a_file_says_where_the_camera_looks_and_how_the_object_is_turned(
+    scene: SceneDescription, tmp_path: Path
+) -> None:
+    looks, turns = tmp_path / "looks.csv", tmp_path / "turns.CSV"
+    looks.write_text("time,x,y,z,look_x,look_y,look_z\n0,3,0,1,0,0,1\n1,3,0,1,3,5,1\n")
+    turns.write_text("time,heading,z,y,x\n0,0,0,0,0\n2,90,0,0,4\n")
+    ahead = placed(bound(scene, path=str(looks)), 1.0)[:3, 2]
+    torch.testing.assert_close(ahead, torch.tensor([0.0, 1.0, 0.0]), atol=1e-5, rtol=0)
+    own, pose = (
+        torch.from_numpy(object_to_world(scene)).float(),
+        placed(bound(scene, path=str(turns), moves="object"), 1),
+    )
+    torch.testing.assert_close(pose[:3, 0], torch.stack([-own[1, 0], own[0, 0], own[2, 0]]), atol=1e-5, rtol=0)
+    there = torch.cat([torch.from_numpy(middle(scene)).float(), torch.ones(1)])
+    shift = (pose @ torch.linalg.inv(own) @ there - there)[:3]
+    torch.testing.assert_close(shift, torch.tensor([4.0, 0.0, 0.0]), atol=1e-5, rtol=0)
+
+
+def test_a_camera_over_the_object_has_a_pose(tmp_path: Path) -> None:
+    file = tmp_path / "over.csv"
+    file.write_text("time,x,y,z\n0,0,0,3\n1,0,0,2\n")
+    assert bool(torch.isfinite(placed(bound(describe("mug"), path=str(file)), 0.5)).all())
+
+
+def test_a_file_that_changes_is_read_again(scene: SceneDescription, tmp_path: Path) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text(WAY)
+    assert PathControl(path=str(file)).seconds == 4.0
+    file.write_text(WAY.replace("7, -2", "9, -2") + "\n")
+    assert PathControl(path=str(file)).seconds == 6.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected columns time, x, y, z, and perhaps look_x, look_y, look_z, got nothing"),
+        ("time,x,y\n0,1,1\n1,1,1\n", "expected columns .* got time, x, y"),
+        ("time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns .* got time, x, y, z, look_x"),
+        ("time,x,y,z,heading\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
+        ("time,x,x,y,z\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
+        ("time,x,y,z\n0,1,1,1\n", "expected 2 to 100000 waypoints, got 1"),
+        ("time,x,y,z\n0,1,1,1\n1,a,1,1\n", "expected 4 numbers in each row"),
+        ("time,x,y,z\n0,1,1,1\n1,1,1\n", "expected 4 numbers in each row"),
+        ("time,x,y,z\n0,1,1,1\n0,1,1,1\n", "expected times that ascend, by 0.001 s at least and 3600 s in all"),
+        ("time,x,y,z\n1,1,1,1\n0,1,1,1\n", "expected times that ascend"),
+        ("time,x,y,z\nnan,1,1,1\n1,1,1,1\n", "expected times that ascend"),
+        ("time,x,y,z\n0,1,1,1\n1e300,1,1,1\n", "expected times that ascend"),
+        ("time,x,y,z\n1e30,1,1,1\n2e30,1,1,1\n", "expected times that ascend"),
+        ("time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n", "expected times that ascend"),
+        ("time,x,y,z\n0,1,1,1\n1,1e300,1,1\n", "expected numbers within 100000"),
+        ("time,x,y,z\n0,nan,1,1\n1,1,1,1\n", "expected numbers within 100000"),
+        ("time,x,y,z\n0,-inf,1,1\n1,1,1,1\n", "expected numbers within 100000"),
+    ],
+)
+def test_a_file_that_is_no_way_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        PathControl(path=str(file))
+
+
+def test_a_file_that_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"nowhere\.csv"):
+        PathControl(path=str(tmp_path / "nowhere.csv"))
+    (tmp_path / "bytes.csv").write_bytes(b"time,x,y,z\n\xff\xfe\x00\n")
+    with pytest.raises(FileFormatError, match=r"bytes\.csv"):
+        PathControl(path=str(tmp_path / "bytes.csv"))
+    with pytest.raises(FileFormatError):
+        (tmp_path / "folder.csv").mkdir()
+        PathControl(path=str(tmp_path / "folder.csv"))
+
+
+def test_what_does_not_go_together_is_refused(scene: SceneDescription, tmp_path: Path) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text(WAY)
+    with pytest.raises(InputError, match=r"path\.path: expected approach, pass, orbit or a \.csv file, got 'aproach'"):
+        PathControl(path="aproach")
+    with pytest.raises(InputError, match="says how long and how far; leave seconds and reach out"):
+        PathControl(path=str(file), seconds=3.0)

@@ -1,0 +1,198 @@
+"""Drives: frames that share their draws, rates worked out by hand, and what an attack keeps along its path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_sweep import FakeRenderer
+from test_sweep_workers import Disorder, rows, summary
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.api.sweep import job_of
+from advsearch.cli.sweep import answer
+from advsearch.config import SweepConfig
+from advsearch.engine.sharing import answering
+from advsearch.engine.sweeps import swept_scene
+from advsearch.engine.sweeps.drives import longest, over_drives
+from advsearch.engine.sweeps.loop import Sweep
+from advsearch.engine.sweeps.swept_scene import Scenes
+from advsearch.errors import InputError
+from advsearch.progress import NullProgress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.sweep import DriveRates
+
+SMALL: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "batch": 4}
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_rendered(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But in the test of an attack."""
+    FakeRenderer.made, FakeRenderer.calls, FakeRenderer.stops_at, FakeRenderer.level = [], 0, None, None
+    monkeypatch.setattr(swept_scene, "make_renderer", FakeRenderer)
+
+
+class Clock(nn.Module):
+    """Is shown the time in the picture, and says "mug" at some of the times."""
+
+    def __init__(self, right: str) -> None:
+        super().__init__()
+        self.right = torch.tensor([float(one) for one in right])
+
+    def forward(self, images: Tensor) -> Tensor:
+        frame = (images.mean(dim=(1, 2, 3)) * 255.0).round().long()
+        score = 10.0 * (2.0 * self.right[frame] - 1.0)
+        return torch.stack([score, -score], dim=1)
+
+
+class Timed(FakeRenderer):
+    """A picture whose grey level is the number of the configuration that is rendered."""
+
+    def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        time = float(str(self.space.describe(u)["path.time"]["value"]))
+        yaw = float(str(self.space.describe(u).get("pose.yaw", {"value": 0.0})["value"]))
+        return torch.full((*self.size, 3), (round(time) + 5 * round(yaw / 90.0)) / 255.0)
+
+
+def clocked(right: str, **given: Any) -> tuple[list[DriveRates], Any]:
+    model = advsearch.load_model(Clock(right), labels=("mug", "vase"), input_size=16, name="clock")
+    result = advsearch.sweep("mug", model, **{**SMALL, **given})
+    return list(result.summary.drives or ()), result
+
+
+DRIVE: dict[str, Any] = {"controls": {"path": {"seconds": 4.0, "reach": 5.0}}, "path": "approach", "fps": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("frames", "right", "gap", "flicker", "first"),
+    [("00110", 0.4, 2.0, 0.5, 3.0), ("11111", 1.0, 0.0, 0.0, 5.0), ("00000", 0.0, 5.0, 0.0, None)]
+    + [("10001", 0.4, 3.0, 0.5, 5.0), ("01010", 0.4, 1.0, 1.0, 4.0)],
+)
+def test_rates_of_one_drive_are_those_worked_out_by_hand(
+    frames: str, right: float, gap: float, flicker: float, first: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five frames in four seconds, from five distances away to one, with the camera as high as the object."""
+    monkeypatch.setattr(swept_scene, "make_renderer", Timed)
+    (said,), _ = clocked(frames, **DRIVE, set={"camera.elevation": 0.0, "camera.distance": 1.0})
+    assert (said.drives, said.frames, said.seconds, said.never_seen) == (1, 5, 4.0, int(first is None))
+    assert (said.right.mean, said.longest_gap.mean, said.flicker.mean) == pytest.approx((right, gap, flicker))
+    assert said.right.interval is None and said.right.worst == said.right.mean
+    assert (said.first_seen and said.first_seen.mean) == (None if first is None else pytest.approx(first, abs=1e-3))
+
+
+def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(swept_scene, "make_renderer", Timed)
+    path = tmp_path / "run"
+    (said,), result = clocked("11111" + "00011" + "10111" + "11110", **DRIVE, grid={"pose.yaw": "0:360:4"}, run=path)
+    assert said.drives == 4 and said.right.mean == pytest.approx((5 + 2 + 4 + 4) / 20) and said.right.worst == 0.4
+    assert said.longest_gap.worst == 3.0 and said.longest_gap.mean == pytest.approx((0 + 3 + 1 + 1) / 4)
+    with Image.open(path / "images" / "drive.webp") as kept:
+        assert getattr(kept, "n_frames", 1) == 5
+    strip = np.asarray(Image.open(path / "images" / "drive.png"))
+    assert strip.shape == (160, 5 * 160, 3) and [int(strip[80, 80 + 160 * k, 0]) for k in range(5)] == [5, 6, 7, 8, 9]
+    text = answer(result.summary)
+    assert "4 drives of 5 frames in 4 s, clock" in text and "75 %" in text and "40 %" in text and "drive.webp" in text
+    assert "Whole drives" in (path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("grid", [{}, {"path.time": [0, 4, 2], "pose.yaw": [0, 90]}, {"pose.yaw": [0, 90]}])
+@pytest.mark.parametrize("samples", [1, 3])
+def test_frames_of_a_drive_share_their_draws_and_drives_do_not(grid: dict[str, Any], samples: int) -> None:
+    result = advsearch.sweep(
+        "mug,bowl", grid=grid, controls={"camera.fov": {"fov": [20, 50]}, "path": {"moves": "object", "seconds": 4.0}},
+        path="approach", fps=1, samples=samples, label="mug", **SMALL,
+    )  # fmt: skip
+    drawn: dict[tuple[Any, ...], list[float]] = {}
+    for row in result.rows():
+        yaw = row.values.get("pose.yaw", {"value": 0.0})["value"]
+        place = (row.values["object"]["value"], yaw, row.step % samples)
+        drawn.setdefault(place, []).append(float(str(row.values["camera.fov"]["value"])))
+    frames = 3 if "path.time" in grid else 5
+    assert len(drawn) == 2 * samples * (2 if grid else 1) and all(len(one) == frames for one in drawn.values())
+    assert all(len(set(one)) == 1 for one in drawn.values()), "the lens is the same all along a drive"
+    assert len({one[0] for one in drawn.values()}) == len(drawn), "and another one on every drive"
+    assert result.summary.drives and result.summary.drives[0].drives == len(drawn)
+
+
+CONFIG = SweepConfig(
+    object="mug", environment="studio,noon", grid={"pose.yaw": "0:360:3"}, controls={"camera.fov": {"fov": [20, 50]},
+    "path": {"moves": "object"}}, path="pass", fps=0.2, samples=2, resolution=16, spp=1, trials=0, batch=2,
+)  # fmt: skip
+
+
+def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "alone") as run:
+        alone = Sweep(job_of(CONFIG), run, NullProgress()).carry_out()
+    path = tmp_path / "shared"
+    for resumed in (False, True):
+        job = job_of(CONFIG)
+        with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
+            executor = Disorder(answering(Scenes(job).named), seed=3, stop=None if resumed else 4)
+            found = Sweep(job, run, NullProgress(), executor).carry_out()
+    assert rows(path) == rows(tmp_path / "alone") and len(rows(path)) == 2 * 3 * 3 * 2
+    assert summary(found) == summary(alone) and alone.summary.drives is not None
+    assert alone.summary.drives[0].drives == 12 and alone.summary.drives[0].right.interval is not None
+    kept = [(one / "images" / "drive.webp").read_bytes() for one in (path, tmp_path / "alone")]
+    assert kept[0] == kept[1]
+
+
+def test_an_interval_is_that_of_a_mean_and_needs_five_drives() -> None:
+    few = over_drives(np.array([0.0, 1.0, 1.0, 1.0]), worst=min)
+    assert (few.mean, few.interval, few.worst) == (0.75, None, 0.0)
+    values = np.random.default_rng(0).normal(size=400)
+    many = over_drives(values, worst=max)
+    assert many.interval is not None and many.worst == values.max()
+    normal = 1.96 * values.std() / 20.0
+    assert many.interval == pytest.approx((values.mean() - normal, values.mean() + normal), abs=0.2 * normal)
+    assert over_drives(np.full(9, 0.5), worst=min).interval == (0.5, 0.5)
+
+
+def test_the_longest_run() -> None:
+    assert [longest(np.array(one, bool)) for one in ([], [0], [1], [1, 1, 0, 1], [0, 1, 0, 1, 1])] == [0, 0, 1, 2, 2]
+
+
+def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
+    assert advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, **SMALL).summary.drives is None
+    assert advsearch.sweep("mug", grid={"path.time": [3]}, **SMALL).summary.drives is None
+    with pytest.raises(
+        InputError, match="path: texture does not travel; add `over=path` beside it, or `controls=path`"
+    ):
+        advsearch.attack("mug", controls="texture", path="orbit")
+
+
+def test_an_attack_over_a_path_keeps_its_answer_along_the_drive(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    size = {"resolution": 16, "spp": 1, "verify_spp": 1, "steps": 1, "trials": 6, "draws": 1}
+    model = advsearch.load_model(Dark(), labels=("mug", "vase"), input_size=16, name="dark")
+    found = advsearch.attack(
+        "mug", model, controls="texture", over={"path": {"seconds": 5.0}}, path="approach", run=path, baseline=False,
+        denoise="none", **size,
+    ).summary  # fmt: skip
+    assert found.drive is not None and found.adversarial is not None
+    assert (found.drive.frames, found.drive.seconds, found.drive.clean) == (24, 5.0, 24)
+    assert found.drive.answer is not None and 0 <= found.drive.answer <= 24
+    for name in ("drive", "drive-clean"):
+        with Image.open(path / "images" / f"{name}.webp") as kept:
+            assert getattr(kept, "n_frames", 1) == 24
+        assert Image.open(path / "images" / f"{name}.png").size == (8 * 160, 160)
+    pictures = [(path / "images" / f"{name}.png").read_bytes() for name in ("drive", "drive-clean")]
+    assert pictures[0] != pictures[1]
+    page = (path / "report.html").read_text()
+    assert "Along the drive" in page and "right in 24 of 24 frames of the clean scene" in page
+    assert (
+        advsearch.attack("mug", model, controls="texture", denoise="none", **{**size, "draws": None}).summary.drive
+        is None
+    )
+
+
+class Dark(nn.Module):
+    """Says "mug" of every picture that is not white, with a slope in its brightness."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        score = 3.0 * (2.0 - images.mean(dim=(1, 2, 3)))
+        return torch.stack([score, -score], dim=1)
