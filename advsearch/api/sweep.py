@@ -14,8 +14,8 @@ from advsearch.api.attack import LOADING, executor_for, is_named
 from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, SweepConfig
-from advsearch.controls import CameraControl, Control
-from advsearch.controls.camera import measured_in
+from advsearch.controls import Control
+from advsearch.controls.camera import CameraControl, measured_in
 from advsearch.engine import run_settings
 from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.attack_result import AttackResult
