@@ -112,7 +112,8 @@ def distance_axes(found: SeenFrom, axes: Any) -> None:
 
 def _at_least(successes: int, trials: int) -> float:
     """The chance of so many successes or more, where each trial is one with a chance of a half."""
-    return sum(math.comb(trials, k) for k in range(successes, trials + 1)) / 2**trials
+    ways: int = sum(math.comb(trials, k) for k in range(successes, trials + 1))
+    return ways / (1 << trials)
 
 
 def _middle(row: AxisRow) -> float:

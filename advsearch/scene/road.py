@@ -118,7 +118,8 @@ def _texture(wet: bool) -> Floats:
     x, y = np.meshgrid((np.arange(width) + 0.5) * TEXEL, EDGES[1] - (np.arange(height) + 0.5) * TEXEL)
     linear = reflectance(x.ravel(), y.ravel(), grain.ravel()).reshape(height, width, 3) * (WETNESS if wet else 1.0)
     levels = np.round(linear_to_srgb(np.round(linear, 5).astype(np.float32)) * 255.0)
-    return np.asarray(levels, np.float32) / np.float32(255.0)
+    shown: Floats = np.asarray(levels, np.float32) / np.float32(255.0)
+    return shown
 
 
 def _blurred(values: Doubles, reach: int) -> Doubles:

@@ -10,10 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from advsearch.scene.road import WETNESS, reflectance
 
 from .panorama import Array, EnvironmentFamily
+
+Bools = npt.NDArray[np.bool_]
 
 EYE = 1.5
 FRONTS = (-12.0, 15.6)  # y of the fronts of the houses
@@ -57,7 +60,7 @@ def _hashed(*numbers: Array) -> Array:
     return np.round((np.sin(total * 0.731 + 1.7) * 43.7585) % 1.0, 6) % 1.0
 
 
-def _front(x: Array, z: Array, side: int, weather: Weather) -> tuple[Array, Array]:
+def _front(x: Array, z: Array, side: int, weather: Weather) -> tuple[Array, Bools]:
     """Radiance (N, 3) of a row of houses at places along and up its front, and (N,) whether a house is there."""
     house = np.floor((x + 5.0 * side) / 13.0)
     along = (x + 5.0 * side) - 13.0 * house
@@ -88,7 +91,7 @@ def _front(x: Array, z: Array, side: int, weather: Weather) -> tuple[Array, Arra
     return color, (z < height) & (z > 0.0)
 
 
-def _trees(rays: Array, light: Array) -> tuple[Array, Array]:
+def _trees(rays: Array, light: Array) -> tuple[Array, Bools]:
     """The end of the street: radiance (N, 3) and (N,) whether something is there."""
     a = np.arctan2(rays[:, 1], np.abs(rays[:, 0]))
     crown = 0.05 + 0.012 * np.sin(31.0 * a + 0.7) + 0.008 * np.sin(67.0 * a) + 0.02 * np.cos(9.0 * a)
@@ -133,7 +136,7 @@ def _with_lamps(rays: Array, radiance: Array, weather: Weather) -> Array:
     """The same with street lamps, round and bright."""
     if weather.lamps == 0.0:
         return radiance
-    total = radiance.copy()
+    total: Array = radiance.copy()
     for x in np.arange(-52.0, 60.0, 15.0):
         for y in (-4.0, 7.4):
             place = np.array([x, y, 5.5 - EYE])

@@ -10,9 +10,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from .curves import Array
-from .shapes import Patch
+from .shapes import Indices, Patch
+
+Bools = npt.NDArray[np.bool_]
 
 Field = Callable[[Array], Array]
 """(N, 3) points to (N,) values, positive inside; about the distance to the edge."""
@@ -50,16 +53,16 @@ def cropped(patch: Patch) -> Patch:
     return replace(patch, uvs=uvs, size=size, rest=lambda u, v: patch.rest(low[0] + u * span[0], low[1] + v * span[1]))
 
 
-def _edges(patch: Patch) -> Array:
+def _edges(patch: Patch) -> Indices:
     """The (E, 2) edges of a patch."""
     pairs = np.concatenate([patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]])
-    edges: Array = np.unique(np.sort(pairs, axis=1), axis=0)
+    edges: Indices = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
     return edges
 
 
 def _snapped(patch: Patch, value: Array) -> Array:
     """The values with 0 at vertices that the curve passes closely."""
-    edges = _edges(patch).astype(np.int64)
+    edges = _edges(patch)
     ends = value[edges]
     crossed = ends[:, 0] * ends[:, 1] < 0.0
     share = np.abs(ends[crossed]) / np.abs(ends[crossed]).sum(axis=1, keepdims=True)
@@ -68,9 +71,9 @@ def _snapped(patch: Patch, value: Array) -> Array:
     return value
 
 
-def _split(patch: Patch, value: Array) -> tuple[Patch, Array]:
+def _split(patch: Patch, value: Array) -> tuple[Patch, Bools]:
     """The patch with its triangles split where the values change sign, and (F,) whether each face is inside."""
-    edges = _edges(patch).astype(np.int64)
+    edges = _edges(patch)
     crossed = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]
     a, b = crossed.T
     share = (value[a] / (value[a] - value[b]))[:, None]
