@@ -140,7 +140,8 @@ class PathControl(NumberControl):
             away = self._camera(scene, own, time)[0] - _middle(scene)
         else:
             away = own[:3, 3] - _middle(scene) - self._object(scene, own, time)[0]
-        return {"distance": {"value": float(away.norm()), "unit": "object sizes"}}
+        unit = "object sizes" if scene.object.metres is None else "metres"
+        return {"distance": {"value": float(away.norm()) * scene.metres, "unit": unit}}
 
     def _share(self, time: Tensor) -> Tensor:
         return (time / self.seconds).clamp(0.0, 1.0)

@@ -29,7 +29,7 @@ def drive_rows(one: DriveRates) -> list[tuple[str, str, str, str]]:
     ]
     if one.first_seen is not None:
         never = f", never in {one.never_seen}" if one.never_seen else ""
-        mean, interval, worst = _texts(one.first_seen, 1.0, " object sizes")
+        mean, interval, worst = _texts(one.first_seen, 1.0, f" {one.unit}")
         rows.insert(1, ("first right at a distance of", mean + never, interval, worst))
     return rows
 

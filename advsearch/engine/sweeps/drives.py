@@ -70,13 +70,14 @@ class Drives:
         right: Flags = np.full(shape, UNKNOWN, np.int8)
         away = np.full((len(job.places), sizes[place]), np.nan)
         before = int(np.prod(sizes[place + 1 :], dtype=np.int64)) * job.samples * len(job.models)
-        name = f"{axis.instance}.distance"
+        name, self._unit = f"{axis.instance}.distance", "object sizes"
         for row in rows:
             right.flat[row.step] = bool(row.correct)
             if name in row.values:
                 away[row.step // len(job.models) // job.per_scene, row.step // before % sizes[place]] = float(
                     str(row.values[name]["value"])
                 )
+                self._unit = row.values[name]["unit"]
         order = np.argsort([float(value) for value in axis.values])
         self.times = np.array([float(value) for value in axis.values])[order]
         self._numbers = np.moveaxis(np.arange(right.size).reshape(shape), place + 1, -1)[..., order]
@@ -114,6 +115,7 @@ class Drives:
             right=over_drives(right.mean(axis=1), worst=min),
             longest_gap=over_drives(np.array([longest(~one) for one in right]) * step, worst=max),
             first_seen=over_drives(first, worst=min) if len(first) and np.isfinite(first).all() else None,
+            unit=self._unit,
             never_seen=int((~seen).sum()),
             flicker=over_drives(changes, worst=max),
         )

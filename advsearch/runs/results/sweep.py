@@ -156,8 +156,9 @@ class DriveRates(Fields):
     right: OverDrives = Field(description="share of frames in which the model is right")
     longest_gap: OverDrives = Field(description="seconds of the longest run of frames in which it is not")
     first_seen: OverDrives | None = Field(
-        description="distance at the first frame in which it is right, in object sizes, of drives that have one"
+        description="distance at the first frame in which it is right, of drives that have one"
     )
+    unit: str = Field(default="object sizes", description="of that distance")
     never_seen: int = Field(description="drives without a frame in which it is right")
     flicker: OverDrives = Field(description="changes between right and wrong a second")
 
