@@ -16,28 +16,28 @@ if TYPE_CHECKING:
     from advsearch import losses as losses
     from advsearch import testing as testing
     from advsearch.api.attack import attack as attack
-    from advsearch.api.check import check as check
-    from advsearch.api.explain import explain as explain
     from advsearch.api.gap import gap as gap
-    from advsearch.api.harden import harden as harden
     from advsearch.api.load_run import load_run as load_run
     from advsearch.api.model import load_model as load_model
     from advsearch.api.photos import photo_agreement as photo_agreement
-    from advsearch.api.plan import plan as plan
-    from advsearch.api.precision import precision as precision
-    from advsearch.api.recipe import recipe as recipe
-    from advsearch.api.region import region as region
     from advsearch.api.render import Rendering as Rendering
     from advsearch.api.render import render as render
-    from advsearch.api.replay import replay as replay
-    from advsearch.api.stability import stability as stability
     from advsearch.api.sweep import sweep as sweep
     from advsearch.engine.attack_result import AttackResult as AttackResult
     from advsearch.engine.loading import Scene as Scene
     from advsearch.engine.loading import load_scene as load_scene
     from advsearch.engine.sweeps.answer import SweepResult as SweepResult
     from advsearch.models import Model as Model
+    from advsearch.questions.check.carry_out import check as check
     from advsearch.questions.compare.carry_out import compare as compare
+    from advsearch.questions.explain.carry_out import explain as explain
+    from advsearch.questions.harden.carry_out import harden as harden
+    from advsearch.questions.plan.carry_out import plan as plan
+    from advsearch.questions.precision.carry_out import precision as precision
+    from advsearch.questions.recipe.carry_out import recipe as recipe
+    from advsearch.questions.region.carry_out import region as region
+    from advsearch.questions.replay.carry_out import replay as replay
+    from advsearch.questions.stability.carry_out import stability as stability
 
 __version__ = "0.1.0"
 
@@ -48,22 +48,22 @@ _HOMES = {
     "Scene": "advsearch.engine.loading",
     "SweepResult": "advsearch.engine.sweeps.answer",
     "attack": "advsearch.api.attack",
-    "check": "advsearch.api.check",
+    "check": "advsearch.questions.check.carry_out",
     "compare": "advsearch.questions.compare.carry_out",
-    "explain": "advsearch.api.explain",
+    "explain": "advsearch.questions.explain.carry_out",
     "gap": "advsearch.api.gap",
-    "harden": "advsearch.api.harden",
+    "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.model",
     "load_run": "advsearch.api.load_run",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.api.photos",
-    "plan": "advsearch.api.plan",
-    "precision": "advsearch.api.precision",
-    "recipe": "advsearch.api.recipe",
-    "region": "advsearch.api.region",
+    "plan": "advsearch.questions.plan.carry_out",
+    "precision": "advsearch.questions.precision.carry_out",
+    "recipe": "advsearch.questions.recipe.carry_out",
+    "region": "advsearch.questions.region.carry_out",
     "render": "advsearch.api.render",
-    "replay": "advsearch.api.replay",
-    "stability": "advsearch.api.stability",
+    "replay": "advsearch.questions.replay.carry_out",
+    "stability": "advsearch.questions.stability.carry_out",
     "sweep": "advsearch.api.sweep",
 }
 """The public names, and the module of each."""

@@ -1,8 +1,9 @@
 """Questions that are rooms of their own: `advsearch/questions/NAME/`, found by the name of their command.
 
 What is below them (the list of settings, of results, of pages) asks here, by name, so that it imports none of them. A
-room has `settings.CONFIG`, `carry_out.NAME_from_config`, `answer.RESULT`, `words.answer`, `words.claims`, `page.page`
-and `command.COMMAND`; a question that needs less has less.
+room has `settings.CONFIG`, `carry_out.NAME_from_config`, `answer.RESULT`, `words.shown`, `words.claims` and
+`command.COMMAND`, and `page.page` where its page is of its own kind; a question that needs less has less. The tool
+works without those whose folder is missing.
 """
 
 from __future__ import annotations
@@ -20,6 +21,12 @@ FOLDER = Path(__file__).parent / "questions"
 def rooms() -> tuple[str, ...]:
     """Return the names of the questions that are rooms."""
     return tuple(sorted(path.parent.name for path in FOLDER.glob("*/__init__.py")))
+
+
+def there(module: str) -> bool:
+    """Return whether a module is none of a question whose folder is missing."""
+    parts = module.split(".")
+    return parts[:2] != ["advsearch", "questions"] or parts[2] in rooms()
 
 
 def in_room(name: str, module: str, what: str) -> Any:

@@ -103,6 +103,12 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
         return 1
     if depth >= DEPTH or counts.get(id(node), 1) == 0:
         raise _problem(node, f"lists or mappings nested deeper than {DEPTH}")
+    if isinstance(node, yaml.MappingNode):
+        seen = set[str]()
+        for name, _ in node.value:
+            if isinstance(name, yaml.ScalarNode) and name.value in seen:
+                raise _problem(name, f"the name {name.value[:60]!r} twice")
+            seen.add(str(name.value))
     if id(node) not in counts:
         counts[id(node)] = 0
         inner = node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]

@@ -83,13 +83,6 @@ BUDGETS: Mapping[str, Mapping[str, tuple[int | None, ...]]] = {
         "quadratic, box": (2000, None, None, None),
         "hills, box": (200, 2000),
     },
-    "halving": {
-        "linear, linf": (200, None, None, None),
-        "linear, l2": (5000, None, None, None),
-        "linear, box": (None, None, None, None),
-        "quadratic, box": (None, None, None, None),
-        "hills, box": (1000, None),
-    },
     "mixture": {
         "linear, linf": (200, None, None, None),
         "linear, l2": (100, 5000, None, None),

@@ -17,9 +17,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from advsearch.explanations.importance import find_importance
 from advsearch.explanations.observations import Factor, Mask, Numbers, Observations
 from advsearch.explanations.rules import CountedRule, find_rules
+from advsearch.questions.explain.findings import find_importance
 
 FACTORS = (
     Factor("camera.elevation", "degrees"),

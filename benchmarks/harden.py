@@ -19,12 +19,12 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.harden import harden_from_config  # noqa: E402
 from advsearch.cli.progress import watch_progress  # noqa: E402
-from advsearch.config import HardenConfig  # noqa: E402
-from advsearch.report.hardening import HEADS, hardened_rows  # noqa: E402
+from advsearch.questions.harden.answer import HardenResult, Share  # noqa: E402
+from advsearch.questions.harden.carry_out import harden_from_config  # noqa: E402
+from advsearch.questions.harden.settings import HardenConfig  # noqa: E402
+from advsearch.questions.harden.words import HEADS, hardened_rows  # noqa: E402
 from advsearch.runs.directory import CONFIG, is_run  # noqa: E402
-from advsearch.runs.results.harden import HardenResult, Share  # noqa: E402
 from advsearch.settings import parse_assignment  # noqa: E402
 
 SETTINGS: dict[str, object] = {"controls": "texture,pose,light", "epsilon": "texture=0.03", "workers": threads.cores()}

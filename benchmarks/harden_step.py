@@ -18,13 +18,17 @@ threads.configure()
 
 import torch  # noqa: E402
 
-from advsearch.api.harden_scenes import Drawing, SceneWork, splits_of  # noqa: E402
-from advsearch.config import HardenConfig  # noqa: E402
-from advsearch.engine.hardening.lessons import Lesson  # noqa: E402
-from advsearch.engine.hardening.split import TRAINING  # noqa: E402
-from advsearch.engine.hardening.training import Course  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.models.trainable import Trainable, trainable  # noqa: E402
+from advsearch.questions.harden.lessons import Lesson  # noqa: E402
+from advsearch.questions.harden.scenes import (  # noqa: E402
+    TRAINING,
+    Drawing,
+    SceneWork,
+    splits_of,
+)
+from advsearch.questions.harden.settings import HardenConfig  # noqa: E402
+from advsearch.questions.harden.training import Course  # noqa: E402
 
 VIEWS = 4
 RENDERED = ("pose", "light")

@@ -20,18 +20,18 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.api.attack import problem_from_config  # noqa: E402
-from advsearch.api.precision import precision_from_config  # noqa: E402
-from advsearch.config import PrecisionConfig  # noqa: E402
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
-from advsearch.evaluation.precision.gradient import GradientBench, estimated_parts  # noqa: E402
-from advsearch.evaluation.precision.image import (  # noqa: E402
+from advsearch.questions.precision.answer import Recommended  # noqa: E402
+from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
+from advsearch.questions.precision.gradient import GradientBench, estimated_parts  # noqa: E402
+from advsearch.questions.precision.image import (  # noqa: E402
     REFERENCE_SAMPLER,
     PictureBench,
     variants,
 )
-from advsearch.evaluation.precision.points import MeasuredSetting, Sample, point_of  # noqa: E402
-from advsearch.evaluation.precision.rounds import TimeBudget  # noqa: E402
-from advsearch.runs.results.precision import Recommended  # noqa: E402
+from advsearch.questions.precision.points import MeasuredSetting, Sample, point_of  # noqa: E402
+from advsearch.questions.precision.rounds import TimeBudget  # noqa: E402
+from advsearch.questions.precision.settings import PrecisionConfig  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"

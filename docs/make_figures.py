@@ -27,17 +27,17 @@ from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
 from advsearch.questions.compare.answer import CompareResult
+from advsearch.questions.explain.answer import ExplainResult
+from advsearch.questions.harden.answer import HardenResult
+from advsearch.questions.recipe.description import recipe_names as recipe_names
+from advsearch.questions.region.answer import RegionResult
+from advsearch.questions.replay.answer import ReplayResult
+from advsearch.questions.stability.answer import CaseRow
 from advsearch.questions.test.answer import SuiteResult
-from advsearch.recipes.description import recipe_names as recipe_names
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
-from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.results.gap import CurveResult, GapResult
-from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.matrix import MatrixResult
-from advsearch.runs.results.region import RegionResult
-from advsearch.runs.results.replay import ReplayResult
-from advsearch.runs.results.stability import CaseRow
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import Setting, settings
@@ -176,7 +176,7 @@ def environments(record: Record) -> str:
     """The bundled environments and the half that each belongs to."""
     from advsearch.bundled.environments import ENVIRONMENTS
 
-    half = {"train": "training", "heldout": "held out"}
+    half = {"train": "training", "heldout": "held out", "street": "a street, in neither"}
     return table(["environment", "half"], [[f"`{one.name}`", half[one.split]] for one in ENVIRONMENTS.values()])
 
 

@@ -7,11 +7,16 @@ files that differ and exits 3.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+
+import numpy as np
+
+from advsearch.scene.assets import Mesh
 
 from .environments import ENVIRONMENTS, EnvironmentFamily
 from .files import exr, ply, png
@@ -31,12 +36,25 @@ def object_files(family: ObjectFamily) -> dict[str, bytes]:
         "source": asset.source,
         "triangles": len(asset.mesh.faces),
     }
+    if asset.metres is not None:
+        facts["metres"] = asset.metres
+    if asset.finishes:
+        facts["finishes"] = {name: asdict(one) for name, one in asset.finishes.items()}
+        facts["faces"] = _runs(asset.mesh)
     folder = f"objects/{family.name}"
     return {
         f"{folder}/mesh.ply": ply(asset.mesh),
         f"{folder}/base_color.png": png(asset.base_color),
         f"{folder}/object.json": (json.dumps(facts, indent=1) + "\n").encode(),
     }
+
+
+def _runs(mesh: Mesh) -> list[tuple[str, int]]:
+    """Return the materials of a mesh's faces, one after the other: the name and how many faces have it in a row."""
+    names = np.empty(len(mesh.faces), dtype=object)
+    for name, faces in mesh.materials.items():
+        names[faces] = name
+    return [(str(name), len(list(run))) for name, run in itertools.groupby(names)]
 
 
 def environment_files(family: EnvironmentFamily) -> dict[str, bytes]:
@@ -50,7 +68,10 @@ def everything() -> Iterator[tuple[str, bytes]]:
         yield from object_files(thing).items()
     for light in ENVIRONMENTS.values():
         yield from environment_files(light).items()
-    facts = {name: {"split": family.split, "source": family.script} for name, family in ENVIRONMENTS.items()}
+    facts = {
+        name: {"split": family.split, "source": family.script} | ({"ground": family.ground} if family.ground else {})
+        for name, family in ENVIRONMENTS.items()
+    }
     yield "environments/environments.json", (json.dumps({"schema": 1, "environments": facts}, indent=1) + "\n").encode()
 
 

@@ -1,5 +1,7 @@
 """Draws docs/images/objects.png and docs/images/environments.png: all objects and environments, to be looked at.
 
+Those of the street are drawn by docs/make_street_image.py.
+
 Run as ``python -m advsearch.bundled.contact_sheet [--out docs/images] [--size 256] [--spp 64]``. It needs
 `mitsuba-oidn` and takes some minutes.
 """
@@ -18,7 +20,7 @@ from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import mesh_part
 
 from .environments import ENVIRONMENTS
-from .objects import OBJECTS
+from .objects import HOUSEHOLD, OBJECTS
 
 Floats = npt.NDArray[np.float32]
 VARIANTS = 3
@@ -108,12 +110,12 @@ def objects(size: int, spp: int, names: list[str]) -> Floats:
 
 
 def environments(size: int, spp: int) -> Floats:
-    """For every environment its map and the mug under it, two in a row."""
+    """For every environment that goes with household objects its map and the mug under it, two in a row."""
     from PIL import Image
 
     mug = OBJECTS["mug"].generate(None)
     cells = []
-    for family in ENVIRONMENTS.values():
+    for family in (one for one in ENVIRONMENTS.values() if one.ground is None):
         light = family.make()
         chart = linear_to_srgb(light.radiance)
         wide = Image.fromarray((chart * 255 + 0.5).astype(np.uint8)).resize((2 * size, size), Image.Resampling.BICUBIC)
@@ -127,7 +129,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     parser.add_argument("--size", type=int, default=256, help="pixels across one picture")
     parser.add_argument("--spp", type=int, default=64, help="samples per pixel")
-    parser.add_argument("--only", nargs="*", default=list(OBJECTS), help="names of objects")
+    parser.add_argument("--only", nargs="*", default=list(HOUSEHOLD), help="names of objects")
     parser.add_argument("--no-environments", action="store_true")
     parser.add_argument("--no-objects", action="store_true")
     args = parser.parse_args()

@@ -9,12 +9,12 @@ import numpy as np
 import OpenEXR
 
 from advsearch.config import AttackConfig
+from advsearch.questions.region.answer import RegionResult
 from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.matrix import MatrixResult
-from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 

@@ -75,21 +75,14 @@ RULES = {
         {"scene", "bundled", "controls", "models", "tasks", "attacks", "cluster", "runs", "report", "viewer", "config"}
         | {"settings"}
     ),
-    "evaluation": Rule(
-        {"scene", "bundled", "controls", "models", "tasks", "attacks", "cluster", "engine", "runs", "report"}
-    ),
     "runs": Rule(
         {"config", "settings"}, {"numpy", "pydantic", "typing_extensions", "imageio", "OpenEXR", "PIL", "pyarrow"}
     ),
-    "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
+    "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib", "pydantic"}, HEAVY),
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
-    "explanations": Rule({"attacks", "recipes", "config", "settings"}, {"numpy", "scipy"}, HEAVY),
-    "recipes": Rule({"attacks", "runs", "report", "config", "settings"}, {"matplotlib", "pydantic"}, HEAVY),
+    "explanations": Rule({"attacks", "runs", "report"}, {"numpy", "scipy"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
-    "questions": Rule(
-        {"api", "attacks", "config", "engine", "explanations", "recipes", "report", "runs", "settings", "viewer"},
-        {"numpy", "pydantic", "torch", "typing_extensions"},
-    ),
+    "questions": Rule(None, None, frozenset(RENDERER)),
     "testing": Rule({"questions", "engine", "config"}, set()),
     "api": Rule(None),
     "cli": Rule(None),
@@ -179,6 +172,55 @@ def _room_allowed(own: str, other: str, rule: Rule) -> bool:
 
 def test_rooms_import_only_what_they_may() -> None:
     assert sorted(broken_rules()) == []
+
+
+LIGHT = {"settings", "answer", "words", "page", "command"}
+"""What a room has for those who only read or show an answer."""
+
+
+def questions() -> Iterator[tuple[str, str, Path, list[str]]]:
+    """Every module of a question: the question, the rest of its name, its file, and what of ours it imports."""
+    for module, path in python_files():
+        parts = module.split(".")
+        if parts[1:2] == ["questions"] and len(parts) > 3:
+            yield parts[2], ".".join(parts[3:]), path, [one for one in imports(module, path) if one.startswith("advs")]
+
+
+def test_a_question_knows_another_only_by_what_carries_it_out_and_its_answer() -> None:
+    broken = [
+        f"{path.relative_to(ROOT)} imports {name}: take what several questions need out of the room"
+        for question, _, path, names in questions()
+        for name in names
+        if name.startswith("advsearch.questions.")
+        and not name.startswith((f"advsearch.questions.{question}.", f"advsearch.questions.{question}:"))
+        and name != f"advsearch.questions.{question}"
+        and name.split(".")[3:4] not in (["carry_out"], ["answer"])
+    ]
+    assert broken == []
+
+
+def test_nothing_below_the_questions_imports_one_of_them() -> None:
+    above = {"questions", "cli", "testing", ""}
+    broken = [
+        f"{path.relative_to(ROOT)} imports {name}: find it by `advsearch.rooms`"
+        for module, path in python_files()
+        if room(module) not in above
+        for name in imports(module, path)
+        if name.startswith("advsearch.questions.")
+    ]
+    assert broken == []
+
+
+def test_an_answer_is_read_and_shown_without_what_renders() -> None:
+    heavy = ("advsearch.engine", "advsearch.scene", "advsearch.api", "advsearch.models", "advsearch.tasks")
+    broken = [
+        f"{path.relative_to(ROOT)} imports {name}"
+        for question, module, path, names in questions()
+        if module in LIGHT - {"command"} and question not in ("test", "compare")
+        for name in names
+        if name.startswith(heavy) or name.endswith(".carry_out")
+    ]
+    assert broken == []
 
 
 @pytest.mark.parametrize(
@@ -439,4 +481,4 @@ def test_no_file_names_a_path_of_the_machine_it_was_written_on() -> None:
 
 
 def test_the_repository_stays_small() -> None:
-    assert sum(path.stat().st_size for path in repository_files()) < 25e6
+    assert sum(path.stat().st_size for path in repository_files()) < 27e6

@@ -31,31 +31,23 @@ from advsearch.attacks.objectives import check_objective
 from advsearch.cli.export import WRITERS
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
-from advsearch.config import (
-    CONFIGS,
-    WAYS,
-    AttackConfig,
-    ExplainConfig,
-    HardenConfig,
-    RecipeConfig,
-    RenderConfig,
-    ReplayConfig,
-    SceneConfig,
-    StabilityConfig,
-    SweepConfig,
-)
-from advsearch.config.hardening import ALL
+from advsearch.config import CONFIGS, AttackConfig, RenderConfig, SceneConfig, SweepConfig
 from advsearch.engine import run_settings
 from advsearch.engine.loading import as_controls
 from advsearch.engine.sweeps.axes import read_axes
-from advsearch.evaluation.stability.suite import chosen
 from advsearch.files import MESHES
 from advsearch.questions.compare.settings import CompareConfig
+from advsearch.questions.explain.settings import ExplainConfig
+from advsearch.questions.harden.settings import ALL, HardenConfig
+from advsearch.questions.recipe.description import read_recipe
+from advsearch.questions.recipe.description import recipe_names as recipes
+from advsearch.questions.recipe.parts import planned
+from advsearch.questions.recipe.settings import RecipeConfig
+from advsearch.questions.replay.settings import WAYS, ReplayConfig
+from advsearch.questions.stability.settings import StabilityConfig
+from advsearch.questions.stability.suite import chosen
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.questions.test.suite import read_suite
-from advsearch.recipes.description import read_recipe
-from advsearch.recipes.description import recipe_names as recipes
-from advsearch.recipes.parts import planned
 from advsearch.runs import export
 from advsearch.scene import environments, library
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node

@@ -13,15 +13,19 @@ import torch
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.api import carry_out as answered
-from advsearch.api.plan import plan_from_config
 from advsearch.api.sweep import sweep_from_config
-from advsearch.attacks import Evaluation, Query, make_policy, region
+from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.attacks.sample_count import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
-from advsearch.cli.plan import answer as plan_text
-from advsearch.config import AttackConfig, PlanConfig, PrecisionConfig, RegionConfig, SweepConfig
+from advsearch.cli.output import shown_text as plan_text
+from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.sweeps.worst import OneModel
+from advsearch.questions.plan.carry_out import plan_from_config
+from advsearch.questions.plan.settings import PlanConfig
+from advsearch.questions.precision.settings import PrecisionConfig
+from advsearch.questions.region import growing as region
+from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config
 

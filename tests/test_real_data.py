@@ -189,6 +189,6 @@ def test_a_real_detector_gives_another_name_where_the_object_is(real_data: Path,
 def test_a_real_object_is_fooled_and_verified(case: str, real_data: Path, tmp_path: Path) -> None:
     summary = attack(real_data, tmp_path / case, case)
     assert summary["ending"] == "found"
-    assert summary["clean"]["correct"] and summary["clean"]["control"]["correct"] >= 19
-    assert summary["verified"]["trials"] == 20 and summary["verified"]["successes"] >= 19
+    assert summary["clean"]["correct"] and summary["clean"]["control"]["rate"] >= 0.95
+    assert summary["verified"]["trials"] in (14, 23) and summary["verified"]["rate"] >= 0.95
     assert summary["verified"]["successes"] > summary["baseline"]["verified"]["successes"]

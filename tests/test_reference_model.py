@@ -11,9 +11,9 @@ import reference_training as training
 import torch
 from torch import Tensor
 
-from advsearch.engine.hardening.augmentation import Augmentation
 from advsearch.errors import InputError
 from advsearch.models import reference
+from advsearch.questions.harden.steps import Augmentation
 
 
 def images(count: int = 2, height: int = 8, width: int = 8, seed: int = 0) -> Tensor:

@@ -21,20 +21,22 @@ from types import ModuleType
 
 import reference_scenes
 
-from advsearch.api import region as mapping
-from advsearch.attacks import POLICIES, clopper_pearson, planned_renders, region, sample_count, smallest, verification
+from advsearch.attacks import POLICIES, clopper_pearson, planned_renders, sample_count, smallest, verification
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS
-from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig, RegionConfig
+from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.controls import CONTROLS, texture
 from advsearch.engine import stages
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
+from advsearch.questions.region import carry_out as mapping
+from advsearch.questions.region import growing as region
+from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs import directory, export, store
 from advsearch.runs.results import KEPT
 from advsearch.runs.results.base import Result
@@ -218,18 +220,24 @@ def made() -> Iterator[str]:
         yield "README.md: run python docs/make_images.py RUN"
 
 
+def _looks() -> tuple[int, int, int]:
+    """Trials that all have to succeed, and what is needed of how many else."""
+    first, last = verification.TRIAL_LOOKS
+    return WORST_CASE.needed(first), WORST_CASE.needed(last), last
+
+
 MADE_BY_HAND = [
     ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
     ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
     ("design.md", f"at {', '.join(map(str, sample_count.LADDER[:-1]))} and {sample_count.LADDER[-1]} samples a pixel"),
-    ("design.md", f"is at most {sample_count.DRIFT} of the margin itself"),
-    ("design.md", f"**Trials**: {TRIALS} renders (`--trials`; {TRIALS_OVER} with `--over`)"),
+    ("design.md", "Looks are after {}, {} and {} renders".format(*sample_count.looks_of(verification.TRIAL_LOOKS[0]))),
+    ("design.md", f"{TRIALS_OVER} with `--over`, {TRIALS} with `--smallest`"),
     ("design.md", f"must reach {verification.PASS_PERCENT_OVER} % of the trials in which the clean scene is right"),
-    ("design.md", f"rounded up: {WORST_CASE.needed(20)} of 20"),
-    ("design.md", f"20 of 20 means a true rate of at least {100 * clopper_pearson(20, 20)[0]:.0f} %"),
+    ("design.md", "rounded up: {0} of {0}, or {1} of {2}".format(*_looks())),
+    ("design.md", f"14 of 14 means a true rate of at least {100 * clopper_pearson(14, 14)[0]:.0f} %"),
     ("design.md", f"at most {mitsuba_scene.MAX_DEPTH} segments"),
     ("questions.md", {8: "Eight renders of the best configurations"}[planned_renders(0)]),
-    ("questions.md", f"**Verified** by {TRIALS} fresh renders"),
+    ("questions.md", f"**Verified** by {verification.TRIAL_LOOKS[0]} fresh renders"),
     ("questions.md", f"until they are within {100 * (smallest.RATIO - 1):.0f} % of each other"),
     ("questions.md", {12: "or twelve searches are done"}[smallest.ROUNDS]),
     (

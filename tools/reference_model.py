@@ -156,9 +156,9 @@ def default_views(spp: int = 64) -> dict[str, float]:
     import torch
     from reference_scenes import SIZE
 
+    from advsearch.bundled.objects import HOUSEHOLD
     from advsearch.controls import Space
     from advsearch.models import reference
-    from advsearch.scene import library
     from advsearch.scene.description import describe
     from advsearch.scene.formation import ImageFormation
     from advsearch.scene.mitsuba_backend.scene import MitsubaScene
@@ -166,7 +166,7 @@ def default_views(spp: int = 64) -> dict[str, float]:
 
     model = reference.load()
     found = {}
-    for name in library.list_objects():
+    for name in sorted(HOUSEHOLD):
         description = describe(name)
         formation = ImageFormation(resolution=SIZE, gain=description.gain)
         renderer = Renderer(MitsubaScene(description, SIZE), Space(()), formation)

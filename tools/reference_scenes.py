@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from advsearch.bundled.objects import OBJECTS
+from advsearch.bundled.objects import HOUSEHOLD
 from advsearch.controls import Space
-from advsearch.engine.hardening.variation import varied
+from advsearch.questions.harden.scenes import varied
 from advsearch.scene import library
 from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription
@@ -26,7 +26,7 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import resolve
 
-CLASSES = tuple(sorted(OBJECTS))
+CLASSES = tuple(sorted(HOUSEHOLD))
 """Object names in the order of the class indices."""
 SPLITS = {"train": 0, "validation": 1, "heldout": 2}
 """Which seeds a split draws its instances from; validation shares the training environments."""
@@ -63,7 +63,7 @@ def picture(split: str, index: int, seed: int = 0) -> Picture:
 
 def random_scene(name: str, environments: str, rng: np.random.Generator) -> SceneDescription:
     """Draw a scene with an object of a class, lit by an environment of one half of the library."""
-    asset = _recoloured(OBJECTS[name].generate(rng), rng)
+    asset = _recoloured(HOUSEHOLD[name].generate(rng), rng)
     names = library.list_environments(environments)
     environment = varied(library.load_environment(names[int(rng.integers(len(names)))]), rng)
     ground = rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.08, 3)

@@ -16,10 +16,10 @@ from reference_calibration import Images, as_floats
 from safetensors import torch as safetensors
 from torch import Tensor, nn
 
-from advsearch.engine.hardening.augmentation import Augmentation
 from advsearch.errors import InputError, ModelError
 from advsearch.files import JsonValue
 from advsearch.models.reference import INPUT_SIZE, RECORD, WEIGHTS, ReferenceNet, build
+from advsearch.questions.harden.steps import Augmentation
 
 WARM_UP = 0.05
 WEIGHT_DECAY = 0.05

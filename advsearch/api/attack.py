@@ -18,7 +18,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_object
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
-from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig, SweepConfig
+from advsearch.config import AttackConfig, SceneConfig
 from advsearch.config.attack import OVER_NUMBERS, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
@@ -390,7 +390,7 @@ def _job(config: AttackConfig) -> _Job:
         raise one_only("object", config.objects)
     searched, drawn = _controls(config, config.controls, config.over)
     task, objective = _asked(config, config.task, config.objective)
-    policy = make_policy(config.policy_name, **_policy_options(config))
+    policy = make_policy(config.policy_name, **config.policy_options)
     scene = lent(SCENE, config.object) or scene_of(config)
     model = _model(config.model, config, task)
     metrics = load_metrics(config.metrics)
@@ -401,7 +401,7 @@ def _given(config: AttackConfig, scene: Scene, model: Model) -> _Job:
     """Find what a configuration names besides its scene and its model."""
     searched, drawn = _controls(config, config.controls, config.over)
     task, objective = _asked(config, config.task, config.objective)
-    policy = make_policy(config.policy_name, **_policy_options(config))
+    policy = make_policy(config.policy_name, **config.policy_options)
     return _Job(config, scene, (model, []), task, searched, drawn, objective, policy, False)
 
 
@@ -427,10 +427,6 @@ def _model(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Tas
     """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
     models, warnings = load_models(several(model), task, config)
     return models[0] if len(models) == 1 else together(models, config.resolution), warnings
-
-
-def _policy_options(config: AttackConfig) -> JsonObject:
-    return config.policy_options | ({} if config.step_size is None else {"step_size": config.step_size})
 
 
 def check_from_config(config: AttackConfig) -> None:
@@ -564,7 +560,7 @@ def attack_answers(settings: JsonObject) -> Call:
 
 
 def executor_for(
-    config: AttackConfig | PrecisionConfig | SweepConfig, function: str, progress: Progress, *, ahead: bool = True
+    config: SceneConfig, function: str, progress: Progress, *, ahead: bool = True
 ) -> AbstractContextManager[Executor | None]:
     """Return what carries out a function of a configuration, as its workers and cluster say; None for this process.
 
@@ -576,7 +572,8 @@ def executor_for(
     """
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     work = Work(function, settings, FILES, config.used_threads or 1, ahead=ahead)
-    return executor_of(work, workers=config.workers, cluster=config.cluster, tell=progress.message)
+    workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))
+    return executor_of(work, workers=workers, cluster=cluster, tell=progress.message)
 
 
 def _policy(job: _Job, problem: Problem) -> Policy[Any]:
@@ -587,7 +584,7 @@ def _policy(job: _Job, problem: Problem) -> Policy[Any]:
         return make_policy("nes")
     if not isinstance(job.policy, str):
         return with_derivatives(job.policy, job.config)
-    return with_derivatives(make_policy(job.policy, **_policy_options(job.config)), job.config)
+    return with_derivatives(make_policy(job.policy, **job.config.policy_options), job.config)
 
 
 def with_derivatives(policy: Policy[Any], config: AttackConfig) -> Policy[Any]:

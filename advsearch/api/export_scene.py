@@ -13,9 +13,9 @@ from torch import Tensor
 import advsearch
 from advsearch import seeds
 from advsearch.api.attack import judged_alone, problem_from_config
-from advsearch.api.replay import kept_answer
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
+from advsearch.engine.retrial import kept_answer
 from advsearch.errors import InputError
 from advsearch.runs.directory import CONFIG, find_run
 from advsearch.runs.files import placed_by, storage_errors, write_bytes, write_text

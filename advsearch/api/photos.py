@@ -15,7 +15,6 @@ import torch
 
 from advsearch import seeds
 from advsearch.api.attack import judged_alone, problem_from_config
-from advsearch.api.replay import kept_answer
 from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
 from advsearch.config import AttackConfig, SweepConfig
@@ -23,6 +22,7 @@ from advsearch.described import Value
 from advsearch.engine.answers import facts_of
 from advsearch.engine.metrics import judgements
 from advsearch.engine.naming import load_models, scene_of
+from advsearch.engine.retrial import kept_answer
 from advsearch.engine.rows import judged
 from advsearch.engine.sweeps.job import check_all
 from advsearch.engine.sweeps.swept_scene import Scenes

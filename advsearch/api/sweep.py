@@ -15,6 +15,7 @@ from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
+from advsearch.controls.camera import CameraControl, measured_in
 from advsearch.engine import run_settings
 from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.attack_result import AttackResult
@@ -50,6 +51,7 @@ from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, fi
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import attack_of
 from advsearch.scene.description import ENVIRONMENT
+from advsearch.scene.parameters import Parameter
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task
@@ -292,6 +294,8 @@ def _job(
         )
     places = _beside_answer(config, places, drawn, axes)
     check_scenes(places, drawn, axes)
+    sized = all(place.scene.description.object.metres is not None for place in places)
+    axes = tuple(replace(one, parameter=_in_units(one, sized)) for one in axes)
     made = make_task(task)
     networks, warnings = _models(models, config, made)
     scenes = [place.scene for place in places]
@@ -314,6 +318,11 @@ def _job(
         aovs=aovs_of(config.aov),
         warnings=tuple(dict.fromkeys(warnings)),
     )
+
+
+def _in_units(axis: Axis, metres: bool) -> Parameter:
+    """The parameter of an axis, as it is around objects that have a size in metres, or have not."""
+    return measured_in(axis.parameter, metres) if axis.control == CameraControl.kind else axis.parameter
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:

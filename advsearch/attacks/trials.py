@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from scipy.special import bdtr, betaincinv, ndtri
 
 from advsearch.errors import InputError
+from advsearch.seeds import stream
 
 CONFIDENCE = 0.95
 """Confidence of every interval that is printed."""
@@ -128,6 +129,11 @@ class Trials:
     def interval(self) -> tuple[float, float]:
         """95 % Clopper-Pearson interval of the rate."""
         return clopper_pearson(self.successes, self.trials)
+
+
+def trial_seed(seed: int, number: int) -> int:
+    """Return the seed of a trial, by its number: the same for all groups with that root."""
+    return stream(seed, "verification", number)
 
 
 def edge_of(beyond: Callable[[float], bool]) -> float:

@@ -16,16 +16,21 @@ from torch import Tensor
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.ending import Ending
 from advsearch.attacks.evaluation import Evaluate, Query
-from advsearch.attacks.trials import Trials, clopper_pearson
+from advsearch.attacks.trials import Trials, clopper_pearson, trial_seed
 from advsearch.errors import InputError
-from advsearch.seeds import stream
 from advsearch.tasks import Judgement
 
 PASS_PERCENT = 95
-"""What a claim must hold in, in per cent of the trials, and what the clean control must pass: 19 of 20."""
+"""What a claim must hold in, in per cent of the trials, and what the clean control must pass: 14 of 14, 19 of 20."""
 
 PASS_PERCENT_OVER = 90
 """What a claim over many conditions must hold in, in per cent of those in which the clean configuration is right."""
+
+TRIAL_LOOKS = 14, 23
+"""Trials after which a verdict may stand, where nobody asked for a number: `found` takes 14 of 14, or 22 of 23.
+
+What holds in 75 % or less is found in 2.4 % of all cases at most, as by 19 of 20, and the interval of what is found
+begins at 77 %, by 19 of 20 at 75 %. `benchmarks/verdicts.py` has both exactly."""
 
 LEAST_RATE = 0.5
 """Where the 95 % interval of a claim's rate may begin: what is called found holds more often than not. So 6 trials are
@@ -128,6 +133,8 @@ class Verification:
         clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
             group is the shorter.
         renders: renders spent here.
+        stopped: why there are no more trials: "asked for" (as many as were), "decided" (the verdict is certain, or
+            stands).
         outcomes: of each trial of the second group, whether it is a success; None where it does not count, as under
             its conditions the clean configuration is wrong.
     """
@@ -140,6 +147,7 @@ class Verification:
     clean_trials: tuple[Judgement, ...]
     adversarial_trials: tuple[Judgement, ...]
     renders: int
+    stopped: str
     outcomes: tuple[bool | None, ...]
 
     @property
@@ -161,6 +169,7 @@ def run_trials(
     spp: int,
     seed: int,
     trials: int = 20,
+    first: int = 0,
     kind: str = "verification",
     keep: int = 0,
     until: Callable[[Sequence[Judgement]], bool] | None = None,
@@ -175,9 +184,10 @@ def run_trials(
         u: (d,) the configuration.
         spp: samples a pixel.
         seed: root of the seeds.
-        trials: how many.
+        trials: how many there are then.
+        first: how many of them there are already, which are left out.
         kind: of their rows.
-        keep: the pictures of so many are wanted.
+        keep: the pictures of the first so many are wanted.
         until: see above.
 
     Raises:
@@ -187,15 +197,16 @@ def run_trials(
         raise InputError(f"trials: expected at least 1, got {trials}")
     if spp < 1:
         raise InputError(f"verify_spp: expected at least 1, got {spp}")
-    seeds = [stream(seed, "verification", number) for number in range(trials)]
     done: list[Judgement] = []
-    queries = [Query(u, one, kind, number, spp=spp, keep=number < keep) for number, one in enumerate(seeds)]
+    queries = [
+        Query(u, trial_seed(seed, number), kind, number, spp=spp, keep=number < keep) for number in range(first, trials)
+    ]
     for answer in evaluate(queries):
         done.append(answer.said)
         if until is not None and until(done):
             return tuple(done)
-    if len(done) != trials:
-        raise RuntimeError(f"evaluate answered {len(done)} of {trials} queries")
+    if len(done) != len(queries):
+        raise RuntimeError(f"evaluate answered {len(done)} of {len(queries)} queries")
     return tuple(done)
 
 
@@ -212,22 +223,27 @@ def verify(
     claim: Ending,
     spp: int,
     seed: int,
-    trials: int = 20,
-    clean: Sequence[Judgement] | None = None,
+    trials: int | Sequence[int] = 20,
+    clean: Sequence[Judgement] = (),
     rule: Rule = WORST_CASE,
     kind: str = "verification",
+    control: str = "control",
     keep: int = 0,
     curtailed: bool = False,
 ) -> Verification:
     """Check a search's answer in fresh trials against the clean configuration as control group.
 
-    See `Rule` for what counts as a success, and for the ending. KeyboardInterrupt passes
-    through.
+    See `Rule` for what counts as a success, and for the ending. KeyboardInterrupt passes through.
+
+    Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the first at which the answer is
+    found.
 
     Curtailed trials end with the first failure that is one more than the rule allows of all of them. The verdict is
     that of all trials, whatever the rest would have said, and the Clopper-Pearson interval of those that were made
     still covers the rate as often as it says: it contains the exact interval of that stopping rule, under which an
-    outcome is the better the later it stops (Jennison and Turnbull 1983).
+    outcome is the better the later it stops (Jennison and Turnbull 1983). Trials with several looks are always
+    curtailed, but have at least `Rule.fewest`, so that they say something of the rate; that their intervals cover it
+    is shown by the probability of every outcome (`benchmarks/verdicts.py`).
 
     Args:
         evaluate: answers the queries; see `Query`.
@@ -236,44 +252,54 @@ def verify(
         claim: the search's ending.
         spp: samples per pixel, from `choose_spp`.
         seed: root seed. Must not be one that the search rendered with through the same stream.
-        trials: per group.
-        clean: trials of the clean configuration, where `run_trials` has run them with the same spp, seed and count
-            (one control group serves the attack and its baseline).
+        trials: per group; or rising numbers, see above.
+        clean: the first trials of the clean configuration, where `run_trials` has run them with the same spp and seed
+            (one control group serves the attack and its baseline); what is missing is run here.
         rule: when the claim counts.
         kind: of the rows of the answer's trials.
+        control: of the rows of those of the clean configuration.
         keep: the pictures of so many of them are wanted.
         curtailed: see above; for an answer of which only the verdict matters.
 
     Raises:
-        InputError: trials or spp under 1, or `clean` has another length.
+        InputError: trials or spp under 1.
     """
-    own = clean is None
-    if clean is None:
-        clean = run_trials(evaluate, domain.start, spp=spp, seed=seed, trials=trials, kind="control")
-    if len(clean) != trials:
-        raise InputError(f"clean trials: expected {trials}, as many as `trials`, got {len(clean)}")
-    u = domain.project(u)
-    control = count_right(clean, spp)
-    allowed = rule.allowed(rule.counted(clean))
+    looks = (trials,) if isinstance(trials, int) else tuple(trials)
+    least = 0 if curtailed or len(looks) == 1 else rule.fewest
+    u, beside, done, renders = domain.project(u), list(clean), list[Judgement](), 0
 
-    def lost(done: Sequence[Judgement]) -> bool:
-        beside = clean[: len(done)]
-        return rule.counted(beside) - sum(map(rule.succeeded, done, beside)) > allowed
+    def tried(others: Sequence[Judgement]) -> tuple[bool | None, ...]:
+        """What comes of trials, beside the clean ones."""
+        return tuple(
+            rule.succeeded(trial, clean) if clean.right or not rule.conditional else None
+            for trial, clean in zip(others, beside, strict=False)
+        )
 
-    adversarial = run_trials(
-        evaluate, u, spp=spp, seed=seed, trials=trials, kind=kind, keep=keep, until=lost if curtailed else None
-    )
-    outcomes = tuple(
-        rule.succeeded(trial, beside) if beside.right or not rule.conditional else None
-        for trial, beside in zip(adversarial, clean, strict=False)
-    )
+    def lost(others: Sequence[Judgement]) -> bool:
+        """Whether too many fail for any look."""
+        made = [*done, *others]
+        allowed = rule.allowed(rule.counted(beside) if len(looks) == 1 else looks[-1])
+        return len(made) >= least and tried(made).count(False) > allowed
+
+    for count in looks:
+        missing = run_trials(evaluate, domain.start, spp=spp, seed=seed, trials=count, first=len(beside), kind=control)
+        beside += missing
+        until = lost if curtailed or len(looks) > 1 else None
+        made = run_trials(
+            evaluate, u, spp=spp, seed=seed, trials=count, first=len(done), kind=kind, keep=keep, until=until
+        )
+        done, renders = [*done, *made], renders + len(missing) + len(made)
+        if len(done) < count or lost(()) or tried(done).count(True) >= rule.needed(count):
+            break
+    outcomes = tried(done)
+    right = count_right(beside, spp)
     counted = max(1, len(outcomes) - outcomes.count(None))
     successes = outcomes.count(True)
     verified = Trials(successes, counted, spp)
-    ending = rule.verdict(claim, control, verified)
+    ending = rule.verdict(claim, right, verified)
     reason = (
         f"{ending.explanation} A success in {successes} of {counted} trials, {rule.needed(counted)} are needed; clean "
-        f"right in {control.successes} of {trials}."
+        f"right in {right.successes} of {right.trials}."
     )
-    renders = len(adversarial) + (trials if own else 0)
-    return Verification(ending, reason, u, control, verified, tuple(clean), adversarial, renders, outcomes)
+    stopped = "asked for" if len(looks) == 1 and len(done) == looks[0] else "decided"
+    return Verification(ending, reason, u, right, verified, tuple(beside), tuple(done), renders, stopped, outcomes)

@@ -9,10 +9,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from advsearch.cli import output
+from advsearch.rooms import there
 
 HELP = "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes"
 
-REGISTRIES = {
+_EVERY = {
     "objects": "advsearch.scene.library:list_objects",
     "environments": "advsearch.scene.library:list_environments",
     "controls": "advsearch.controls:CONTROLS",
@@ -20,8 +21,9 @@ REGISTRIES = {
     "tasks": "advsearch.tasks:TASKS",
     "objectives": "advsearch.attacks.objectives:objective_summaries",
     "models": "advsearch.cli.list:MODELS",
-    "recipes": "advsearch.recipes.description:titles",
+    "recipes": "advsearch.questions.recipe.description:titles",
 }
+REGISTRIES = {kind: place for kind, place in _EVERY.items() if there(place)}
 """Where the names of each kind are: a mapping from them, or a function that returns them."""
 
 MODELS = {"reference": "the bundled classifier of household objects; models of your own are given as files"}

@@ -24,34 +24,35 @@ from advsearch import __version__
 from advsearch.cli.screen import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS
+from advsearch.rooms import there
 
 GROUPS = {
     "ask: what does a model get wrong?": {
         "attack": "advsearch.cli.attack",
         "sweep": "advsearch.cli.sweep",
         "gap": "advsearch.cli.gap",
-        "region": "advsearch.cli.region",
-        "explain": "advsearch.cli.explain",
+        "region": "advsearch.questions.region.command",
+        "explain": "advsearch.questions.explain.command",
         "compare": "advsearch.questions.compare.command",
-        "recipe": "advsearch.cli.recipe",
-        "harden": "advsearch.cli.harden",
+        "recipe": "advsearch.questions.recipe.command",
+        "harden": "advsearch.questions.harden.command",
     },
     "look: at scenes, names and answers": {
         "render": "advsearch.cli.render",
         "show": "advsearch.cli.show",
         "view": "advsearch.cli.view",
         "dashboard": "advsearch.cli.dashboard",
-        "report": "advsearch.cli.report",
+        "report": "advsearch.questions.report.command",
         "list": "advsearch.cli.list",
         "labels": "advsearch.cli.labels",
     },
     "trust: does an answer hold, and is the tool right?": {
         "test": "advsearch.questions.test.command",
-        "replay": "advsearch.cli.replay",
-        "check": "advsearch.cli.check",
-        "plan": "advsearch.cli.plan",
-        "precision": "advsearch.cli.precision",
-        "stability": "advsearch.cli.stability",
+        "replay": "advsearch.questions.replay.command",
+        "check": "advsearch.questions.check.command",
+        "plan": "advsearch.questions.plan.command",
+        "precision": "advsearch.questions.precision.command",
+        "stability": "advsearch.questions.stability.command",
         "doctor": "advsearch.cli.doctor_command",
     },
     "files and runs: repeat, continue, bring in, take out": {
@@ -65,7 +66,7 @@ GROUPS = {
 }
 """Each command and its module, in the groups and the order in which the help shows them."""
 
-COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
+COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items() if there(module)}
 
 OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
@@ -140,7 +141,9 @@ def _run_and_tell(given: list[str]) -> int:
     except AdvsearchError as error:
         from advsearch.cli.flags import with_flags
 
-        print(f"advsearch: error: {shortened(with_flags(str(error)))}", file=sys.stderr)
+        in_a_file = given[0] in ("run", "resume") and not isinstance(error, UnknownNameError)
+        text = str(error) if in_a_file else with_flags(str(error))
+        print(f"advsearch: error: {shortened(text)}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
         return OK
@@ -197,9 +200,9 @@ def _listing() -> str:
     lines = []
     for title, commands in GROUPS.items():
         lines.append(title)
-        for name, path in commands.items():
+        for name in (one for one in commands if one in COMMANDS):
             begin = f"  {name}".ljust(column)
-            lines.append(textwrap.fill(begin + _module(path).HELP, width, subsequent_indent=" " * column))
+            lines.append(textwrap.fill(begin + _module(COMMANDS[name]).HELP, width, subsequent_indent=" " * column))
         lines.append("")
     return "\n".join(lines)
 

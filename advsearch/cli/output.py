@@ -116,6 +116,25 @@ def output_kept_clean() -> Iterator[None]:
         yield
 
 
+def shown_text(result: Result) -> str:
+    """Return what is shown of an answer as text: what it says, its parts, by what it came about, and notes."""
+    from advsearch.report.shown import facts_of, remarks_of, shown
+    from advsearch.runs.directory import REPORT
+
+    given, run = shown(result), getattr(result, "run", None)
+    parts = [given.said]
+    for one in given.sections:
+        if one.only == "page" or one.empty:
+            continue
+        table = aligned([one.heads, *one.rows] if one.heads else one.rows)
+        pictures = [[picture.file, picture.caption] for group in one.pictures for picture in group]
+        inside = [*one.text, "\n".join(filter(None, [table, aligned(pictures)]))]
+        parts.append("\n".join(filter(None, [one.title, "\n\n".join(filter(None, inside))])))
+    facts = [[name.lower(), text] for name, text in facts_of(result, given).items()]
+    parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))
+    return "\n\n".join(filter(None, parts)) + as_notes(remarks_of(result, given))
+
+
 def aligned(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:
     """Return lines with the cells of `rows` in aligned columns."""
     wide = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows), default=0))]

@@ -43,7 +43,7 @@ class QuestionCommand:
 
     Attributes:
         name: of the command; `advsearch.config.CONFIGS` has its settings, and `advsearch.api.carry_out` answers them.
-        answer: makes a text for a person of its result.
+        answer: makes a text for a person of its result; what is shown of it where it has no other.
         short: whether a result falls short of what was checked.
         about: the setting that names runs, or a file, which the question is about; Python code that the first of them
             names is imported only if `--code` or `--model` names it too.
@@ -51,7 +51,7 @@ class QuestionCommand:
     """
 
     name: str
-    answer: Callable[[Any], str]
+    answer: Callable[[Any], str] = output.shown_text
     short: Callable[[Any], bool] = lambda result: False
     about: str = ""
     place: Positional | None = None

@@ -63,7 +63,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     if not (path / NAME).is_file():
         return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
-    answer = importlib.import_module(COMMANDS[result.command]).answer
+    answer = importlib.import_module(COMMANDS[result.command]).COMMAND.answer
     photos = photos_of(path)
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
@@ -179,7 +179,7 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
 
 
 def _show_recipe(name: str, as_json: bool) -> int:
-    from advsearch.recipes.description import read_recipe, recipe_yaml
+    from advsearch.questions.recipe.description import read_recipe, recipe_yaml
 
     text = recipe_yaml(name)
     if as_json:

@@ -51,8 +51,19 @@ class _Sweep(QuestionCommand):
 
 def answer(summary: SweepSummary) -> str:
     """Return accuracy in total and by axis, the worst configuration and the cost."""
+    from advsearch.report.distance import distance_of, distance_sentence
+
     facts = [[name, text] for name, text in _facts(summary).items() if text]
-    parts = [_verdict(summary), *_drives(summary), *_tables(summary), "\n".join(_surface(summary)), aligned(facts)]
+    far = distance_of(summary)
+    distance = distance_sentence(far) if far else ""
+    parts = [
+        _verdict(summary),
+        distance,
+        *_drives(summary),
+        *_tables(summary),
+        "\n".join(_surface(summary)),
+        aligned(facts),
+    ]
     return "\n\n".join(part for part in parts if part) + as_notes(summary.warnings)
 
 

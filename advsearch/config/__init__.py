@@ -9,15 +9,9 @@ from __future__ import annotations
 
 from advsearch import rooms
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
-from advsearch.config.checking import CheckConfig, PlanConfig, StabilityConfig
 from advsearch.config.derivative import DerivativeConfig
-from advsearch.config.explain import ExplainConfig
-from advsearch.config.hardening import HardenConfig
-from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
-from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
-from advsearch.config.recipe import RecipeConfig
+from advsearch.config.questions import GapConfig
 from advsearch.config.rendering import RenderConfig
-from advsearch.config.replaying import WAYS, ReplayConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
 from advsearch.settings import Config
@@ -31,15 +25,6 @@ _OWN: tuple[type[Config], ...] = (
     RenderConfig,
     SweepConfig,
     GapConfig,
-    RegionConfig,
-    ReplayConfig,
-    PlanConfig,
-    CheckConfig,
-    StabilityConfig,
-    PrecisionConfig,
-    RecipeConfig,
-    ExplainConfig,
-    HardenConfig,
 )
 
 
@@ -56,27 +41,14 @@ __all__ = [
     "AUTO_SHARE",
     "CLOSE_LOOKS",
     "CONFIGS",
-    "FEWEST_SAMPLES",
     "FEWEST_TRIALS",
-    "QUANTITIES",
-    "SAMPLERS",
     "SEARCH_SPP",
     "TRIALS",
     "TRIALS_OVER",
-    "WAYS",
     "AttackConfig",
-    "CheckConfig",
     "DerivativeConfig",
-    "ExplainConfig",
     "GapConfig",
-    "HardenConfig",
-    "PlanConfig",
-    "PrecisionConfig",
-    "RecipeConfig",
-    "RegionConfig",
     "RenderConfig",
-    "ReplayConfig",
     "SceneConfig",
-    "StabilityConfig",
     "SweepConfig",
 ]

@@ -141,14 +141,6 @@ class AttackConfig(DerivativeConfig):
         gt=0.0,
         le=1e9,
     )
-    step_size: float | None = setting(
-        None,
-        "search",
-        "size of the first step, as a share of epsilon",
-        otherwise="the policy's own",
-        gt=0.0,
-        le=2.0,
-    )
     target: str | None = setting(
         None,
         "search",
@@ -231,7 +223,7 @@ class AttackConfig(DerivativeConfig):
         None,
         "verification",
         "samples per pixel of the verification",
-        otherwise="raised until the margin stands still",
+        otherwise="raised until more would leave the margin on its side",
         unit="samples",
         ge=1,
         le=65536,
@@ -241,7 +233,7 @@ class AttackConfig(DerivativeConfig):
         "verification",
         "fresh renders that verify the answer, and as many of the clean scene",
         f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be called found)",
-        otherwise=f"{TRIALS}, or {TRIALS_OVER} with --over",
+        otherwise=f"14, or 23 where one fails; {TRIALS_OVER} with --over, {TRIALS} with --smallest",
         unit="renders",
         ge=FEWEST_TRIALS,
         le=100_000,

@@ -9,6 +9,7 @@ from pydantic import field_validator
 
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, check_once, parse_assignment, setting, setting_as_in
+from advsearch.settings.configuration import Config
 
 LARGEST_EPSILON = 1e6
 """No control has a distance of that size; far above it, its square is none in float32."""
@@ -104,3 +105,17 @@ def _positive(value: Any) -> float:
     if not 1e-30 < number <= LARGEST_EPSILON:  # what is smaller has no square in float32
         raise ValueError("out of range")
     return number
+
+
+class TimedConfig(Config):
+    """A question that may run out of time."""
+
+    seconds: float | None = setting(
+        None,
+        "check",
+        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
+    )

@@ -74,10 +74,11 @@ class SceneConfig(Config):
     camera: str | None = setting(
         None,
         "scene",
-        "which camera of a scene file takes the picture",
-        "a name that advsearch import lists, or orbit",
+        "which camera takes the picture: one of a scene file, or the one around the object with a lens of its own",
+        "a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, Kalibr, ROS "
+        "or COLMAP",
         metavar="NAME",
-        otherwise="orbit, the one around the object that camera.* describes",
+        otherwise="orbit, the pinhole around the object that camera.* describes",
         min_length=1,
     )
     set_: dict[str, float | str | tuple[float, ...]] = setting(

@@ -23,6 +23,7 @@ from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.road import on_its_ground
 from advsearch.scene.settings import CHANNELS
 
 COLOR = "backdrop.color"
@@ -102,7 +103,7 @@ class BackgroundControl(NumberControl):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         scene = dataclasses.replace(scene, backdrop=True)
-        return scene.with_values(ground__size=0.0) if self.chosen["ground"] == "hide" else scene
+        return on_its_ground(scene.with_values(ground__size=0.0)) if self.chosen["ground"] == "hide" else scene
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if WHAT[int(values["what"])] == "environment":

@@ -1,8 +1,9 @@
 """The `camera` control: an orbit around the object, the lens, and the exposure.
 
-The camera looks at the middle of the object in its default pose. While the distance is not searched or set, it follows
-the field of view so that the object keeps its place in the picture (a dolly zoom), down to where the camera would enter
-the sphere around the object: see `advsearch.scene.framing`.
+The camera looks at the middle of the object in its default pose. Its lens bends as a calibrated one does where a
+coefficient is asked for, or a camera file has one: see `advsearch.scene.cameras.model`. While the distance is not
+searched or set, it follows the field of view so that the object keeps its place in the picture (a dolly zoom), down to
+where the camera would enter the sphere around the object: see `advsearch.scene.framing`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
+from advsearch.scene.cameras.model import COEFFICIENTS, NUMBERS, OF_KIND, CameraModel, pinhole
 from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.framing import framing_distance, middle
 from advsearch.scene.geometry import affine, camera_to_world
@@ -31,6 +33,11 @@ SENSOR_WIDTH = 36.0
 
 def _lens(name: str, low: float, high: float, default: float | str, text: str, log: bool = False) -> Parameter:
     return Parameter(name, (), "object sizes", low, high, default, text, log=log, estimators=ORBIT)
+
+
+def _coefficient(name: str) -> Parameter:
+    what = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}[name[0]]
+    return moving(ORBIT, name, "1", -100.0, 100.0, 0.0, f"{what} distortion, as OpenCV has it.")
 
 
 class CameraControl(NumberControl):
@@ -45,6 +52,7 @@ class CameraControl(NumberControl):
         moving(ORBIT, "shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
         _lens("aperture", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
         _lens("focus", 0.01, 1e4, "the object's middle", "Distance in focus.", log=True),
+        *map(_coefficient, COEFFICIENTS),
         CAMERA[-1],
     )
 
@@ -61,11 +69,42 @@ class CameraControl(NumberControl):
             raise InputError(
                 f"`controls` {self.name}: a shifted picture together with an aperture is not supported; leave one out"
             )
-        return replace(scene, thin_lens=True) if wanted else scene
+        bent = [name for name in COEFFICIENTS if name in self.specs]
+        if bent and scene.camera_model is None:
+            scene = replace(scene, camera_model=pinhole(scene.number("camera.fov"), scene.aspect))
+        if scene.camera_model is None:
+            return replace(scene, thin_lens=True) if wanted else scene
+        self._check_model(scene.camera_model, bent)
+        return scene
+
+    def _check_model(self, model: CameraModel, bent: list[str]) -> None:
+        """Refuse what the camera's model has not.
+
+        Raises:
+            InputError: it was asked for.
+        """
+        lacking = [name for name in bent if name not in OF_KIND[model.kind]]
+        if lacking:
+            has = ", ".join(OF_KIND[model.kind]) or "none"
+            raise InputError(
+                f"`controls` {self.name}: a {model.kind} lens has the coefficients {has}, not {lacking[0]}"
+            )
+        own = ("fov", "focal_length") if model.name else ()
+        shift = () if OF_KIND[model.kind] else ("shift_x", "shift_y")
+        for name in (*own, *shift, "aperture", "focus"):
+            if name in self.specs:
+                whose = f"the lens of `camera={model.name}`" if model.name else "a lens with distortion"
+                raise InputError(f"`controls` {self.name}: {name} is not supported with {whose}; leave one of them out")
+
+    def in_scene(self, scene: SceneDescription, parameter: Parameter) -> Parameter:
+        return measured_in(parameter, scene.object.metres is not None)
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
+        model = scene.camera_model
+        if parameter.name in COEFFICIENTS and model is not None:
+            return model.values[parameter.name]
         if parameter.name == "distance" or parameter.name == "focus":
-            return fitted_distance(self._described(scene))
+            return fitted_distance(self._described(scene)) * scene.metres
         if parameter.name == "focal_length":
             return SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
         return super().default(scene, parameter)
@@ -75,7 +114,7 @@ class CameraControl(NumberControl):
 
     def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
         if parameter.name == "distance" and parameter.search is not None:
-            fitted = fitted_distance(self._described(scene))
+            fitted = fitted_distance(self._described(scene)) * scene.metres
             return parameter.search[0] * fitted, parameter.search[1] * fitted
         return parameter.search
 
@@ -84,19 +123,33 @@ class CameraControl(NumberControl):
         if "focal_length" in self.specs:
             fov = _fov_of(values["focal_length"])
         if self._distance_is_free(scene):
-            distance = values["distance"]
+            distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
-        inputs = {"camera.to_world": self._orbit(scene, values, distance), "camera.fov": fov.reshape(1)}
+        inputs = {"camera.to_world": self._orbit(scene, values, distance)}
+        if scene.camera_model is not None:
+            inputs["camera.lens"] = self._numbers(scene.camera_model, scene.aspect, values, fov)
+        else:
+            inputs["camera.fov"] = fov.reshape(1)
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
-            focus = values["focus"] if "focus" in self.specs else distance
+            focus = values["focus"] / scene.metres if "focus" in self.specs else distance
             inputs["camera.focus"] = focus.reshape(1)
-        if "shift_x" in self.specs or "shift_y" in self.specs:
+        if scene.camera_model is None and ("shift_x" in self.specs or "shift_y" in self.specs):
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
             inputs["camera.exposure"] = values["exposure"] - scene.number("camera.exposure")
         return inputs
+
+    def _numbers(self, model: CameraModel, aspect: float, values: Values, fov: Tensor) -> Tensor:
+        """The numbers (17,) of the camera's model."""
+        found = {name: torch.tensor(value) for name, value in model.values.items()}
+        if not model.name:
+            focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
+            found |= {"fx": focal * max(1.0, 1.0 / aspect), "fy": focal * max(1.0, aspect)}
+        found |= {name: values[name] for name in COEFFICIENTS if name in self.specs}
+        found |= {"cx": found["cx"] + values["shift_x"], "cy": found["cy"] + values["shift_y"]}
+        return torch.stack([found[name].to(fov) for name in NUMBERS])
 
     def _distance_is_free(self, scene: SceneDescription) -> bool:
         return "distance" in self.specs or not self.asked or "camera.distance" in scene.given
@@ -119,6 +172,11 @@ class CameraControl(NumberControl):
         left, up = roll.cos() * left + roll.sin() * up, roll.cos() * up - roll.sin() * left
         place = torch.from_numpy(middle(scene)).to(distance) + distance * outwards
         return affine(torch.stack([left, up, -outwards], dim=1), place)
+
+
+def measured_in(parameter: Parameter, metres: bool) -> Parameter:
+    """Return a parameter of the camera as it is around an object that has a size in metres, or has none."""
+    return replace(parameter, unit="metres") if metres and parameter.name in ("distance", "focus") else parameter
 
 
 def fitted_distance(scene: SceneDescription) -> float:

@@ -105,6 +105,10 @@ class NumberControl(Control, ABC):
             InputError: a choice is out of range.
         """
 
+    def in_scene(self, scene: SceneDescription, parameter: Parameter) -> Parameter:
+        """Return a parameter as this scene has it, where its unit depends on that."""
+        return parameter
+
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         """Return a parameter's value in the unchanged scene: the setting of that name, or else its own default."""
         value = scene.values.get(self.setting(parameter))
@@ -164,7 +168,8 @@ class NumberControl(Control, ABC):
         begin = 0
         for parameter in self.own:
             value = self.default(scene, parameter)
-            slot = Slot(parameter, self._spec(scene, parameter, value), self.size(parameter), begin, value)
+            spec, size = self._spec(scene, parameter, value), self.size(parameter)
+            slot = Slot(self.in_scene(scene, parameter), spec, size, begin, value)
             slots.append(slot)
             begin += slot.width
         return BoundNumbers(self, scene, tuple(slots))

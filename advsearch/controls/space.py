@@ -49,7 +49,7 @@ class Space:
     def groups(self) -> tuple[Group, ...]:
         """Every group of coordinates in the order of u, without an estimator yet.
 
-        The material form knows neither a medium nor a backdrop nor a thin lens nor the edges of cut-outs, nor where a
+        The material form knows neither a medium nor a backdrop nor a lens nor the edges of cut-outs, nor where a
         normal of a normal map turns away from the camera, nor meshes that emit light, so that it is not valid beside
         these.
         """
@@ -57,6 +57,7 @@ class Space:
         unknown = scene is not None and (
             scene.backdrop
             or scene.thin_lens
+            or scene.camera_model is not None
             or scene.cut_out
             or scene.normal_mapped
             or scene.emits

@@ -9,7 +9,7 @@ import torch
 from advsearch import seeds
 from advsearch.engine.path_length import SHORTEST, measured_bounces
 from advsearch.engine.problem import Problem
-from advsearch.runs.results.plan import PathLength
+from advsearch.runs.results.derivatives import PathLength
 
 DRAWS = 2
 """Configurations, beside the clean one, that the measurement looks at."""

@@ -41,9 +41,11 @@ def check_failures(verifier: Verifier, found: SearchResult) -> None:
         return
     fewest = rule.fewest
     whole = rule.control and not all(trial.right for trial in findings.clean[:fewest])
-    trials = verifier.count if whole else fewest
+    trials = None if whole else fewest
     tried = known.listed[:TRIED]
-    verifier.begin("checking different failures with fresh renders", len(tried) * trials, at_most=True)
+    verifier.begin(
+        "checking different failures with fresh renders", len(tried) * (trials or verifier.count), at_most=True
+    )
     checked = []
     for number, failure in enumerate(tried):
         claim = replace(found, best_u=failure.u)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.runs.results.check import GradientStatus
+from advsearch.runs.results.derivatives import GradientStatus
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import STEP_RANGE, GradientPlan
 from advsearch.scene.renderer import Renderer
@@ -29,7 +29,7 @@ Loss = Callable[[Tensor], Tensor]
 """From a picture (H, W, 3) sRGB to a number, by differentiable torch operations."""
 
 SMALL = 0.1
-"""See `scale_of`."""
+"""Share of a control's largest derivative that each of its derivatives counts as, at least."""
 COORDINATEWISE = 8
 """Groups of at most this many coordinates are probed one by one."""
 TOLERANCE = 0.05
@@ -177,9 +177,11 @@ def _steep_probe(renderer: Renderer, loss: Loss, u: Tensor, group: Group, seed: 
     return Probe(group, group.name, direction, step)
 
 
-def only(plan: GradientPlan, names: Collection[str], estimator: str) -> GradientPlan:
-    """Return the plan with the groups of these names differentiated by an estimator and the others not at all."""
-    groups = tuple(replace(one, estimator=estimator if one.name in names else "none") for one in plan.groups)
+def only(plan: GradientPlan, names: Collection[str], estimator: str | None = None) -> GradientPlan:
+    """Return the plan with the groups of these names differentiated, by an estimator or as planned, and no others."""
+    groups = tuple(
+        replace(one, estimator=(estimator or one.estimator) if one.name in names else "none") for one in plan.groups
+    )
     return replace(plan, groups=groups)
 
 
@@ -374,27 +376,46 @@ def _difference(renderer: Renderer, loss: Loss, u: Tensor, probe: Probe, step: f
         return (float(loss(renderer(above, seed, spp))) - float(loss(renderer(below, seed, spp)))) / width
 
 
-def scale_of(against: Reference, beside: Sequence[Reference]) -> float:
-    """Return what errors and noise of a derivative are measured by: its own size, or `SMALL` of the control's largest.
+@dataclass(frozen=True)
+class Judgement:
+    """How good an estimate is beside a reference, see `judge`; the numbers are relative to the derivative's size.
 
-    A derivative that happens to be near zero beside the others of its control has no size of its own to speak of.
+    Attributes:
+        status: in a word.
+        error: distance of the estimates' mean from the reference.
+        doubt: how much of it noise explains: `CONFIDENCE` standard errors of both.
+        noise: standard deviation of one estimate.
     """
-    return max(abs(against.value), SMALL * max(abs(one.value) for one in beside))
+
+    status: GradientStatus
+    error: float
+    doubt: float
+    noise: float
+
+    @property
+    def excess(self) -> float:
+        """What of the error noise does not explain."""
+        return max(0.0, self.error - self.doubt)
 
 
-def verdict(estimate: Estimate, against: Reference, size: float) -> tuple[GradientStatus, float]:
-    """Return the status of an estimate, and its error relative to `size` (see `scale_of`).
+def judge(estimate: Estimate, against: Reference, beside: Sequence[Reference] = ()) -> Judgement:
+    """Say how good an estimate is: "reference unusable" where the reference's noise exceeds `LOUD` and doubt covers
+    the error; "biased" where the error exceeds `TOLERANCE` beyond doubt; "noisy" where the noise exceeds `LOUD`;
+    otherwise "ok".
 
-    - "reference unusable": the reference's own noise exceeds a fifth of the size, and covers the difference;
-    - "biased": the means differ by more than `TOLERANCE` of the reference beyond `CONFIDENCE` standard errors;
-    - "noisy": one gradient scatters by more than `LOUD` of the reference;
-    - "ok": none of these.
+    The size that this is relative to is the reference's, or `SMALL` of the largest of those `beside` it, the others of
+    its control: a derivative that happens to be near zero has no size of its own to speak of.
     """
+    size = max([abs(against.value), *(SMALL * abs(one.value) for one in beside)])
     difference = abs(estimate.value - against.value)
-    error = difference / size if size > 0.0 else (0.0 if difference == 0.0 else math.inf)
     doubt = CONFIDENCE * math.hypot(estimate.standard_error, against.noise)
+    status: GradientStatus
     if difference <= doubt and against.noise > LOUD * size:
-        return "reference unusable", error
-    if difference > TOLERANCE * size + doubt:
-        return "biased", error
-    return ("noisy" if estimate.noise > LOUD * size else "ok"), error
+        status = "reference unusable"
+    elif difference > TOLERANCE * size + doubt:
+        status = "biased"
+    else:
+        status = "noisy" if estimate.noise > LOUD * size else "ok"
+    if size == 0.0:
+        return Judgement(status, math.inf if difference else 0.0, 0.0, math.inf)
+    return Judgement(status, difference / size, doubt / size, estimate.noise / size)

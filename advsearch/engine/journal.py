@@ -113,7 +113,7 @@ class Journal:
         if told is None:
             return None
         row, beside = told
-        if beside.u != _digest(query.u) or row.seed != query.seed:
+        if beside.u != digest(query.u) or row.seed != query.seed:
             path, again = ("", "") if self.run is None else (self.run.path, self.run.again)
             raise InputError(
                 f"{path}: cannot go on: evaluation {query.number} of the {query.kind} is another one now than it was, "
@@ -187,7 +187,7 @@ class Journal:
         )
         told = Told(
             number=query.number,
-            u=_digest(query.u),
+            u=digest(query.u),
             non_finite=answer.non_finite,
             cost=answer.cost,
             gradient=None if answer.gradient is None else answer.gradient.detach().numpy(),
@@ -245,5 +245,6 @@ def other_answers(run: RunDirectory | None, values: Mapping[str, tuple[float | N
     )
 
 
-def _digest(u: Tensor) -> bytes:
+def digest(u: Tensor) -> bytes:
+    """Return what tells a configuration from others."""
     return hashlib.blake2b(np.ascontiguousarray(u.detach().numpy()).tobytes(), digest_size=16).digest()

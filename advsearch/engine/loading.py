@@ -20,6 +20,7 @@ from advsearch.models.switches import plainly
 from advsearch.options import told
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
+from advsearch.scene.cameras.model import bundled
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -36,6 +37,7 @@ from advsearch.scene.importing.images import read_picture
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.road import on_its_ground
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 
@@ -107,7 +109,8 @@ class Scene:
         check_ground(own.given_values, name)
         if environment is not None:
             check_one_environment(own.parts, f"`environment={name}`")
-        return Scene(replace(own, environment=environment, environment_spec=name, given=given), self.only_here)
+        lit = replace(own, environment=environment, environment_spec=name, given=given)
+        return Scene(on_its_ground(lit), self.only_here)
 
     def __repr__(self) -> str:
         described = self.description
@@ -134,8 +137,10 @@ class Scene:
         resolved = settings.resolve(given)
         own = self.description
         check_meshes(own, given)
+        if own.camera_model is not None:
+            own.camera_model.check_given(given)
         values = {**own.values, **{name: resolved[name] for name in given}}
-        return Scene(replace(own, values=values, given=own.given | set(given)), self.only_here)
+        return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
 
 
 @plainly()
@@ -159,7 +164,8 @@ def load_scene(
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
-        camera: name of a camera of a scene file; "orbit" or None for the one around the object.
+        camera: a camera file (OpenCV, Kalibr, ROS, COLMAP), "fisheye" or "equirectangular", whose lens the camera
+            around the object then has; the name of a camera of a scene file; "orbit" or None for a pinhole.
         texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
             top; `result.artifacts["texture"]`, say.
 
@@ -211,14 +217,20 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
 
 
 def named_camera(description: SceneDescription) -> str | None:
-    """Return the camera of a scene file in use, as `load_scene` takes it; None for the one around the object."""
+    """Return the camera in use, as `load_scene` takes it; None for the pinhole around the object."""
+    if description.camera_model is not None and description.camera_model.name:
+        return description.camera_model.name
     return None if description.camera == ORBIT_CAMERA else description.camera
 
 
 def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> SceneDescription:
     """Return the scene as it is seen in a picture of this size (side, or height and width)."""
     height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
-    return replace(description, aspect=width / height)
+    model, remarks = description.camera_model, description.remarks
+    if model is not None:
+        model = bundled(width / height).get(model.name, model)
+        remarks = tuple(dict.fromkeys((*remarks, *model.scaling((height, width)))))
+    return replace(description, aspect=width / height, camera_model=model, remarks=remarks)
 
 
 def make_renderer(

@@ -315,7 +315,8 @@ def _transport(findings: Findings) -> LinearTransport:
         return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
     return LinearTransport(
         used=True,
-        reason=transport.given_up,
+        way=transport.way,
+        reason=transport.given_up or findings.surface_refused or None,
         conditions=None if transport.conditions is None else BankOfConditions.of(transport.conditions),
         entries=transport.size()[0],
         bytes=transport.size()[1],
@@ -418,8 +419,8 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
     count = findings.sample_count
     if count is not None and count.table and not count.converged:
         remarks.append(
-            f"It is not shown that the margin stands still at {count.spp} samples a pixel, the most that a check "
-            "takes: noise may take part in the verdict."
+            f"It is not shown that more than {count.spp} samples a pixel, the most that a check takes, would leave the "
+            "margin on its side: noise may take part in the verdict."
         )
     if not_finite := problem.renderer.non_finite:
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")

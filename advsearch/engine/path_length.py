@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.runs.results.plan import PathCut, PathLength
+from advsearch.runs.results.derivatives import PathCut, PathLength
 from advsearch.scene.renderer import Renderer
 
 SHORTEST = 2

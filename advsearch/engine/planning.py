@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
-from advsearch.runs.results.check import GradientStatus
-from advsearch.runs.results.plan import CosineRow
+from advsearch.runs.results.derivatives import CosineRow, GradientStatus
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, compared
 from advsearch.scene.renderer import Renderer
@@ -79,9 +78,9 @@ REPEATS = 3
 """Gradients that are taken of everything that is compared."""
 
 
-def plan_gradients(plan: GradientPlan, *, every: bool = False, repeats: int = REPEATS) -> int:
+def plan_gradients(plan: GradientPlan, *, every: bool = False) -> int:
     """Return how many gradients `measured_plan` takes."""
-    return repeats * sum(len(candidates) for _, candidates in contested(plan, every=every))
+    return REPEATS * sum(len(candidates) for _, candidates in contested(plan, every=every))
 
 
 def measured_plan(
@@ -167,20 +166,15 @@ def _scores(
 
 
 def cosine_samples(
-    plan: GradientPlan,
-    *,
-    factors: Sequence[float] = FACTORS,
-    counts: Sequence[int] = COUNTS,
-    repeats: int = REPEATS,
-    controls: Collection[str] | None = None,
+    plan: GradientPlan, *, counts: Sequence[int] = COUNTS, controls: Collection[str] | None = None
 ) -> int:
     """Return the samples a pixel that the gradients of `cosines` take in all, at most."""
-    each = repeats * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
+    each = REPEATS * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
     by_control: dict[str, set[str]] = {}
     for group in plan.groups:
         if group.estimator != "none" and (controls is None or group.control in controls):
             by_control.setdefault(group.control, set()).add(group.estimator)
-    return each * sum(len(factors) if used & BY_DIFFERENCES else 1 for used in by_control.values())
+    return each * sum(len(FACTORS) if used & BY_DIFFERENCES else 1 for used in by_control.values())
 
 
 def cosines(
@@ -189,9 +183,7 @@ def cosines(
     u: Tensor,
     *,
     seed: int,
-    factors: Sequence[float] = FACTORS,
     counts: Sequence[int] = COUNTS,
-    repeats: int = REPEATS,
     controls: Collection[str] | None = None,
     tick: Callable[[int], None] = lambda samples: None,
     keep: Keep = measured_now,
@@ -210,23 +202,16 @@ def cosines(
         by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
         reached = False
         tried: list[GradientPlan] = []
-        for factor in factors if by_steps else factors[:1]:
+        for factor in FACTORS if by_steps else FACTORS[:1]:
             if factor == FACTORS[-1] and reached:
                 break
-            plan = _silenced(base.with_steps(factor), names)
+            plan = only(base.with_steps(factor), names)
             if plan in tried:  # no step can be wider
                 continue
             tried.append(plan)
-            for row in _cosines_at(plan, taken, factor, counts, repeats, renderer.formation.denoiser, tick):
+            for row in _cosines_at(plan, taken, factor, counts, renderer.formation.denoiser, tick):
                 reached = reached or row.status == "ok"
                 yield row
-
-
-def _silenced(plan: GradientPlan, names: set[str]) -> GradientPlan:
-    """The plan with all other groups left out."""
-    return replace(
-        plan, groups=tuple(one if one.name in names else replace(one, estimator="none") for one in plan.groups)
-    )
 
 
 def _cosines_at(
@@ -234,7 +219,6 @@ def _cosines_at(
     taken: Callable[..., tuple[Tensor, float]],
     factor: float,
     counts: Sequence[int],
-    repeats: int,
     denoiser: str,
     tick: Callable[[int], None],
 ) -> Iterator[CosineRow]:
@@ -255,7 +239,7 @@ def _cosines_at(
             many = AGAIN * CONVERGED
             truth, agreement = converged(many)
         found, seconds = taken(
-            plan, "working", spp=spp, repeats=repeats, place=f"{place} {spp}", tick=partial(tick, spp)
+            plan, "working", spp=spp, repeats=REPEATS, place=f"{place} {spp}", tick=partial(tick, spp)
         )
         mean = statistics.fmean(_cosine(one, truth) for one in found)
         yield CosineRow(

@@ -23,7 +23,7 @@ from advsearch.engine.asked import Asked
 from advsearch.engine.domains import domain_of
 from advsearch.engine.metrics import Metrics, judgements, mean_metrics
 from advsearch.models import Model
-from advsearch.runs.results.plan import GroupDerivative, PlannedGradient
+from advsearch.runs.results.derivatives import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients.group import Group

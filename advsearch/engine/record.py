@@ -43,6 +43,7 @@ class Findings:
         interrupted: somebody pressed Ctrl-C.
         transport: what predicted the pictures of the searches, if anything did.
         rendered_because: why nothing did, in words.
+        surface_refused: why matrices did and not light on surfaces, where that was tried.
         verification_renders: renders spent on choosing the sample count and on trials.
     """
 
@@ -64,6 +65,7 @@ class Findings:
     interrupted: bool = False
     transport: Predictor | None = None
     rendered_because: str = ""
+    surface_refused: str = ""
     verification_renders: int = 0
 
     @property

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -16,7 +17,9 @@ from advsearch.cluster.executor import Executor
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
 from advsearch.engine.sharing import Shared
+from advsearch.errors import InputError
 from advsearch.progress import Progress
+from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Judgement
@@ -166,3 +169,19 @@ class Retrials:
             if key not in self._lights:
                 self._lights[key] = renderer.radiance(whole, seed, condition.spp)
             return to_8_bit(renderer.space.picture(whole, renderer.formation.display(self._lights[key])))
+
+
+def kept_answer(folder: Path, problem: Problem) -> torch.Tensor:
+    """Return the configuration (d,) that a run answers with, of its problem loaded again.
+
+    Raises:
+        InputError: the scene is another one now.
+        FileFormatError: there is none.
+    """
+    u = torch.from_numpy(read_answer(folder))
+    if u.shape != problem.domain.start.shape:
+        raise InputError(
+            f"{folder}: its answer has {len(u)} numbers, and its scene has {problem.domain.dim} now: the object or "
+            "advsearch has changed since; do the run again"
+        )
+    return u

@@ -104,7 +104,8 @@ def judgement_of(row: Row) -> Judgement:
 
 def verified_rate(checked: Verification) -> VerifiedRate:
     """Return the rate of a success, with how often each such answer was given and the mean score of the trials."""
-    return rate_of(checked.adversarial, checked.counting, checked.successes)
+    rated = rate_of(checked.adversarial, checked.counting, checked.successes)
+    return rated.model_copy(update={"stopped": checked.stopped})
 
 
 def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:

@@ -27,8 +27,10 @@ from advsearch.engine.journal import Journal
 from advsearch.engine.print_terms import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.transport import CleanMatrix, Transport, reason_against, remark
+from advsearch.engine.surface_light import SurfaceLight
+from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason_against, remark, varying
 from advsearch.report.wording import count
+from advsearch.scene.surface import plan as surface_light
 from advsearch.scene.transport.renderer import TransportTooLargeError
 
 MOST_FRAMES = 60
@@ -68,15 +70,26 @@ class Searches:
         if findings.rendered_because:
             return
         if problem.conditions is None:
-            findings.transport = Transport(problem, steps, clean=self.clean)
-        else:
-            findings.transport = Bank(problem, steps, self.journal.traced)
+            self._prepare(Transport(problem, steps, clean=self.clean), "collecting light transport")
+            return
+        if surface_light.why_not(problem.renderer, varying(problem)) is None:
+            light = SurfaceLight(problem, steps)
+            self._prepare(light, "finding the light on surfaces")
+            findings.surface_refused = light.too_far_off or ""
+            if not findings.surface_refused:
+                return
+            self.stages.progress.message(f"Pictures are predicted by matrices: {findings.surface_refused}.")
+        self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
+
+    def _prepare(self, predictor: Predictor, title: str) -> None:
+        """Make what predicts pictures; where its matrix would be too large, pictures are rendered."""
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
-        self.stages.begin("transport", "collecting light transport", findings.transport.samples, hint=hint)
+        self.stages.begin("transport", title, predictor.samples, hint=hint)
+        self.findings.transport = predictor
         try:
-            findings.transport.prepare(self.stages.progress.advance)
+            predictor.prepare(self.stages.progress.advance)
         except TransportTooLargeError as error:
-            findings.transport = None
+            self.findings.transport = None
             self._renders_because(str(error))
 
     def _renders_because(self, reason: str) -> None:
@@ -136,7 +149,7 @@ class Searches:
 
         domain = self.problem.domain if domain is None else domain
         transport = self.findings.transport
-        drawn = isinstance(transport, Bank) and policy.uses_gradient
+        drawn = isinstance(transport, (Bank, SurfaceLight)) and policy.uses_gradient
         found = search(
             answers,
             replace(domain, exact=isinstance(transport, Transport), drawn=drawn),

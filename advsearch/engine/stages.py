@@ -13,6 +13,7 @@ from advsearch import seeds
 from advsearch.attacks import Ending, Evaluation, Policy, SearchResult, Verification, count_right, run_trials
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.smallest import scaled
+from advsearch.attacks.verification import TRIAL_LOOKS
 from advsearch.config import AttackConfig
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
 from advsearch.engine.failures import check_failures
@@ -60,7 +61,9 @@ class Attack:
         self.problem = self.journal.problem
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
         ladder = ladder_of(self.config)
-        self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, self.config.trial_count)
+        unasked = self.config.trials is None and not self.config.over
+        looks = TRIAL_LOOKS if unasked and not self.config.smallest else (self.config.trial_count,)
+        self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, looks)
         kept = (self.stages, self.findings, self.clean)
         self._searches = Searches(self.journal, self.config, self.policy, *kept)
 
@@ -174,7 +177,7 @@ class Attack:
         if not self.problem.rule.control or (looks_right and not config.smallest):
             return True
         self._verifier.choose_spp({"clean": start})
-        self._verifier.begin("checking the clean scene with fresh renders", config.trial_count)
+        self._verifier.begin("checking the clean scene with fresh renders", self._verifier.looks[0])
         self._verifier.try_clean()
         return not self.problem.rule.already_wrong(count_right(findings.clean, findings.spp))
 
@@ -218,7 +221,7 @@ class Attack:
         if not self.config.smallest or findings.sample_count is None:
             self._verifier.choose_spp({"adversarial": answer, "clean": problem.domain.start})
         groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
-        self._verifier.begin("checking the answer with fresh renders", groups * self.config.trial_count, at_most=True)
+        self._verifier.begin("checking the answer with fresh renders", groups * self._verifier.count, at_most=True)
         self._verifier.try_clean()
         findings.verification = self._verifier.verified("verification", found)
         if findings.verification.ending is Ending.ALREADY_WRONG:
@@ -255,9 +258,9 @@ def _values(trial: Judgement) -> list[float | None]:
     return [finite(getattr(trial, name)) for name in LOOKED_AT]
 
 
-def _rank(verification: Verification) -> tuple[bool, int, float]:
-    """How bad an answer is for the model: found, then successes, then the mean margin."""
+def _rank(verification: Verification) -> tuple[bool, float, float]:
+    """How bad an answer is for the model: found, then the rate of successes, then the mean margin."""
     scores = [trial.score for trial in verification.counting]
     mean = sum(scores) / len(scores)
     mean = mean if mean == mean else -math.inf
-    return verification.ending is Ending.FOUND, verification.adversarial.successes, mean
+    return verification.ending is Ending.FOUND, verification.adversarial.rate, mean

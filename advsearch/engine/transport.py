@@ -13,6 +13,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -101,7 +102,7 @@ def reason_against(problem: Problem, steps: int, specialise: bool) -> str | None
         return "nothing is left out"
     if steps < WORTH:
         return f"a matrix pays from {WORTH} evaluations on"
-    reason = why_not(problem.renderer, _varying(problem))
+    reason = why_not(problem.renderer, varying(problem))
     if reason is None and problem.conditions is None:
         worth = WORTH_A_LIGHT * lights_to_collect(problem.renderer)
         return f"basis pictures pay from {worth} evaluations on" if steps < worth else None
@@ -115,7 +116,7 @@ def remark(reason: str) -> str:
     return f"{costs}: {reason}; {instead}." if instead else ""
 
 
-def _varying(problem: Problem) -> list[str]:
+def varying(problem: Problem) -> list[str]:
     """The controls that vary by chance."""
     return [] if problem.conditions is None else [one.name for one in problem.space.controls[problem.searched :]]
 
@@ -124,10 +125,12 @@ class Predictor(ABC):
     """What predicts the pictures of a run's searches.
 
     Attributes:
+        way: by what, in words.
         deviations: what the comparisons with traced pictures found, in order.
         seconds: spent on making matrices and on comparing.
     """
 
+    way: ClassVar[str] = "matrix"
     deviations: list[Deviation]
     seconds: float
 

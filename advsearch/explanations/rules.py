@@ -8,16 +8,23 @@ other half of the rows, which no choice has seen, says whether a rule holds.
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.stats import hypergeom
 
 from advsearch import seeds
-from advsearch.explanations.libraries import import_library
+from advsearch.errors import InputError
 from advsearch.explanations.observations import Factor, Mask, Observations, encoded
+from advsearch.runs.results.base import ConditionRow
+
+FEWEST_ROWS = 100
+"""Rows of which one half can choose and the other can count."""
+
 
 MOST_RULES = 5
 DEPTH = 3
@@ -264,3 +271,36 @@ def _nodes(
                 replace(before, options=before.options & {option}),
             )
         open_nodes += [(int(left[node]), {**so_far, place: below}), (int(right[node]), {**so_far, place: above})]
+
+
+PACKAGES = {"sklearn": "scikit-learn"}
+"""Names on the package index, by that of a module."""
+
+
+def import_library(name: str) -> Any:
+    """Return a module of such a library, such as ``sklearn.tree``.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package, command = PACKAGES[name.partition(".")[0]], "pip install 'advsearch[explain]'"
+        raise InputError(f"explain needs {package}, which cannot be imported: {command}") from error
+
+
+def condition_rows(conditions: RuleConditions, factors: Sequence[Factor]) -> list[ConditionRow]:
+    """Return conditions with the names of their factors."""
+    return [_condition_row(one, factors[one.place]) for one in conditions]
+
+
+def _condition_row(one: RuleCondition, factor: Factor) -> ConditionRow:
+    return ConditionRow(
+        parameter=factor.name,
+        unit=factor.unit,
+        over=one.low if np.isfinite(one.low) else None,
+        at_most=one.high if np.isfinite(one.high) else None,
+        options=[factor.options[number] for number in sorted(one.options or ())],
+        text=one.text(factor),
+    )

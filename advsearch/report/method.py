@@ -38,7 +38,8 @@ def transport_text(summary: AttackSummary) -> str:
         return ""
     if not transport.used:
         return f"every picture was rendered: {transport.reason}" if transport.reason else "every picture was rendered"
-    parts = [f"a matrix predicted {count(summary.renders.get('products'), 'picture')}"]
+    what = "light on surfaces" if transport.way == "surface light" else "a matrix"
+    parts = [f"{what} predicted {count(summary.renders.get('products'), 'picture')}"]
     if transport.error is not None:
         levels, logits = map(_short, (transport.error.levels, transport.error.logits))
         parts.append(
@@ -88,7 +89,8 @@ def _sample_count(summary: AttackSummary) -> str:
     chosen = summary.sample_count
     if chosen is None:
         return ""
-    still = "the margin stands still there" if chosen.converged else "that the margin stands still there is not shown"
+    enough, unknown = "more would leave the margin on its side", "that more would not change it is not shown"
+    still = enough if chosen.converged else unknown
     return f"{chosen.spp} a pixel in the verification; {still}"
 
 

@@ -11,14 +11,13 @@ from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
 from advsearch.report.wording import short_name
 from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow
 from advsearch.runs.results.matrix import MatrixResult
-from advsearch.runs.results.region import BoxSide, MarginMap
 from advsearch.runs.results.sweep import AxisRow, SweepMap, SweepSummary
 from advsearch.settings import split_names
 
 
 def curve_figure(answer: CurveResult) -> Figures:
     """Draw the robust accuracy with its interval over epsilon; nothing where there is one epsilon only."""
-    return _figure(lambda axes: curve_axes(answer, axes), (5.6, 3.6)) if len(_points(answer)) > 1 else {}
+    return figure_of(lambda axes: curve_axes(answer, axes), (5.6, 3.6)) if len(_points(answer)) > 1 else {}
 
 
 def curve_axes(answer: CurveResult, axes: Any) -> None:
@@ -43,7 +42,7 @@ def _points(answer: CurveResult) -> list[CurvePoint]:
 def gap_figure(answer: GapResult) -> Figures:
     """Draw, for each object and control, the accuracy on average and of the worst configuration, joined by a line."""
     size = (6.4, 1.6 + 0.36 * len(answer.table))
-    return _figure(lambda axes: gap_axes(answer, axes), size) if answer.table else {}
+    return figure_of(lambda axes: gap_axes(answer, axes), size) if answer.table else {}
 
 
 def gap_axes(answer: GapResult, axes: Any) -> None:
@@ -87,26 +86,7 @@ def matrix_figure(answer: MatrixResult) -> Figures:
         axes.set(xlabel="tested on", ylabel="attacked on")
         axes.set_title(f"{', '.join(answer.objects)}, {', '.join(answer.controls)}: wrong in trials")
 
-    return _figure(draw, (2.6 + 1.3 * len(answer.models), 1.8 + 0.5 * len(rows)))
-
-
-def map_figure(drawn: MarginMap, box: Sequence[BoxSide]) -> Figures:
-    """Draw a map of the margin over two parameters, with the line at which the verdict changes, and the box."""
-
-    def draw(axes: Any) -> None:
-        (first, second), margins = drawn.axes, drawn.margins
-        extent = (first.low, first.high, second.low, second.high)
-        _heat(axes, margins, extent, MARGIN, _name(first.name, first.unit), _name(second.name, second.unit))
-        if min(map(min, margins)) < 0.0 < max(map(max, margins)):
-            axes.contour(margins, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
-        across, up = box
-        corners_x = [across.low, across.high, across.high, across.low, across.low]
-        corners_y = [up.low, up.low, up.high, up.high, up.low]
-        axes.plot(corners_x, corners_y, color="black", linestyle="--", label="region")
-        axes.plot(across.centre, up.centre, "k+", label="centre")
-        axes.legend(loc="upper right", frameon=True)
-
-    return _figure(draw, (6.0, 4.6))
+    return figure_of(draw, (2.6 + 1.3 * len(answer.models), 1.8 + 0.5 * len(rows)))
 
 
 def sweep_figure(answer: SweepSummary) -> Figures:
@@ -115,7 +95,7 @@ def sweep_figure(answer: SweepSummary) -> Figures:
     A cell shows the accuracy there; where no cell has more than one configuration, the margin.
     """
     size = _map_size(answer.cells) if answer.cells else (5.6, 3.6)
-    return _figure(lambda axes: sweep_axes(answer, axes), size) if answer.cells or _only_axis(answer) else {}
+    return figure_of(lambda axes: sweep_axes(answer, axes), size) if answer.cells or _only_axis(answer) else {}
 
 
 def sweep_axes(answer: SweepSummary, axes: Any) -> None:
@@ -156,14 +136,14 @@ def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
     first, second = cells.axes
     seen, correct, margin = cells.configurations, cells.correct, cells.margin
     extent = (-0.5, len(first.values) - 0.5, -0.5, len(second.values) - 0.5)
-    labels = _name(first.axis, first.unit), _name(second.axis, second.unit)
+    labels = axis_title(first.axis, first.unit), axis_title(second.axis, second.unit)
     if max(map(max, seen)) > 1:
         pairs = [zip(*rows, strict=True) for rows in zip(correct, seen, strict=True)]
         values = [[right / count if count else math.nan for right, count in row] for row in pairs]
-        _heat(axes, values, extent, ACCURACY, *labels)
+        heat(axes, values, extent, ACCURACY, *labels)
     else:
         values = [[math.nan if one is None else one for one in row] for row in margin]
-        _heat(axes, values, extent, MARGIN, *labels)
+        heat(axes, values, extent, MARGIN, *labels)
     axes.set_xticks(*_ticks(first.values), rotation=45 if _long(first.values) else 0)
     axes.set_yticks(*_ticks(second.values))
     more = len(cells.over)
@@ -178,7 +158,7 @@ def _along(axes: Any, answer: SweepSummary, rows: Sequence[AxisRow]) -> None:
     axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
     axes.plot(at, accuracy, "o", color=BLUE, label="accuracy")
     axes.set_xticks(*_ticks([row.value for row in rows]), rotation=45 if _long([r.value for r in rows]) else 0)
-    axes.set(xlabel=_name(rows[0].axis, rows[0].unit), ylabel="accuracy", ylim=(-0.03, 1.03))
+    axes.set(xlabel=axis_title(rows[0].axis, rows[0].unit), ylabel="accuracy", ylim=(-0.03, 1.03))
     axes.margins(x=0.08)
     axes.set_title(_who(answer))
     axes.grid(True, axis="y")
@@ -194,7 +174,7 @@ MOST_POINTS, MOST_TICKS = 400, 16
 """Values of an axis that are drawn, and that are written."""
 
 
-def _heat(
+def heat(
     axes: Any, values: Sequence[Sequence[float]], extent: tuple[float, ...], meaning: str, across: str, up: str
 ) -> None:
     """Draw values as colours, rows from the lowest, with what they mean and the names of both axes."""
@@ -209,7 +189,8 @@ def _heat(
     axes.figure.colorbar(shown, ax=axes, label=meaning)
 
 
-def _name(name: str, unit: str) -> str:
+def axis_title(name: str, unit: str) -> str:
+    """Return what an axis is called: ``pose.yaw [degrees]``."""
     return f"{name} [{unit}]" if unit not in ("", "name") else name
 
 
@@ -249,5 +230,6 @@ def _worst(row: GapRow) -> float:
     return 0.0 if row.ending == "already wrong" else 1.0 - row.worst.rate if row.worst else 1.0
 
 
-def _figure(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:
+def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:
+    """Return what is drawn on the axes of a new figure of a size in inches."""
     return drawn(lambda figure: draw(figure.subplots()), size)

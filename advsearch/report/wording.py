@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from advsearch.report.phrases import (
 
 if TYPE_CHECKING:
     from advsearch.runs.results.attack import AttackSummary, SharedWork, VerifiedRate
-    from advsearch.runs.results.base import Formation, Interval
+    from advsearch.runs.results.base import ConditionRow, Formation, Interval
 
 NO_INTERVAL = "no interval"
 
@@ -341,3 +341,8 @@ def _against_random(summary: AttackSummary) -> list[str]:
     if random.rate == ours.rate > 0:
         return [f"Random search with as many renders does as well: {tally}. The policy adds nothing here."]
     return []
+
+
+def conditions_text(conditions: Sequence[ConditionRow]) -> str:
+    """Return conditions in one phrase."""
+    return " and ".join(one.text for one in conditions) or "everything that was looked at"

@@ -107,6 +107,10 @@ class ObjectAsset:
             and normal, row 0 on top; None where there is none.
         emission: (H, W, 3) float32 linear radiance of the front of its faces, row 0 on top; (1, 1, 3) where it is the
             same everywhere, None where there is none.
+        finishes: of an object of several materials, what each of `mesh.materials` is like beside its base colour; what
+            none of them covers is like `material`.
+        metres: its largest extent in metres, where it has a size of its own; then distances of the camera are in
+            metres. None where distances are in object sizes.
     """
 
     name: str
@@ -121,6 +125,8 @@ class ObjectAsset:
     opacity: Floats | None = None
     normal_map: Floats | None = None
     emission: Floats | None = None
+    finishes: Mapping[str, Material] = field(default_factory=dict)
+    metres: float | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -140,6 +146,8 @@ class EnvironmentAsset:
         source: where it came from.
         warnings: what the importer had to repair or leave out, one sentence each.
         photographed: it shows the floor of a real place: the ground that things stand on is that floor by itself.
+        ground: the kind of ground that belongs to it by itself (`advsearch.scene.settings.GROUND_KINDS`); None for the
+            usual one.
 
     Raises:
         InputError: a texel is negative, NaN or infinite.
@@ -150,6 +158,7 @@ class EnvironmentAsset:
     source: str = ""
     warnings: tuple[str, ...] = ()
     photographed: bool = False
+    ground: str | None = None
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)

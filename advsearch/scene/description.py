@@ -1,7 +1,8 @@
 """A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
 
 Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
-in degrees. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
+in degrees. `camera.distance` and `camera.focus` are in metres where the object has a size in metres. The camera at
+azimuth 0 and elevation 0 looks from +x towards the object.
 """
 
 from __future__ import annotations
@@ -20,10 +21,13 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import reading
 from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
+from advsearch.scene.cameras.files import read_camera
+from advsearch.scene.cameras.model import CameraModel, bundled
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.photograph import Photograph, photograph_of
+from advsearch.scene.road import on_its_ground
 
 Doubles = npt.NDArray[np.float64]
 
@@ -40,8 +44,6 @@ ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 """Mitsuba's lights from everywhere, of which a scene can have one."""
 NO_MAP = "none"
 """What the environment of a scene without a map is called."""
-TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in settings.CHANNELS))
-"""Settings that only a table has."""
 OWN_MAP = "own"
 """What the scene's own environment is called where another may be chosen."""
 
@@ -65,6 +67,7 @@ class SceneDescription:
         aspect: width over height of the picture.
         cameras: those with poses of their own, by name.
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
+        camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
         remarks: what a user should know of further files that controls have read.
     """
@@ -82,6 +85,7 @@ class SceneDescription:
     aspect: float = 1.0
     cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
     camera: str = ORBIT_CAMERA
+    camera_model: CameraModel | None = None
     metered: bool = True
     remarks: tuple[str, ...] = ()
 
@@ -105,21 +109,37 @@ class SceneDescription:
         return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
 
     def seen_by(self, camera: str) -> SceneDescription:
-        """Return the scene as one of its cameras sees it.
+        """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens.
+
+        Args:
+            camera: name of a camera of the scene, a path to a camera file, or the name of a bundled camera model.
 
         Raises:
             UnknownNameError: it has no such camera.
-            InputError: a setting of the camera around the object was given, and another is to see it.
+            InputError: a setting of the camera around the object was given, and another is to see it; or a file cannot
+                be used.
         """
         if camera not in (ORBIT_CAMERA, *self.cameras):
-            raise UnknownNameError("camera of the scene", camera, (ORBIT_CAMERA, *self.cameras))
+            return self._with_model(camera)
         idle = sorted(name for name in self.given if name.startswith("camera.") and name != "camera.exposure")
         if camera != ORBIT_CAMERA and idle:
             raise InputError(
                 f"`camera={camera}` and `set` {idle[0]} contradict each other: the camera of the file has a place and "
                 "a field of view of its own; leave one of the two out"
             )
-        return replace(self, camera=camera)
+        return replace(self, camera=camera, camera_model=None)
+
+    def _with_model(self, name: str) -> SceneDescription:
+        if is_path(name):
+            with reading(name.partition("#")[0]):
+                model = read_camera(name)
+        elif name in bundled():
+            model = bundled()[name]
+        else:
+            known = (ORBIT_CAMERA, *self.cameras, *bundled())
+            raise UnknownNameError("camera", name, known, "Or give the path of a camera file, such as calib.yaml.")
+        model.check_given(self.given)
+        return replace(self, camera=ORBIT_CAMERA, camera_model=model)
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
@@ -167,6 +187,12 @@ class SceneDescription:
         return self.environment is not None or bool(self.lamps) or shining or self.emits
 
     @property
+    def metres(self) -> float:
+        """What distances of the camera are to be divided by to be in object sizes: the object's size in metres; 1 where
+        it has none."""
+        return self.object.metres or 1.0
+
+    @property
     def object_name(self) -> str:
         """How the object was asked for, or else its own name."""
         return self.object_spec or self.object.name
@@ -180,7 +206,8 @@ class SceneDescription:
     def notes(self) -> tuple[str, ...]:
         """What a user should know of how object and environment were read, and what controls name."""
         lit = () if self.environment is None else self.environment.warnings
-        return tuple(dict.fromkeys((*self.object.notes, *lit, *self.remarks)))
+        seen = () if self.camera_model is None else self.camera_model.notes
+        return tuple(dict.fromkeys((*self.object.notes, *lit, *seen, *self.remarks)))
 
     @property
     def bundled_environment(self) -> str | None:
@@ -236,7 +263,9 @@ class SceneDescription:
         own, kind = self.environment, self.values.get("ground.kind")
         if own is None or self.number("ground.size") == 0.0:
             return None
-        if kind is None and (not own.photographed or self.backdrop or not self.given.isdisjoint(TABLE_SETTINGS)):
+        if kind is None and (
+            not own.photographed or self.backdrop or not self.given.isdisjoint(settings.TABLE_SETTINGS)
+        ):
             return None
         if kind is not None and settings.GROUND_KINDS[int(kind)] != settings.PHOTOGRAPH:
             return None
@@ -287,7 +316,7 @@ def describe(
     file, node = split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)
     mitsuba = plugins is not None or (node is not None and str(file).lower().endswith(MITSUBA_FILE))
     if mitsuba:
-        around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up, given or {})
+        around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up)
     else:
         around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
     shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
@@ -314,7 +343,11 @@ def describe(
         metered=not mitsuba,
     )
     check_meshes(described, values)
-    return described
+    idle = [name for name in given or {} if name.startswith("material.")]
+    if described.object.surface is not None and idle:
+        whose = "several materials" if described.object.finishes else "a surface of Mitsuba's own"
+        raise InputError(f"`set` {idle[0]}: the object has {whose}, without it; leave it out")
+    return on_its_ground(described)
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
@@ -353,31 +386,28 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
     Raises:
         InputError: there is no photograph, or a table is described beside it.
     """
-    if given.get("ground.kind") != settings.PHOTOGRAPH:
+    kind = given.get("ground.kind")
+    if kind not in (settings.PHOTOGRAPH, *settings.ROADS):
         return
-    if lit_by == NO_MAP:
+    if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
         raise InputError(
             "`set` ground.kind=photograph: the scene has no environment map to show; give it one, or leave it out"
         )
-    described = [name for name in TABLE_SETTINGS if name in given]
+    described = [name for name in settings.TABLE_SETTINGS if name in given]
     if described:
         raise InputError(
-            f"`set` ground.kind=photograph and `set` {described[0]} contradict each other: only a table has that; "
+            f"`set` ground.kind={kind} and `set` {described[0]} contradict each other: only a table has that; "
             f"leave one of the two out"
         )
 
 
-def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None, given: settings.Given) -> ImportedScene:
+def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None) -> ImportedScene:
     from advsearch.scene.mitsuba_backend.files.scene import import_plugins
 
     if up is not None:
         raise InputError("up: the first camera of a Mitsuba scene says which way is up; leave `up` out")
     with reading(scene) if isinstance(scene, Path) else nullcontext():
-        found = import_plugins(scene, shape)
-    idle = [name for name in given if name.startswith("material.")]
-    if found.object.surface is not None and idle:
-        raise InputError(f"`set` {idle[0]}: the object has a surface of Mitsuba's own, without it; leave it out")
-    return found
+        return import_plugins(scene, shape)
 
 
 def _scene(path: Path, node: str, up: str | None) -> ImportedScene:

@@ -26,6 +26,7 @@ from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import pixels_in
+from advsearch.scene.road import paved
 from advsearch.scene.settings import resolve
 from advsearch.scene.silhouettes import NEAREST, Frame
 from advsearch.scene.surface_map import looked_up
@@ -59,7 +60,7 @@ def metered_gain(scene: SceneDescription) -> float:
     Where the camera sees nothing of the object, the card lies on the ground; where no light arrives the factor is 1.
     """
     default = {name: value for name, value in resolve({}).items() if name.startswith(MOVED)}
-    scene = replace(scene, values={**scene.values, **default}, aspect=1.0, camera=ORBIT_CAMERA)
+    scene = replace(scene, values={**scene.values, **default}, aspect=1.0, camera=ORBIT_CAMERA, camera_model=None)
     seen = visible_irradiance(scene)
     metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen
     return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
@@ -85,7 +86,7 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
     vertices = scene.base_vertices
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
     reach = np.abs(middle[:2] + directions[:, :2] * (middle[2] / np.maximum(-directions[:, 2:], 1e-9)))
-    on_table = scene.photograph is None  # else the map itself says what comes from below
+    on_table = scene.photograph is None and not paved(scene)  # else the map itself says what comes from below
     hits = on_table & ~upper & (reach <= scene.number("ground.size") / 2.0).all(axis=1)
     power = np.where(hits[:, None], bounced * solid[:, None], power)
     facing = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)

@@ -43,7 +43,7 @@ def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) 
     offsets = torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
     azimuth, elevation, roll = (float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW)
     offsets = offsets.to(fov.device)
-    edge = _tangents(fov, aspect)
+    edge = _edge(description, fov, aspect)
     fits = _from_one_side(offsets, camera_axes(azimuth, elevation, roll), edge * FRAME_FILL)
     whole = _from_all_around(offsets, elevation, edge)
     return torch.maximum(fits, whole).clamp_min(float(offsets.norm(dim=1).max()) + CLEARANCE)
@@ -52,7 +52,7 @@ def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) 
 def filling_distance(description: SceneDescription) -> float:
     """Return the distance at which the object just fits into a square picture from where this scene's camera looks."""
     offsets = torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
-    edge = _tangents(torch.tensor(description.number("camera.fov"), dtype=torch.float64), 1.0)
+    edge = _edge(description, torch.tensor(description.number("camera.fov"), dtype=torch.float64), 1.0)
     axes = camera_axes(*(description.number(name) for name in DEFAULT_VIEW))
     return float(_from_one_side(offsets, axes, edge * FRAME_FILL))
 
@@ -79,6 +79,14 @@ def middle(description: SceneDescription) -> Doubles:
     """Return what the camera looks at: the middle (3,) of the object's bounding box in its default pose."""
     vertices = description.object.mesh.vertices.astype(np.float64)
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
+
+
+def _edge(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
+    """Tangents of half the picture's width and height, (2,); of a lens, those of what it shows of a rectangle."""
+    model = description.camera_model
+    if model is not None and model.name:
+        return torch.tensor(model.tangents, dtype=torch.float64, device=fov.device)
+    return _tangents(fov, aspect)
 
 
 def _tangents(fov: Tensor, aspect: float) -> Tensor:

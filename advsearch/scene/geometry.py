@@ -95,8 +95,9 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
     aspect = description.aspect if aspect is None else aspect
     number = description.number
     axes = camera_axes(number("camera.azimuth"), number("camera.elevation"), number("camera.roll"))
-    distance = description.values["camera.distance"]
-    if distance is None:
+    asked = description.values["camera.distance"]
+    distance = 0.0 if asked is None else asked / description.metres
+    if asked is None:
         distance = float(framing_distance(description, torch.tensor(number("camera.fov"), dtype=torch.float64), aspect))
     matrix = np.eye(4)
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = axes[0], axes[1], -axes[2]

@@ -8,6 +8,8 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections.abc import Iterable
+from dataclasses import replace
 from importlib import resources
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,7 @@ import numpy.typing as npt
 from advsearch.errors import FileFormatError, UnknownNameError
 from advsearch.files import MESHES, either
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
+from advsearch.scene.finishes import finished
 
 if TYPE_CHECKING:
     from importlib.abc import Traversable
@@ -47,10 +50,17 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
     """Return the names of the bundled environments, sorted.
 
     Args:
-        split: "train" or "heldout" to list only that half; None for all.
+        split: "train" or "heldout" to list only that half, "street" for the streets; None for all.
     """
-    facts = json.loads((_data() / "environments" / "environments.json").read_text("utf-8"))["environments"]
-    return tuple(sorted(name for name, fact in facts.items() if split is None or fact["split"] == split))
+    facts = _environments().items()
+    return tuple(sorted(name for name, fact in facts if split is None or fact["split"] == split))
+
+
+def _environments() -> dict[str, dict[str, str]]:
+    """What is known of each bundled environment, by name."""
+    text = (_data() / "environments" / "environments.json").read_text("utf-8")
+    facts: dict[str, dict[str, str]] = json.loads(text)["environments"]
+    return facts
 
 
 def load_object(name: str) -> ObjectAsset:
@@ -66,13 +76,19 @@ def load_object(name: str) -> ObjectAsset:
     folder = _data() / "objects" / name
     try:
         facts = json.loads((folder / "object.json").read_text("utf-8"))
+        mesh = replace(_mesh((folder / "mesh.ply").read_bytes()), materials=_materials(facts.get("faces", ())))
+        material = Material(**facts["material"])
+        finishes = {one: Material(**given) for one, given in facts.get("finishes", {}).items()}
         return ObjectAsset(
             name=name,
-            mesh=_mesh((folder / "mesh.ply").read_bytes()),
+            mesh=mesh,
             base_color=_image((folder / "base_color.png").read_bytes()),
-            material=Material(**facts["material"]),
+            material=material,
             label=facts["label"],
             source=f"bundled object, made by {facts['source']}",
+            surface=finished(mesh, finishes, material) if finishes else None,
+            finishes=finishes,
+            metres=facts.get("metres"),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FileFormatError(f"bundled object {name!r} cannot be read ({error}); reinstall advsearch") from error
@@ -92,7 +108,7 @@ def load_environment(name: str) -> EnvironmentAsset:
         radiance = _exr((_data() / "environments" / f"{name}.exr").read_bytes())
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
-    return EnvironmentAsset(name, radiance, source=BUNDLED_ENVIRONMENT)
+    return EnvironmentAsset(name, radiance, source=BUNDLED_ENVIRONMENT, ground=_environments()[name].get("ground"))
 
 
 def _mesh(content: bytes) -> Mesh:
@@ -114,6 +130,12 @@ def _mesh(content: bytes) -> Mesh:
         normals=np.ascontiguousarray(vertices[:, 3:6]),
         uvs=np.ascontiguousarray(vertices[:, 6:]),
     )
+
+
+def _materials(runs: Iterable[tuple[str, int]]) -> dict[str, npt.NDArray[np.int64]]:
+    """Return the faces of each material, from how many faces in a row have which."""
+    names = np.repeat([name for name, _ in runs], [count for _, count in runs])
+    return {str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)}
 
 
 def _image(content: bytes) -> Floats:

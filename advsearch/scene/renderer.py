@@ -272,8 +272,14 @@ class Renderer:
     ) -> Tensor:
         """The picture of u, or with scene inputs in the place of its own; or else the radiance that is to be shown."""
         inputs = self.scene.assembly(self.space.inputs(u)) if given is None else given
-        exposure, backdrop = inputs.pop("camera.exposure", None), inputs.pop("backdrop.color", None)
-        rendered = self._rendered(inputs, seed, spp, backdrop is not None)
+        hide = "backdrop.color" in inputs
+        traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+        return self._shown(self._rendered(traced, seed, spp, hide), inputs, u, shown=shown)
+
+    def _shown(self, rendered: Tensor, inputs: Mapping[str, Tensor], u: Tensor, *, shown: bool = True) -> Tensor:
+        """The picture of rendered radiance, or the radiance that is to be shown: exposure and backdrop of scene inputs,
+        and what controls do to the finished picture at u."""
+        exposure, backdrop = inputs.get("camera.exposure"), inputs.get("backdrop.color")
         radiance = rendered[..., :3]
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)

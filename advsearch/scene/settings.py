@@ -116,7 +116,7 @@ CAMERA = (
         0.05,
         1000.0,
         "fits the object",
-        "Distance to the object's middle.",
+        "Distance to the object's middle; in metres where the object has a size.",
         (0.8, 1.5),
         log=True,
     ),
@@ -142,16 +142,19 @@ ENVIRONMENT = (
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
     ),
 )
-GROUND_KINDS = TABLE, PHOTOGRAPH = "table", "photograph"
+GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD = "table", "photograph", "road", "wet-road"
+ROADS = (DRY_ROAD, WET_ROAD)
+TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
+"""Settings that only a table has."""
 GROUND = (
     Parameter(
         "kind",
         (),
         "name",
         0.0,
-        1.0,
-        "photograph where the map is a file, else table",
-        "What the object stands on: a square table, or the floor that the environment's photograph shows.",
+        3.0,
+        "what the environment has: photograph where the map is a file, a road in a street, else table",
+        "What the object stands on: a square table, the floor that the environment's photograph shows, or a road.",
         options=GROUND_KINDS,
     ),
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),

@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 PLACE: Mapping[str, bool | None] = {"run": None, "overwrite": False}
 """The settings that say where a run is kept, not what it does, as a repetition has them."""
 
-FILES = ("object", "environment", "model", "labels", "recipe", "suite", "held_out", "held_out_environment", "compared")
+FILES = (
+    *("object", "environment", "camera", "model", "labels", "recipe", "suite"),
+    *("held_out", "held_out_environment", "compared"),
+)
 """The settings that may name files."""
 
 

@@ -1,26 +1,30 @@
-"""`report.html` of any run: the page that runs of its command have."""
+"""`report.html` of any run: the page that its question has, or what it shows of its answer as a page."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from advsearch import rooms
-from advsearch.runs.directory import REPORT
+from advsearch.report.charts import NARROW, WIDE, study_chart
+from advsearch.report.markup import Html, element, join_html
+from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
+from advsearch.runs.directory import IMAGES, REPORT
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.results.gap import CurveResult, GapResult
-from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.matrix import MatrixResult
-from advsearch.runs.results.recipe import RecipeResult
-from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.viewer import attack_page, study_page, sweep_page
-from advsearch.viewer.explain_page import explain_page
-from advsearch.viewer.harden_page import harden_page
-from advsearch.viewer.recipe_page import recipe_page
-from advsearch.viewer.result_page import result_page
+from advsearch.viewer.document import data_url, document, scrolled
+from advsearch.viewer.study_page import again, facts_table, heading, part_links, study_table, subject_html
+
+LARGEST_FIGURE = 2_000_000
+"""Bytes of a figure or a picture that the page takes along."""
+
+KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
+"""Media types of pictures."""
 
 
 def write_page(run: Path, result: Result) -> Path:
@@ -45,14 +49,89 @@ def write_page(run: Path, result: Result) -> Path:
             text = study_page.curve_page(run, result)
         case MatrixResult():
             text = study_page.matrix_page(run, result)
-        case ReplayResult():
-            text = study_page.replay_page(run, result)
-        case ExplainResult():
-            text = explain_page(run, result)
-        case HardenResult():
-            text = harden_page(run, result)
-        case RecipeResult():
-            text = recipe_page(run, result)
         case _:
-            text = (rooms.in_room(result.command, "page", "page") or result_page)(run, result)
+            own = rooms.in_room(result.command, "page", "page")
+            text = own(run, result) if own else shown_page(run, result, shown(result))
     return write_text(run / REPORT, text, durable=False)
+
+
+def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
+    """Return what is shown of an answer as the page of the run in the folder `run`."""
+    parts = list(getattr(result, "parts", ()))
+    facts = {name[:1].upper() + name[1:]: text for name, text in facts_of(result, given).items()}
+    drawn = any(one.draw or one.figure or one.pictures for one in given.sections)
+    main = element(
+        "main",
+        *([] if drawn else _figures(run, given.said)),
+        *(_section(run, one) for one in given.sections if one.only != "text" and not one.empty),
+        _links(run, parts) if parts and all(isinstance(one, str) for one in parts) else None,
+        join_html(element("h2", "Cost and conditions"), facts_table(facts)),
+        again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
+    )
+    what = join_html(f"{result.command}; ", subject_html(*(("", one) for one in subject_of(result, given))))
+    header = heading(what, given.said, remarks_of(result, given))
+    return document(
+        f"{run.name}, {result.command}", header, main, footer=f"run {run.name}. This page needs no other file."
+    )
+
+
+def kept(run: Path, name: str | Path) -> Path | None:
+    """Return the file of a picture in the folder of a run; None where it is missing, elsewhere or too large."""
+    file = (run / name).resolve()
+    inside = file.is_relative_to(run.resolve()) and file.is_file() and not (run / name).is_symlink()
+    return file if inside and file.stat().st_size <= LARGEST_FIGURE else None
+
+
+def _section(run: Path, one: AnswerPart) -> Html:
+    """A part of an answer; a folded one has its title as the handle."""
+    chart = None
+    if one.draw is not None:
+        words = " ".join([f"{one.title}.", *one.text])
+        chart = element("div", *(study_chart(one.draw, words, width, one.height) for width in (WIDE, NARROW)))
+    table = study_table(one.heads, one.rows, part_links(run, one.parts), one.shares) if one.heads else None
+    inside = join_html(
+        *(element("p", text) for text in one.text if text and one.draw is None),
+        chart or _figure(run, one.figure, " ".join(one.text) or one.title),
+        (table or facts_table({row[0]: row[1] for row in one.rows})) if one.rows else None,
+        *(_pictures(run, group) for group in one.pictures),
+        element("p", one.note, class_="soft") if one.note else None,
+    )
+    if one.folded:
+        return element("details", element("summary", one.title), inside)
+    return join_html(element("h2", one.title) if one.title else None, inside)
+
+
+def _pictures(run: Path, group: Iterable[Picture]) -> Html | None:
+    """Pictures side by side, of those that are there."""
+    figures = [
+        element(
+            "figure",
+            element("img", src=data_url(file.read_bytes(), KINDS[file.suffix.lower()]), alt=one.caption),
+            element("figcaption", one.caption),
+        )
+        for one in group
+        if (file := kept(run, one.file)) is not None
+    ]
+    return element("div", *figures, class_="pictures pair" if len(figures) < 3 else "pictures") if figures else None
+
+
+def _figures(run: Path, said: str) -> Iterator[Html]:
+    """The figures among the images of a run whose question names none."""
+    for file in sorted((run / IMAGES).glob("*.png")):
+        name = file.stem.replace("-", " ").replace("_", " ").capitalize()
+        yield _figure(run, f"{IMAGES}/{file.name}", f"{name}: {said}") or Html()
+
+
+def _figure(run: Path, name: str, alt: str) -> Html | None:
+    file = kept(run, name) if name else None
+    if file is None:
+        return None
+    picture = element("img", src=data_url(file.read_bytes(), "image/png"), alt=alt)
+    return element("figure", scrolled(picture, "wide"), class_="wide")
+
+
+def _links(run: Path, parts: list[str]) -> Html:
+    """The runs that a run consists of, folded."""
+    linked = zip(parts, part_links(run, parts), strict=True)
+    lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
+    return element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines))

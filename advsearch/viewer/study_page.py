@@ -12,13 +12,11 @@ from advsearch.files import MESHES
 from advsearch.report import gaps, wording
 from advsearch.report.charts import HEIGHT, NARROW, WIDE, study_chart
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.replays import HEADS, replay_rows, replay_text
 from advsearch.report.studies import curve_axes, gap_axes
 from advsearch.report.transfer import matrix_heads, matrix_rows, matrix_text
 from advsearch.runs.directory import PARTS, REPORT
 from advsearch.runs.results.gap import CurveResult, GapResult, StudyResult
 from advsearch.runs.results.matrix import MatrixResult
-from advsearch.runs.results.replay import ReplayResult
 from advsearch.viewer.document import document, scrolled
 
 ROW_HEIGHT = 34
@@ -93,40 +91,6 @@ def matrix_page(run: Path, result: MatrixResult) -> str:
         element("p", note, class_="soft"),
     ]
     return _study_page(run, result, matrix_text(result), body, facts)
-
-
-def replay_page(run: Path, result: ReplayResult) -> str:
-    """Return the page of a replay in the folder `run`."""
-    what = join_html(
-        f"answer of {Path(result.answer).name} ({result.answered}); ",
-        subject_html(("", result.object), ("", ", ".join(result.controls))),
-    )
-    note = (
-        "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
-        "intervals. A success is what the search sought, where the clean scene is right with the same seed under the "
-        "same condition."
-    )
-    facts = {
-        "Answer": result.answer,
-        "Model": result.model,
-        "Environment": result.environment,
-        "Renders": str(result.renders),
-        "Time": wording.seconds_text(result.seconds["total"]),
-        "Seed": str(result.seed),
-    }
-    main = element(
-        "main",
-        element("h2", "Under other conditions"),
-        study_table(HEADS, replay_rows(result)),
-        element("p", note, class_="soft"),
-        join_html(element("h2", "Cost and conditions"), facts_table(facts)),
-        again(result.command_line),
-    )
-    header = heading(what, replay_text(result), result.warnings)
-    return document(f"{run.name}, replay", header, main, footer=f"run {run.name}. This page needs no other file.")
-
-
-# ---- parts ----------------------------------------------------------------------------------------------------------
 
 
 def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:

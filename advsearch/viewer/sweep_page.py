@@ -12,11 +12,14 @@ import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
+from advsearch.report.charts import NARROW, WIDE, study_chart
+from advsearch.report.distance import distance_axes, distance_of, distance_sentence
 from advsearch.report.drives import HEADS, drive_rows, drive_title
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.notebook import axis_cells
@@ -99,6 +102,7 @@ def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: S
         element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
         *left_out,
         *(_still(path, summary) for path, summary in summaries),
+        *(_distance(summary) for _, summary in summaries),
         *(_drives(path, summary) for path, summary in summaries),
         *(_surface(path, summary) for path, summary in summaries),
         *(join_html(_axes(summary), _cost(path, summary)) for path, summary in summaries),
@@ -217,6 +221,16 @@ def _drives(path: Path, summary: SweepSummary) -> Html:
         element("div", figure, class_="pictures") if figure else None,
         *(join_html(element("p", drive_title(one)), study_table(HEADS, drive_rows(one))) for one in summary.drives),
     )
+
+
+def _distance(summary: SweepSummary) -> Html:
+    """How far away the object is seen, where the sweep of a detector tells."""
+    found = distance_of(summary)
+    if found is None:
+        return Html("")
+    said = distance_sentence(found)
+    charts = [study_chart(partial(distance_axes, found), said, width) for width in (WIDE, NARROW)]
+    return join_html(element("h2", "How far away it is seen"), element("p", said), *charts)
 
 
 def _surface(path: Path, summary: SweepSummary) -> Html:

@@ -29,26 +29,32 @@ class EnvironmentFamily:
 
     Attributes:
         name: usable on the command line.
-        split: "train" when models may be trained under it, "heldout" when it is kept for testing.
+        split: "train" when models may be trained under it, "heldout" when it is kept for testing; "street" for streets,
+            which the reference model never sees.
         paint: maps unit directions (N, 3), z up, to linear radiance (N, 3).
         script: the file that makes it, within this repository.
         needs_mitsuba: whether making it runs Mitsuba.
+        height: rows of the map; it has twice as many columns.
+        ground: the kind of ground that belongs to it; None for the usual table.
     """
 
     name: str
-    split: Literal["train", "heldout"]
+    split: Literal["train", "heldout", "street"]
     paint: Callable[[Array], Array]
     script: str
     needs_mitsuba: bool = False
+    height: int = HEIGHT
+    ground: str | None = None
 
     def make(self) -> EnvironmentAsset:
-        """Return the (HEIGHT, WIDTH, 3) map at the common brightness, every value a half-precision number."""
-        fine = self.paint(directions(HEIGHT * SUPERSAMPLING, WIDTH * SUPERSAMPLING).reshape(-1, 3))
-        radiance = fine.reshape(HEIGHT, SUPERSAMPLING, WIDTH, SUPERSAMPLING, 3).mean(axis=(1, 3))
+        """Return the (height, 2 height, 3) map at the common brightness, every value a half-precision number."""
+        rows, columns = self.height, 2 * self.height
+        fine = self.paint(directions(rows * SUPERSAMPLING, columns * SUPERSAMPLING).reshape(-1, 3))
+        radiance = fine.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING, 3).mean(axis=(1, 3))
         scaled = radiance * (LEVEL / round(brightness(radiance), 6))
         coarse = np.ldexp(np.round(np.ldexp(scaled, 12)), -12)  # a step far above what machines disagree by
         half = np.minimum(coarse, 65000.0).astype(np.float16)
-        return EnvironmentAsset(self.name, half.astype(np.float32), source=self.script)
+        return EnvironmentAsset(self.name, half.astype(np.float32), source=self.script, ground=self.ground)
 
 
 def directions(height: int, width: int) -> Array:

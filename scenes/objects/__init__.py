@@ -1,15 +1,17 @@
-"""The bundled object classes: parametric families of household objects, written by hand in numpy."""
+"""The bundled object classes: parametric families of household objects, and things of the street, in numpy."""
 
 from __future__ import annotations
 
+from .cars import CAR
 from .family import Instance, ObjectFamily
 from .furniture import CHAIR, LAMP
 from .kitchen import FRYING_PAN, TEAPOT
+from .signs import STOP_SIGN
 from .things import BALL, BANANA, BOOK
 from .tools import DUMBBELL, HAMMER
 from .vessels import BOTTLE, BOWL, MUG, VASE, WINE_GLASS
 
-OBJECTS: dict[str, ObjectFamily] = {
+HOUSEHOLD: dict[str, ObjectFamily] = {
     family.name: family
     for family in (
         MUG,
@@ -28,5 +30,10 @@ OBJECTS: dict[str, ObjectFamily] = {
         DUMBBELL,
     )
 }
+"""What the reference model is trained on."""
 
-__all__ = ["OBJECTS", "Instance", "ObjectFamily"]
+STREET: dict[str, ObjectFamily] = {family.name: family for family in (CAR, STOP_SIGN)}
+
+OBJECTS: dict[str, ObjectFamily] = HOUSEHOLD | STREET
+
+__all__ = ["HOUSEHOLD", "OBJECTS", "STREET", "Instance", "ObjectFamily"]

@@ -18,7 +18,7 @@ from .curves import Array
 from .shapes import Patch
 from .textures import Paint, Texels
 
-SIZE = 256  # texels along the atlas
+SIZE = 256  # texels along the atlas, where a family says nothing else
 GUTTER = 2  # texels around each chart, on every side
 DECIMALS = 6  # coordinates are rounded to this: machines differ in the last bits of a sine
 
@@ -34,8 +34,8 @@ class Slot:
     turned: bool
 
 
-def _shelves(sizes: Sequence[tuple[float, float]], scale: float) -> list[Slot] | None:
-    """Pack rectangles on shelves, tallest first; None where they do not fit. `sizes` are (w, h) with w >= h."""
+def _shelves(sizes: Sequence[tuple[float, float]], scale: float, side: int) -> list[Slot] | None:
+    """Pack rectangles (w, h), w >= h, on shelves of a square, tallest first; None where they do not fit."""
     cells = [(int(np.ceil(w * scale)) + 2 * GUTTER, int(np.ceil(h * scale)) + 2 * GUTTER) for w, h in sizes]
     order = sorted(range(len(cells)), key=lambda i: (-cells[i][1], -cells[i][0], i))
     slots: list[Slot | None] = [None] * len(cells)
@@ -43,11 +43,11 @@ def _shelves(sizes: Sequence[tuple[float, float]], scale: float) -> list[Slot] |
     top = 0
     for i in order:
         width, height = cells[i]
-        if width > SIZE:
+        if width > side:
             return None
-        shelf = next((s for s in shelves if s[2] + width <= SIZE), None)
+        shelf = next((s for s in shelves if s[2] + width <= side), None)
         if shelf is None:
-            if top + height > SIZE:
+            if top + height > side:
                 return None
             shelf = [top, height, 0]
             shelves.append(shelf)
@@ -57,21 +57,21 @@ def _shelves(sizes: Sequence[tuple[float, float]], scale: float) -> list[Slot] |
     return [slot for slot in slots if slot is not None]
 
 
-def pack(sizes: Sequence[tuple[float, float]]) -> list[Slot]:
+def pack(sizes: Sequence[tuple[float, float]], side: int = SIZE) -> list[Slot]:
     """Return a slot for every chart of size (width, height), at the largest common scale that was found to fit."""
     exact = [(round(w, DECIMALS), round(h, DECIMALS)) for w, h in sizes]
     wide = [(max(s), min(s)) for s in exact]
-    low, high = 0.0, SIZE / max(w for w, _ in wide)
-    best = _shelves(wide, low)
+    low, high = 0.0, side / max(w for w, _ in wide)
+    best = _shelves(wide, low, side)
     for _ in range(12):
         middle = (low + high) / 2
-        slots = _shelves(wide, middle)
+        slots = _shelves(wide, middle, side)
         if slots is None:
             high = middle
         else:
             low, best = middle, slots
     if best is None:
-        raise ValueError(f"{len(sizes)} charts do not fit an atlas of {SIZE} texels; use fewer patches")
+        raise ValueError(f"{len(sizes)} charts do not fit an atlas of {side} texels; use fewer patches")
     return [Slot(slot.x, slot.y, slot.width, slot.height, h > w) for slot, (w, h) in zip(best, exact, strict=True)]
 
 
@@ -83,18 +83,20 @@ def _chart(slot: Slot) -> tuple[Array, Array]:
     return (b, 1.0 - a) if slot.turned else (a, b)
 
 
-def _in_atlas(slot: Slot, uvs: Array) -> Array:
+def _in_atlas(slot: Slot, uvs: Array, side: int) -> Array:
     """Atlas coordinates in [0, 1] of chart coordinates (V, 2)."""
     local = np.stack([1.0 - uvs[:, 1], uvs[:, 0]], axis=1) if slot.turned else uvs
     inner = np.array([slot.width - 2 * GUTTER, slot.height - 2 * GUTTER])
-    places: Array = (np.array([slot.x, slot.y]) + GUTTER + local * inner) / SIZE
+    places: Array = (np.array([slot.x, slot.y]) + GUTTER + local * inner) / side
     return places
 
 
-def painted(patches: Sequence[Patch], slots: Sequence[Slot], paints: Mapping[str, Paint]) -> npt.NDArray[np.float32]:
-    """Return the (SIZE, SIZE, 3) texture, display-referred sRGB, multiples of 1/255, row 0 at the top."""
-    image = np.zeros((SIZE, SIZE, 3))
-    used = np.zeros((SIZE, SIZE), dtype=bool)
+def painted(
+    patches: Sequence[Patch], slots: Sequence[Slot], paints: Mapping[str, Paint], side: int = SIZE
+) -> npt.NDArray[np.float32]:
+    """Return the (side, side, 3) texture, display-referred sRGB, multiples of 1/255, row 0 at the top."""
+    image = np.zeros((side, side, 3))
+    used = np.zeros((side, side), dtype=bool)
     for patch, slot in zip(patches, slots, strict=True):
         u, v = _chart(slot)
         colour = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
@@ -107,7 +109,7 @@ def painted(patches: Sequence[Patch], slots: Sequence[Slot], paints: Mapping[str
     return stored
 
 
-def joined(patches: Sequence[Patch], slots: Sequence[Slot]) -> Mesh:
+def joined(patches: Sequence[Patch], slots: Sequence[Slot], side: int = SIZE) -> Mesh:
     """Return one mesh, largest extent 1, standing on z = 0 and centred, every number rounded to `DECIMALS`."""
     starts = np.cumsum([0] + [len(p.vertices) for p in patches[:-1]])
     vertices = np.concatenate([p.vertices for p in patches])
@@ -115,7 +117,7 @@ def joined(patches: Sequence[Patch], slots: Sequence[Slot]) -> Mesh:
     origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     vertices = (vertices - origin) / float((high - low).max())
     normals = np.concatenate([p.normals for p in patches])
-    uvs = np.concatenate([_in_atlas(slot, p.uvs) for p, slot in zip(patches, slots, strict=True)])
+    uvs = np.concatenate([_in_atlas(slot, p.uvs, side) for p, slot in zip(patches, slots, strict=True)])
     faces = np.concatenate([p.faces + start for p, start in zip(patches, starts, strict=True)])
     used = np.unique(faces)  # poles leave vertices behind that no triangle needs
     renumbered = np.searchsorted(used, faces).astype(np.uint32)

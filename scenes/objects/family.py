@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from advsearch.scene.assets import Material, ObjectAsset
+from advsearch.scene.finishes import finished
 
-from .atlas import joined, pack, painted
+from .atlas import SIZE, joined, pack, painted
 from .draw import Draw
 from .shapes import Patch
 from .textures import Paint
@@ -24,12 +26,14 @@ class Instance:
         paints: a paint for every tag of the patches.
         material: the other surface parameters.
         detail: texels along an edge relative to the rest of the object, by tag, for parts that are hardly seen.
+        finishes: of an object of several materials, what each tag is like; its tags are then names of materials.
     """
 
     patches: Sequence[Patch]
     paints: Mapping[str, Paint]
     material: Material
     detail: Mapping[str, float] = field(default_factory=dict)
+    finishes: Mapping[str, Material] = field(default_factory=dict)
 
     def charts(self) -> list[tuple[float, float]]:
         """Return the width and height that every patch asks of the atlas."""
@@ -46,10 +50,14 @@ class ObjectFamily:
     Attributes:
         name: the class, usable on the command line.
         make: builds an instance from a `Draw`.
+        metres: of what has its real size, the unit in which it is made; None leaves its size open.
+        texels: along each side of its texture.
     """
 
     name: str
     make: Callable[[Draw], Instance]
+    metres: float | None = None
+    texels: int = SIZE
 
     @property
     def label(self) -> str:
@@ -67,15 +75,31 @@ class ObjectFamily:
         The mesh has largest extent 1 and rests on z = 0. The same state of the generator gives the same asset.
         """
         instance = self.make(Draw(rng))
-        slots = pack(instance.charts())
+        if instance.finishes:  # the faces of a material in one row
+            tags = list(dict.fromkeys(one.tag for one in instance.patches))
+            instance = replace(instance, patches=sorted(instance.patches, key=lambda one: tags.index(one.tag)))
+        slots = pack(instance.charts(), self.texels)
+        mesh = joined(instance.patches, slots, self.texels)
+        if instance.finishes:
+            mesh = replace(mesh, materials=_by_tag(instance.patches))
+        extent = np.ptp(np.concatenate([one.vertices for one in instance.patches]), axis=0).max()
         return ObjectAsset(
             name=self.name,
-            mesh=joined(instance.patches, slots),
-            base_color=painted(instance.patches, slots, instance.paints),
+            mesh=mesh,
+            base_color=painted(instance.patches, slots, instance.paints, self.texels),
             material=instance.material,
             label=self.label,
             source=self.script,
+            surface=finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
+            finishes=instance.finishes,
+            metres=None if self.metres is None else round(float(extent) * self.metres, 4),
         )
+
+
+def _by_tag(patches: Sequence[Patch]) -> dict[str, npt.NDArray[np.int64]]:
+    """The faces of each tag, as `joined` numbers them."""
+    tags = np.repeat([one.tag for one in patches], [len(one.faces) for one in patches])
+    return {str(tag): np.nonzero(tags == tag)[0] for tag in dict.fromkeys(tags)}
 
 
 def finish(

@@ -56,6 +56,12 @@ def placed(
     ]
 
 
+def stretched(patches: Iterable[Patch], factors: Sequence[float] | Array) -> list[Patch]:
+    """Stretch patches along x, y and z by three factors. What is painted on them stretches along."""
+    by = np.asarray(factors, dtype=np.float64)
+    return [replace(p, vertices=p.vertices * by, normals=unit(p.normals / by)) for p in patches]
+
+
 # ------------------------------------------------------------------------------------------------ grid patches
 
 

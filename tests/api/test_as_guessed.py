@@ -29,9 +29,9 @@ from advsearch.engine.run_settings import given_to
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import NullProgress
+from advsearch.questions.region.answer import RegionResult
 from advsearch.report.tables import GapTable
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.region import RegionResult
 from advsearch.watching import BarProgress, LineProgress, NotebookProgress, watched
 
 SIDE = 16

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.api import attack as attacking
 from advsearch.cli.main import main
-from advsearch.config import CONFIGS, AttackConfig, RegionConfig, SweepConfig
+from advsearch.config import CONFIGS, AttackConfig, SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.pose import PoseControl
@@ -34,6 +34,7 @@ from advsearch.controls.texture import TextureControl
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
+from advsearch.questions.region.settings import RegionConfig
 from advsearch.report.wording import objective_text
 from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
@@ -308,7 +309,7 @@ def test_instances_and_names_go_together_in_every_question(
         seen.append(problem)
         raise ZeroDivisionError
 
-    monkeypatch.setattr("advsearch.api.plan._Measurements", planned)
+    monkeypatch.setattr("advsearch.questions.plan.carry_out._Measurements", planned)
     with pytest.raises(ZeroDivisionError):
         advsearch.plan("mug", controls=mixed, run=tmp_path / "plan", **small)
     assert [bound.name for bound in seen[0].space.controls] == ["faded", "pose"]

@@ -17,13 +17,14 @@ from samples import attack as attacked
 import advsearch
 from advsearch.api import carry_out
 from advsearch.api import gap as studies
-from advsearch.api import region as mapping
 from advsearch.cli.gap import answer
 from advsearch.cli.main import main
-from advsearch.cli.region import answer as region_text
-from advsearch.config import AttackConfig, GapConfig, RegionConfig
+from advsearch.cli.output import shown_text as region_text
+from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.region import carry_out as mapping
+from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results.attack import AttackSummary
@@ -143,7 +144,7 @@ SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "denoise": "none"}
 
 
 def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.attacks.region.MOST_PROBED", 20)
+    monkeypatch.setattr("advsearch.questions.region.growing.MOST_PROBED", 20)
     config = RegionConfig(
         **SMALL, controls={"pose": {"yaw": [10, 50], "pitch": 0, "roll": 0, "x": 0, "z": 0}, "camera.elevation": {}},
         vary="pose.yaw,camera.elevation", samples=8, map=2, verify_spp=2, run=str(tmp_path / "run"),
@@ -179,7 +180,7 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
     )
     assert main(flags.split()) == 130
     said = capsys.readouterr().out
-    assert said.startswith("Stopped before the box was known.") and "renders   1\n" in said
+    assert said.startswith("Stopped before the box was known.") and "renders       1\n" in said
     assert said.endswith(f"Go on with: advsearch resume {folder}\n")
     assert main(["show", str(folder)]) == 0 and capsys.readouterr().out == said
     assert not finished(folder) and listed_runs(tmp_path)[0].state == "stopped"

@@ -11,7 +11,8 @@ import pytest
 from advsearch.bundled import build
 from advsearch.bundled.environments import ENVIRONMENTS
 from advsearch.bundled.environments.panorama import HEIGHT, LEVEL, WIDTH, brightness, directions, irradiance
-from advsearch.bundled.objects import OBJECTS
+from advsearch.bundled.objects import HOUSEHOLD, OBJECTS, STREET
+from advsearch.bundled.objects.carving import carved
 from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.shapes import grid
 from advsearch.errors import UnknownNameError
@@ -57,8 +58,9 @@ def charts(mesh: Mesh) -> np.ndarray:
 
 
 def test_every_class_of_the_library_is_registered() -> None:
-    assert set(OBJECTS) == CLASSES
-    assert {family.label for family in OBJECTS.values()} == {name.replace("-", " ") for name in CLASSES}
+    assert set(HOUSEHOLD) == CLASSES
+    assert set(STREET) == {"car", "stop-sign"}
+    assert {family.label for family in HOUSEHOLD.values()} == {name.replace("-", " ") for name in CLASSES}
 
 
 @pytest.mark.parametrize(("name", "seed"), INSTANCES)
@@ -66,7 +68,7 @@ def test_a_mesh_is_sound(name: str, seed: int | None) -> None:
     asset = instance(name, seed)
     mesh = asset.mesh
     assert asset.label == name.replace("-", " ")
-    assert 500 < len(mesh.faces) < 12000
+    assert 500 < len(mesh.faces) < (22000 if name == "car" else 12000)
     assert all(np.isfinite(a).all() for a in (mesh.vertices, mesh.normals, mesh.uvs, asset.base_color))
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
     assert len(np.unique(mesh.faces)) == len(mesh.vertices), "vertices that no triangle uses"
@@ -95,7 +97,7 @@ def test_charts_lie_apart_in_the_atlas(name: str, seed: int | None) -> None:
     assert (area > 0.0).all(), "a chart is mirrored or folded"
     assert 0.3 < area.sum() < 1.0, "much of the atlas is empty, or charts overlap"
 
-    texels = 128  # half of the canonical size: charts must stay apart there too
+    texels = OBJECTS[name].texels // 2  # half of the canonical size: charts must stay apart there too
     count = np.ceil(4 * area * texels**2).astype(np.int64) + 3
     face = np.repeat(np.arange(len(uv)), count)
     rng = np.random.default_rng(0)
@@ -146,23 +148,57 @@ def test_a_grid_patch_faces_outwards_and_maps_charts_to_points() -> None:
     )
 
 
+def test_carving_splits_a_surface_along_a_curve() -> None:
+    at = np.linspace(0.0, 1.0, 9)
+    points = np.stack([*np.meshgrid(at, at), np.zeros((9, 9))], axis=-1)
+    whole = grid("x", points, np.broadcast_to([0.0, 0.0, 1.0], points.shape), (1.0, 1.0), at, at)
+    rest, disc = carved([whole], lambda p: 0.3 - np.hypot(p[:, 0] - 0.5, p[:, 1] - 0.5), "disc")
+    areas = {}
+    for part in (rest, disc):
+        a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+        areas[part.tag] = float(np.cross(b - a, c - a)[:, 2].sum() / 2)
+        assert (np.cross(b - a, c - a)[:, 2] > 0.0).all()
+    assert areas["disc"] == pytest.approx(np.pi * 0.09, rel=0.05)
+    assert areas["disc"] + areas["x"] == pytest.approx(1.0)
+    assert disc.size == pytest.approx((0.6, 0.6), abs=0.01)
+    used = np.unique(disc.faces)
+    found = disc.rest(disc.uvs[used, 0], disc.uvs[used, 1])
+    np.testing.assert_allclose(found, disc.vertices[used], atol=1e-9)
+    (left,) = carved([whole], lambda p: 0.3 - p[:, 0], None)
+    assert left.vertices[np.unique(left.faces)][:, 0].min() == pytest.approx(0.3)
+
+
+def test_things_of_the_street_have_their_size_and_several_materials() -> None:
+    car = library.load_object("car")
+    assert car.metres == pytest.approx(4.3, abs=0.05)
+    extent = np.ptp(car.mesh.vertices, axis=0) * car.metres
+    assert 1.7 < extent[1] < 2.2  # with its mirrors
+    assert 1.4 < extent[2] < 1.55
+    assert set(car.finishes) == set(car.mesh.materials)
+    assert sum(map(len, car.mesh.materials.values())) == len(car.mesh.faces)
+    assert 1.0 < (library.load_object("stop-sign").metres or 0.0) < 1.3
+    assert library.load_object("mug").metres is None
+
+
 # ----------------------------------------------------------------------------------------------- environments
 
 
 def test_half_of_the_environments_are_held_out() -> None:
+    streets = {name for name, family in ENVIRONMENTS.items() if family.split == "street"}
+    assert streets == {"street", "street-wet", "street-dusk"} == set(library.list_environments("street"))
     splits = [family.split for family in ENVIRONMENTS.values()]
     assert splits.count("train") == splits.count("heldout") >= 4
     assert ENVIRONMENTS["studio"].split == ENVIRONMENTS["noon"].split == "train"
     assert ENVIRONMENTS["low-sun"].split == "heldout"
     halves = library.list_environments("train"), library.list_environments("heldout")
-    assert sorted(halves[0] + halves[1]) == sorted(ENVIRONMENTS) == list(library.list_environments())
+    assert sorted((*halves[0], *halves[1], *streets)) == sorted(ENVIRONMENTS) == list(library.list_environments())
     assert all(ENVIRONMENTS[name].split == "train" for name in halves[0])
 
 
 @pytest.mark.parametrize("name", sorted(ENVIRONMENTS))
 def test_a_shipped_environment_is_light_of_the_common_brightness(name: str) -> None:
     radiance = library.load_environment(name).radiance
-    assert radiance.shape == (HEIGHT, WIDTH, 3)
+    assert radiance.shape == ((320, 640, 3) if name.startswith("street") else (HEIGHT, WIDTH, 3))
     assert radiance.dtype == np.float32
     assert np.isfinite(radiance).all()
     assert radiance.min() >= 0.0
@@ -205,7 +241,7 @@ def test_the_check_command_names_a_file_that_differs(
 
 
 def test_the_data_is_small() -> None:
-    assert sum(p.stat().st_size for p in build.DATA.rglob("*")) < 8 * 2**20
+    assert sum(p.stat().st_size for p in build.DATA.rglob("*")) < 10 * 2**20
 
 
 @pytest.mark.parametrize("name", sorted(OBJECTS))
@@ -217,6 +253,9 @@ def test_the_library_loads_the_canonical_instance(name: str) -> None:
         np.testing.assert_array_equal(loaded, expected)
     np.testing.assert_array_equal(asset.base_color, made.base_color)
     assert (asset.name, asset.label, asset.material) == (name, made.label, made.material)
+    assert (asset.finishes, asset.metres) == (made.finishes, made.metres)
+    assert asset.mesh.materials.keys() == made.mesh.materials.keys()
+    assert all((faces == made.mesh.materials[one]).all() for one, faces in asset.mesh.materials.items())
     assert asset.base_color.dtype == np.float32
 
 

@@ -33,11 +33,12 @@ from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import aligned, finish
 from advsearch.cli.progress import watch_progress
-from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
+from advsearch.config import AttackConfig, GapConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
+from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.parameters import Parameter
@@ -325,7 +326,7 @@ def test_attack_builds_its_configuration_from_flags(asked: list[AttackConfig]) -
     argv = (
         "attack --object mug.obj --up y --environment room.hdr --model net.pt2 --labels l.json --label cup --norm l2"
         " --control texture,pose --control light --set camera.azimuth=130 --set a.b=[0,1] --epsilon 0.1 --exposure -1"
-        " --texture-resolution 64 --policy random --steps 3 --step-size 0.5 --objective margin --spp 4 --verify-spp 32"
+        " --texture-resolution 64 --policy random --steps 3 --objective margin --spp 4 --verify-spp 32"
         " --trials 7 --denoise none --resolution 64x96 --no-baseline --seed 9 --threads 1 --run x --overwrite"
         " --deterministic --quiet"
     )
@@ -335,7 +336,7 @@ def test_attack_builds_its_configuration_from_flags(asked: list[AttackConfig]) -
             object="mug.obj", up="y", environment="room.hdr", model="net.pt2", labels="l.json", label="cup",
             controls={"texture": {}, "pose": {}, "light": {}, "patch": {"size": 0.3}},
             set_={"camera.azimuth": 130, "a.b": [0, 1]}, epsilon=0.1, norm="l2", texture_resolution=64, policy="random",
-            steps=3, step_size=0.5, objective="margin", spp=4, verify_spp=32, trials=7, denoise="none",
+            steps=3, objective="margin", spp=4, verify_spp=32, trials=7, denoise="none",
             resolution=(64, 96), exposure=-1, baseline=False, seed=9, threads=1, run="x", overwrite=True,
             deterministic=True,
         )
@@ -488,12 +489,16 @@ def test_region_builds_its_configuration_and_prints_the_box(
     ]
     assert capsys.readouterr().out == (
         "The model is wrong in 200 of 200 fresh samples of this box: with 95 % confidence in at least 98.2 % of it.\n\n"
+        "The box\n"
         "  parameter   from   to     centre   unit\n"
         "  pose.yaw    10     55.5   30       degrees\n\n"
         "  share of the space   12 %\n"
+        "  samples a pixel      64\n"
+        "  environment          studio\n"
         "  renders              300\n"
         "  time                 9.0 s\n"
-        "  run                  runs/mug-pose-002\n"
+        "  seed                 0\n"
+        "  page                 runs/mug-pose-002/report.html\n"
     )
 
 
@@ -771,7 +776,7 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> None:
     put("advsearch.controls", CONTROLS={"camera": Camera()})
     put("advsearch.attacks", POLICIES={"pgd": Pgd})
     put("advsearch.tasks", TASKS={"classification": Pgd})
-    put("advsearch.recipes.description", titles=lambda: {"backgrounds": "Which are hard?"})
+    put("advsearch.questions.recipe.description", titles=lambda: {"backgrounds": "Which are hard?"})
     put("advsearch.attacks.objectives", objective_summaries=lambda: {"margin": "Largest wrong logit."})
 
 

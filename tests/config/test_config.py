@@ -18,21 +18,14 @@ from hypothesis import strategies as st
 
 from advsearch.cli import flags
 from advsearch.cli.main import main
-from advsearch.config import (
-    CONFIGS,
-    QUANTITIES,
-    AttackConfig,
-    CheckConfig,
-    GapConfig,
-    PrecisionConfig,
-    RegionConfig,
-    RenderConfig,
-    StabilityConfig,
-    SweepConfig,
-)
+from advsearch.config import CONFIGS, AttackConfig, GapConfig, RenderConfig, SweepConfig
 from advsearch.config.attack import TRIALS, TRIALS_OVER
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.questions.check.settings import CheckConfig
+from advsearch.questions.precision.settings import QUANTITIES, PrecisionConfig
+from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config, Setting, all_finite, parse_assignment, read_yaml, settings
 
@@ -77,7 +70,6 @@ WRONG: dict[str, tuple[Any, str]] = {
     "measure": ("some", "expected no, quick or full, got some"),
     "policy": (None, "expected the name of a policy, or NAME={OPTION: VALUE}, got None"),
     "steps": (2.5, "expected a whole number from 1 to 1000000, got 2.5"),
-    "step_size": (0.0, "expected a number greater than 0 and at most 2, got 0.0"),
     "objective": ({}, "expected the name of an objective, got {}"),
     "spp": ("many", "expected a whole number from 1 to 65536, or auto, got many"),
     "denoise": (False, "expected oidn or none, got False"),
@@ -110,7 +102,7 @@ GIVEN: dict[str, Any] = {
     "norm": "l2", "texture_resolution": 64,
     "estimator": {"pose": "differences", "*": "adjoint"}, "measure": "no",
     "policy": {"name": "pgd", "momentum": 0.9},
-    "steps": 3, "step_size": 0.5, "objective": "cross_entropy", "spp": 4, "denoise": "none",
+    "steps": 3, "objective": "cross_entropy", "spp": 4, "denoise": "none",
     "pixel_sampler": "independent",
     "specialise": False,
     "baseline": False, "verify_spp": 32, "trials": 7, "seed": 9, "threads": 1, "deterministic": True, "run": "x/y",
@@ -312,7 +304,6 @@ def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> No
             "--epsilon: expected a number greater than 0 and at most 1e+06, got texture={a: 1}",
         ),
         ("--seconds 1e308", "--seconds: expected a number greater than 0 and at most 1e9, got 1e308"),
-        ("--step-size 1e308", "--step-size: expected a number greater than 0 and at most 2, got 1e308"),
         ("--control pose --control pose", "--control: pose is given twice; leave one of them out"),
         ("--control texture,texture", "--control: texture is given twice; leave one of them out"),
         ("--over camera --over 'camera={fov: 30}'", "--over: camera is given twice; leave one of them out"),

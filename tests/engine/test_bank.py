@@ -17,6 +17,7 @@ from advsearch.engine import bank, transport
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.bank import Bank, stratified
 from advsearch.errors import ClusterError
+from advsearch.scene.surface import plan
 
 SMALL: dict[str, Any] = {
     "resolution": 48,
@@ -51,6 +52,13 @@ def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
         monkeypatch.setattr(bank, name, value)
     monkeypatch.setattr(transport, "CHANGE_SPP", 4)
+    monkeypatch.setattr(plan, "why_not", lambda renderer, varying: "matrices are tested")
+
+
+@pytest.fixture(autouse=True)
+def by_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nothing be predicted by light on surfaces."""
+    monkeypatch.setattr(plan, "why_not", lambda renderer, varying: "matrices are tested")
 
 
 @pytest.fixture

@@ -14,9 +14,7 @@ from torch import Tensor
 
 from advsearch import load_scene
 from advsearch.api.attack import problem_from_config
-from advsearch.api.check import attempts, check_from_config
-from advsearch.cli.check import check_table
-from advsearch.config import AttackConfig, CheckConfig
+from advsearch.config import AttackConfig
 from advsearch.controls import make_control
 from advsearch.engine.gradients import (
     Estimate,
@@ -24,16 +22,18 @@ from advsearch.engine.gradients import (
     Reference,
     estimated,
     inside,
+    judge,
     probes,
     reference,
-    scale_of,
     smooth_loss,
-    verdict,
 )
 from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.runs.results.check import WHOLE, DerivativeRow, DirectionRow
-from advsearch.runs.results.plan import CosineRow
+from advsearch.questions.check.answer import WHOLE, DerivativeRow, DirectionRow
+from advsearch.questions.check.carry_out import attempts, check_from_config
+from advsearch.questions.check.settings import CheckConfig
+from advsearch.questions.check.words import shown
+from advsearch.runs.results.derivatives import CosineRow
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import ESTIMATORS, SEARCH_STEP, first_plan
@@ -290,17 +290,27 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
 # ---- judging --------------------------------------------------------------------------------------------------------
 
 
-def test_a_verdict_needs_more_than_noise() -> None:
+def test_a_judgement_needs_more_than_noise() -> None:
     sure = Reference(1.0, 0.001, (1.0, 1.0), 8)
-    assert verdict(Estimate("x", 1.01, 0.05, 9, 1.0), sure, 1.0)[0] == "ok"
-    assert verdict(Estimate("x", 1.2, 0.05, 9, 1.0), sure, 1.0)[0] == "biased"
-    assert verdict(Estimate("x", -1.0, 0.05, 9, 1.0), sure, 1.0) == ("biased", 2.0)
-    assert verdict(Estimate("x", 1.0, 0.5, 9, 1.0), sure, 1.0)[0] == "noisy"
+    assert judge(Estimate("x", 1.01, 0.05, 9, 1.0), sure).status == "ok"
+    assert judge(Estimate("x", 1.2, 0.05, 9, 1.0), sure).status == "biased"
+    turned = judge(Estimate("x", -1.0, 0.06, 9, 1.0), sure)
+    assert (turned.status, turned.error, turned.noise) == ("biased", 2.0, 0.06)
+    assert turned.doubt == pytest.approx(0.05, rel=1e-2)
+    assert turned.excess == 2.0 - turned.doubt
+    assert judge(Estimate("x", 1.0, 0.5, 9, 1.0), sure).status == "noisy"
     unsure = Reference(0.1, 0.5, (0.6, 0.1), 8)
-    assert verdict(Estimate("x", 0.4, 0.1, 9, 1.0), unsure, 0.1)[0] == "reference unusable"
-    large = Reference(5.0, 0.01, (5.0, 5.0), 8)
-    assert scale_of(sure, [sure, large]) == 1.0
-    assert scale_of(Reference(0.01, 0.0, (0.01, 0.01), 8), [sure, large]) == 0.5
+    assert judge(Estimate("x", 0.4, 0.1, 9, 1.0), unsure).status == "reference unusable"
+    assert judge(Estimate("x", 0.0, 0.0, 9, 1.0), Reference(0.0, 0.0, (0.0, 0.0), 8)).error == 0.0
+
+
+def test_a_derivative_near_zero_is_judged_beside_the_others_of_its_control() -> None:
+    small, large = Reference(0.01, 0.0, (0.01, 0.01), 8), Reference(5.0, 0.01, (5.0, 5.0), 8)
+    off = Estimate("x", 0.03, 0.0, 9, 1.0)
+    alone, beside = judge(off, small), judge(off, small, [small, large])
+    assert (alone.status, beside.status) == ("biased", "ok")
+    assert [alone.error, beside.error] == pytest.approx([2.0, 0.04])
+    assert judge(off, large, [small, large]).error == judge(off, large).error
 
 
 def test_a_reference_of_a_parabola_has_its_bias_taken_off() -> None:
@@ -623,7 +633,8 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
 
 def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> None:
     config = CheckConfig(controls={"background": {}}, resolution=(24, 24), spp=4, run=str(tmp_path / "run"))
-    rows = check_from_config(config).rows
+    check = check_from_config(config)
+    rows = check.rows
     linear = [row for row in rows if row.loss == "linear"]
     assert {row.parameter for row in linear} >= {"hue", "saturation", "value"}
     for row in linear:
@@ -643,5 +654,5 @@ def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> N
             and math.isfinite(row.gradient)
         )
         assert row.status in ("ok", "noisy", "biased", "reference unusable")
-    text = check_table(rows)
-    assert "smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text
+    text = " ".join(one.title for one in shown(check).sections if not one.empty)
+    assert "Smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

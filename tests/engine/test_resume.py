@@ -22,12 +22,15 @@ from covering import only
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
-from advsearch.config import AttackConfig, CheckConfig, PlanConfig, StabilityConfig
+from advsearch.config import AttackConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.record import Stages
 from advsearch.engine.sharing import Shared
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
+from advsearch.questions.check.settings import CheckConfig
+from advsearch.questions.plan.settings import PlanConfig
+from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.runs import database
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import can_resume

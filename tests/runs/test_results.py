@@ -6,9 +6,9 @@ import json
 import math
 from typing import ClassVar
 
-from advsearch.cli.plan import answer as plan_text
+from advsearch.cli.output import shown_text as plan_text
+from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, PlanResult
 from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result
-from advsearch.runs.results.plan import DenoiserAdvice, EstimatorLimit, PlanResult
 
 
 class Inner(Fields):
@@ -55,4 +55,4 @@ def test_limits_of_a_plan_are_sentences() -> None:
             "limits": [limit],
         }
     )
-    assert "limits of the material form:\n  a mirror's reflections stay\n" in plan_text(plan)
+    assert "Limits of the material form\na mirror's reflections stay\n" in plan_text(plan)

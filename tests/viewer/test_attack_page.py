@@ -550,7 +550,7 @@ def test_the_page_says_how_the_search_worked(tmp_path: Path) -> None:
     text = page_of(make_run(tmp_path / "run", attack(**METHOD))).text
     for said in (
         "The search's claim margin 4.5 in the render that won, 3.25 when rendered again",
-        "Sample count 64 a pixel in the verification; that the margin stands still there is not shown",
+        "Sample count 64 a pixel in the verification; that more would not change it is not shown",
         "Light transport a matrix predicted 37 pictures; at the last comparison with a traced one it was off by 0.812 "
         "of 255 levels of the picture's change (root mean square) and an unknown amount of the objective; made anew 1 "
         "time; it and the comparisons took 2.0 s",

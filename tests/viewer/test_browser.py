@@ -23,14 +23,14 @@ from stored_sweeps import described, make_sweep, serving
 
 from advsearch.api.photos import Photographs
 from advsearch.config import AttackConfig
+from advsearch.questions.explain.answer import ExplainResult
+from advsearch.questions.harden.answer import HardenResult
+from advsearch.questions.recipe.answer import RecipeResult
+from advsearch.questions.replay.answer import ReplayResult
+from advsearch.questions.stability.answer import StabilityResult
 from advsearch.report.phrases import answer_text, percent_number
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.explain import ExplainResult
-from advsearch.runs.results.harden import HardenResult
-from advsearch.runs.results.recipe import RecipeResult
-from advsearch.runs.results.replay import ReplayResult
-from advsearch.runs.results.stability import StabilityResult
 from advsearch.runs.store import Row, Store, Told
 from advsearch.tasks import Answer
 from advsearch.viewer import thumbnails

@@ -13,12 +13,13 @@ from stored_sweeps import serving
 
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
+from advsearch.questions.recipe.answer import RecipeResult
+from advsearch.questions.stability.answer import StabilityResult
+from advsearch.report.shown import fields_shown
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.gap import StudyResult
-from advsearch.runs.results.recipe import RecipeResult
-from advsearch.runs.results.stability import StabilityResult
-from advsearch.viewer.pages import write_page
+from advsearch.viewer.pages import shown_page, write_page
 from advsearch.viewer.study_page import heading
 
 ACCURACIES = ((0.01, 7), (0.03, 4), (0.1, 1))
@@ -103,7 +104,8 @@ def test_a_recipe_leads_to_its_runs(tmp_path: Path) -> None:
 
 
 def test_only_words_that_are_shown_are_explained(tmp_path: Path) -> None:
-    page = write_page(tmp_path, StabilityResult.of(STABILITY)).read_text()
+    result = StabilityResult.of(STABILITY)
+    page = shown_page(tmp_path, result, fields_shown(result))
     meanings = page[page.index("What these words mean") :]
     assert "every picture and gradient was finite" in meanings
     assert "cases that were not begun" not in meanings
@@ -119,16 +121,14 @@ def test_an_attack_without_a_page_has_no_link(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("result", "said"),
     [
-        (StabilityResult.of(STABILITY), ["1 of 1 hold.", "ties objective", "condition number 12.5", "0.0125"]),
+        (StabilityResult.of(STABILITY), ["1 of 1 cases hold", "ties", "condition number"]),
         (
             region(warnings=["Look out."]),
             [
-                "Wrong in 200 of 200 samples of the box.",
-                "128 x 128 pixels",
-                "pose.yaw degrees 10 55.5 30",
-                "0.982 to 1",
+                "wrong in 200 of 200 fresh samples",
+                "pose.yaw 10 55.5 30 degrees",
                 "Look out.",
-                "Volume share of the ranges that the box takes up",
+                "Share of the space",
             ],
         ),
     ],

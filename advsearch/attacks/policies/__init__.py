@@ -13,7 +13,6 @@ from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_se
 from advsearch.attacks.policies.choices import Choices, with_choices
 from advsearch.attacks.policies.cmaes import CMAES
 from advsearch.attacks.policies.grid import Grid
-from advsearch.attacks.policies.halving import Halving
 from advsearch.attacks.policies.mixture import Mixture
 from advsearch.attacks.policies.nes import NES
 from advsearch.attacks.policies.pgd import PGD
@@ -40,7 +39,6 @@ POLICIES: Registry[type[Policy[Any]]] = Registry(
         "auto": Auto,
         "cmaes": CMAES,
         "grid": Grid,
-        "halving": Halving,
         "mixture": Mixture,
         "nes": NES,
         "pgd": PGD,
@@ -74,7 +72,7 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
         raise UnknownNameError("policy", name, POLICIES)
     policy = POLICIES[name]
     check_options("policy", name, policy, options)
-    if options.get("policy") is not None:
+    if "policy" in options:
         options["policy"] = _nested(options["policy"], f"policy of {name}")
     if "policies" in options:
         given = options["policies"]
@@ -105,7 +103,6 @@ __all__ = [
     "Choices",
     "Evaluated",
     "Grid",
-    "Halving",
     "MapElites",
     "Mixture",
     "Policy",

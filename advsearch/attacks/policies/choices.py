@@ -17,9 +17,6 @@ from advsearch.attacks.policies.base import Counts, Evaluated, Policy, Proposal,
 from advsearch.attacks.policies.racing import Race
 from advsearch.attacks.policies.stay import Stay
 
-ETA = 2
-"""After each round, one of so many combinations goes on."""
-
 MOST = 256
 """No more combinations than this take part."""
 
@@ -50,9 +47,9 @@ class ChoicesState:
 class Choices(Policy[ChoicesState]):
     """Searches combinations of options outside and, with another policy, the numbers inside.
 
-    Every combination of options has a search of its own over the numbers, and the combinations race: see `racing`, with
-    one of two left behind after each round, by the largest objective reached. If there are more combinations than can
-    have a whole evaluation in every round, a random choice of them takes part, the start's among them always.
+    Every combination of options has a search of its own over the numbers, and the combinations race: see `racing`. If
+    there are more combinations than can have a whole evaluation in every round, a random choice of them takes part, the
+    start's among them always.
 
     `search` puts this around every policy whose `handles_choices` is false, a user's own included.
 
@@ -78,10 +75,10 @@ class Choices(Policy[ChoicesState]):
         each = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
         counts = [block.options for block in domain.blocks if block.options]
         limit = min(MOST, math.prod(counts), max(2, MOST_NUMBERS // domain.dim))
-        most = racing.most_runners(steps, ETA, each, limit)
+        most = racing.most_runners(steps, each, limit)
         combinations = _combinations(counts, domain.begin[choices], most, seeded(seed, 0))
         search = (policy, _EMPTY if inner is None else inner)
-        race = racing.line_up([search] * len(combinations), steps, seed, eta=ETA)
+        race = racing.line_up([search] * len(combinations), steps, seed)
         return ChoicesState(domain, numbers, choices, combinations, race)
 
     def propose(self, state: ChoicesState, n: int) -> tuple[tuple[Proposal, ...], ChoicesState]:

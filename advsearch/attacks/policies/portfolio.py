@@ -63,4 +63,4 @@ class Portfolio(Raced):
                 searches.append((whole, domain))
         if not searches:
             raise errors[0]
-        return racing.line_up(searches, steps, seed, eta=2)
+        return racing.line_up(searches, steps, seed)

@@ -1,11 +1,11 @@
-"""Successive halving between searches: what the wrappers share. Each round, those that reached less are left behind.
+"""Successive halving between searches: what the wrappers share. After each round the better half goes on.
 
 Rounds get equal shares of the renders, and within a round every search that is still in gets an equal share. They take
 turns, step by step: next comes whoever has most of its share left, so that steps of different searches, which do not
-wait for each other, can be evaluated together. After a round the best 1 / eta of them go on. With n searches there are
-1 + ceil(log_eta n) rounds, the last for one alone, so it gets many times the renders of those that fell first (Karnin,
-Koren and Somekh 2013, "Almost optimal exploration in multi-armed bandits"; Jamieson and Talwalkar 2016). With eta = 1
-there is one round: all get the same. What is left of the renders after the last round is for the best.
+wait for each other, can be evaluated together. After a round the half that has reached more goes on. With n searches
+there are 1 + ceil(log2 n) rounds, the last for one alone, so it gets many times the renders of those that fell first
+(Karnin, Koren and Somekh 2013, "Almost optimal exploration in multi-armed bandits"; Jamieson and Talwalkar 2016). With
+one round for all, each gets the same. What is left of the renders after the last round is for the best.
 
 A share counts what a proposal may cost, so that the order does not depend on how many are evaluated at once; where one
 costs less, the rounds to come get what is left.
@@ -25,9 +25,6 @@ from advsearch.attacks.domain import Domain
 from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Evaluated, Policy, Proposal, affordable, seeded
 
-MOST_SAMPLES = 64
-"""No evaluation has more than this many times the search's samples for the sake of the round."""
-
 
 @dataclass(frozen=True, eq=False)
 class Runner:
@@ -38,7 +35,6 @@ class Runner:
         state: the policy's.
         left: renders left of its share of this round.
         best: the largest objective it has met.
-        lately: the largest in this round.
         over: whether it has nothing more to propose.
     """
 
@@ -47,7 +43,6 @@ class Runner:
     state: Any
     left: int = 0
     best: float = -math.inf
-    lately: float = -math.inf
     over: bool = False
 
 
@@ -58,10 +53,7 @@ class Race:
     Attributes:
         runners: all searches.
         steps: renders in all.
-        eta: one of so many goes on after a round.
         rounds: how many there are.
-        fresh: whether a round's order rests on its own evaluations alone.
-        growth: by how much the samples of every proposal grow from round to round.
         field: numbers of those that are in this round, the best first.
         round: number of this one, from 0.
         spent: renders that the evaluations so far took.
@@ -70,58 +62,41 @@ class Race:
 
     runners: tuple[Runner, ...]
     steps: int
-    eta: int
     rounds: int
-    fresh: bool = False
-    growth: int = 1
     field: tuple[int, ...] = ()
     round: int = 0
     spent: int = 0
     asked: tuple[int, ...] = ()
 
-    @property
-    def samples(self) -> int:
-        """What a proposal's samples are multiplied with in this round."""
-        return _samples(self.growth, self.round)
+
+def count_rounds(runners: int) -> int:
+    """Return how many rounds a race has: 1 + ceil(log2 runners)."""
+    return 1 + (runners - 1).bit_length()
 
 
-def count_rounds(runners: int, eta: int) -> int:
-    """Return how many rounds a race has: 1 + ceil(log_eta runners), one for eta = 1."""
-    rounds = 1
-    while eta > 1 and runners > 1:
-        runners, rounds = -(-runners // eta), rounds + 1
-    return rounds
-
-
-def most_runners(steps: int, eta: int, each: int, limit: int) -> int:
+def most_runners(steps: int, each: int, limit: int) -> int:
     """Return how many searches, at least 1 and at most `limit`, can have `each` renders in every round."""
     count = 1
-    while count < limit and (count + 1) * count_rounds(count + 1, eta) * each <= steps:
+    while count < limit and (count + 1) * count_rounds(count + 1) * each <= steps:
         count += 1
     return count
 
 
 def line_up(
-    searches: Sequence[tuple[Policy[Any], Domain]],
-    steps: int,
-    seed: int,
-    *,
-    eta: int,
-    fresh: bool = False,
-    growth: int = 1,
+    searches: Sequence[tuple[Policy[Any], Domain]], steps: int, seed: int, *, rounds: int | None = None
 ) -> Race:
-    """Return a race before its first proposal; each search plans for the renders that it gets if it stays in to the
-    end, counted as if they all had the samples that it asks for."""
-    steps, rounds = max(1, steps), count_rounds(len(searches), eta)
+    """Return a race before its first proposal, of `count_rounds` rounds where no other number is given; each search
+    plans for the renders that it gets if it stays in to the end."""
+    steps, rounds = max(1, steps), rounds or count_rounds(len(searches))
     planned, count = 0.0, len(searches)
-    for number in range(rounds):
-        planned += steps / rounds / count / _samples(growth, number)
-        count = -(-count // eta)
+    for _ in range(rounds):
+        planned += steps / rounds / count
+        count = -(-count // 2)
     runners = tuple(
         Runner(policy, domain, policy.start(domain, seeded(seed, number), max(1, int(planned))))
         for number, (policy, domain) in enumerate(searches)
     )
-    return _begin(Race(runners, steps, eta, rounds, fresh, growth), range(len(runners)), 0)
+    return _begin(Race(runners, steps, rounds), range(len(runners)), 0)
 
 
 def propose(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
@@ -135,16 +110,15 @@ def propose(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
 
 def update(race: Race, evaluated: Evaluated) -> Race:
     """Tell each search what came of its proposals, or of the first of them; every u and its evaluation are as its own
-    domain has them, and its cost as if it had the samples that the search asked for."""
+    domain has them."""
     told = defaultdict[int, list[Any]](list)
     for number, (u, evaluation) in zip(race.asked, evaluated, strict=False):
-        told[number].append((u, replace(evaluation, cost=-(-evaluation.cost // race.samples))))
+        told[number].append((u, evaluation))
     runners = list(race.runners)
     for number, own in told.items():
         runner, reached = runners[number], max(evaluation.objective for _, evaluation in own)
         state = runner.policy.update(runner.state, own)
-        best, lately = max(runner.best, reached), max(runner.lately, reached)
-        runners[number] = replace(runner, state=state, best=best, lately=lately)
+        runners[number] = replace(runner, state=state, best=max(runner.best, reached))
     spent = race.spent + sum(evaluation.cost for _, evaluation in evaluated)
     return replace(race, runners=tuple(runners), spent=spent, asked=())
 
@@ -193,16 +167,11 @@ class Raced(Policy[Race]):
 # ---- turns and rounds -----------------------------------------------------------------------------------------------
 
 
-def _samples(growth: int, number: int) -> int:
-    """Return what samples are multiplied with in a round."""
-    return min(MOST_SAMPLES, int(growth**number))
-
-
 def _begin(race: Race, field: Iterable[int], number: int) -> Race:
     """Begin a round of what is left of the renders, with equal shares for those that are in."""
     field = tuple(field)
     share = max(1, (race.steps - race.spent) // (race.rounds - number) // len(field))
-    runners = [replace(runner, left=0, lately=-math.inf) for runner in race.runners]
+    runners = [replace(runner, left=0) for runner in race.runners]
     for k in field:
         runners[k] = replace(runners[k], left=share)
     return replace(race, runners=tuple(runners), field=field, round=number)
@@ -211,8 +180,8 @@ def _begin(race: Race, field: Iterable[int], number: int) -> Race:
 def _next_round(race: Race) -> Race:
     """Begin the next round with the best of this one."""
     runners = race.runners
-    ranked = sorted(race.field, key=lambda k: runners[k].lately if race.fresh else runners[k].best, reverse=True)
-    able = [k for k in ranked[: -(-len(ranked) // race.eta)] if not runners[k].over]
+    ranked = sorted(race.field, key=lambda k: runners[k].best, reverse=True)
+    able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
     if race.round + 1 >= race.rounds or not able:  # nobody left who can go on: the renders are for whoever still can
         able = sorted((k for k, runner in enumerate(runners) if not runner.over), key=lambda k: -runners[k].best)[:1]
     return _begin(race, able, min(race.round + 1, race.rounds - 1))
@@ -230,8 +199,7 @@ def _ask(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
         k = field[place]
         runner = runners[k]
         if k not in given:
-            most = min(each, -(-runner.left // race.samples))
-            given[k], state = runner.policy.propose(runner.state, most)
+            given[k], state = runner.policy.propose(runner.state, min(each, runner.left))
             runner = replace(runner, state=state)
         if not given[k]:
             _leave(runners, field, k)
@@ -239,7 +207,10 @@ def _ask(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
             continue
         if taken[k] == len(given[k]):  # what it proposes next, these evaluations say
             break
-        batch.append(_paid(race, runner, given[k][taken[k]]))
+        wanted = given[k][taken[k]]
+        capped = replace(wanted, samples=min(runner.left, wanted.samples))
+        later = race.round + 1 < race.rounds  # there will be renders to use a gradient
+        batch.append(affordable(capped, runner.domain, runner.left + later))
         asked.append(k)
         taken[k] += 1
         runners[k] = replace(runner, left=runner.left - batch[-1].cost(runner.domain))
@@ -251,13 +222,6 @@ def _ask(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
             _, state = runners[k].policy.propose(race.runners[k].state, count)
             runners[k] = replace(runners[k], state=state)
     return tuple(batch), replace(race, runners=tuple(runners), asked=tuple(asked))
-
-
-def _paid(race: Race, runner: Runner, proposal: Proposal) -> Proposal:
-    """Return the proposal with the samples of the round, as far as its search's share allows; in all rounds but the
-    last there will be renders to use a gradient."""
-    proposal = replace(proposal, samples=min(runner.left, proposal.samples * race.samples))
-    return affordable(proposal, runner.domain, runner.left + (race.round + 1 < race.rounds))
 
 
 def _queue(runners: Sequence[Runner], field: Sequence[int]) -> list[tuple[int, int]]:

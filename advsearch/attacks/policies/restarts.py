@@ -52,4 +52,4 @@ class Restarts(Raced):
         each = 1 + (domain.gradient_cost if self.policy.uses_gradient else 0)
         count = max(1, min(self.times, steps // each))
         begins = (domain.begin, *(domain.sample(seeded(seed, number))[0] for number in range(1, count)))
-        return racing.line_up([(self.policy, replace(domain, first=begin)) for begin in begins], steps, seed, eta=1)
+        return racing.line_up([(self.policy, replace(domain, first=begin)) for begin in begins], steps, seed, rounds=1)

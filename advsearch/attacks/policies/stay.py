@@ -14,13 +14,7 @@ from advsearch.attacks.policies.base import Evaluated, Policy, Proposal
 
 @dataclass(frozen=True)
 class Stay(Policy[Tensor]):
-    """Proposes the configuration where it began, again and again; its state is that configuration. For wrappers.
-
-    Attributes:
-        samples: as in `Proposal`.
-    """
-
-    samples: int = 1
+    """Proposes the configuration where it began, again and again; its state is that configuration. For wrappers."""
 
     name: ClassVar[str] = "stay"
     uses_gradient: ClassVar[bool] = False
@@ -30,7 +24,7 @@ class Stay(Policy[Tensor]):
         return domain.begin
 
     def propose(self, state: Tensor, n: int) -> tuple[tuple[Proposal, ...], Tensor]:
-        return (Proposal(state, samples=self.samples),) * n, state
+        return (Proposal(state),) * n, state
 
     def update(self, state: Tensor, evaluated: Evaluated) -> Tensor:
         return state

@@ -257,6 +257,9 @@ class _Seen:
         world = vertices @ pose[:3, :3].T + pose[:3, 3]
         points = _from_camera(world, camera)
         frame = Frame.of(fov, shift=(float(shift[0]), float(shift[1])))
+        if scene.camera_model is not None:
+            x, y = scene.camera_model.tangents
+            frame = Frame(-x, x, -y, y)
         found = silhouette(points, mesh.faces, frame)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         return _Seen(

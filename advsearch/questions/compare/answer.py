@@ -6,8 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import Fields, Interval, JsonFloat, RunResult
-from advsearch.runs.results.explain import ConditionRow
+from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
 from advsearch.runs.results.sweep import AxisValue, CountedAnswers
 
 

@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from advsearch import seeds
-from advsearch.api.explain import condition_rows
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import mcnemar, paired_difference
-from advsearch.config.explain import FEWEST_ROWS
 from advsearch.explanations.observations import Factor
-from advsearch.explanations.rules import CountedRule, find_rules
+from advsearch.explanations.rules import FEWEST_ROWS, CountedRule, condition_rows, find_rules
 from advsearch.questions.compare.answer import ComparedPair, CountOf, PairPart, PairRule
 from advsearch.questions.compare.sides import Mask, Side, observations, shared_columns
 from advsearch.runs.results.sweep import AxisValue

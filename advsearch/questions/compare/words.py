@@ -14,10 +14,10 @@ from advsearch.questions.compare.answer import (
     PairRule,
 )
 from advsearch.report import wording
-from advsearch.report.explanations import conditions_text
+from advsearch.report.claims import Claim, Extent
 from advsearch.report.phrases import percent, percent_number
+from advsearch.report.wording import conditions_text
 from advsearch.runs.results.base import Interval
-from advsearch.runs.results.evidence import Claim, Extent
 from advsearch.runs.results.sweep import AxisValue
 
 SIDE_HEADS = ("", "right in", "accuracy", "95 % interval", "time an answer")

@@ -268,7 +268,9 @@ def _check(planned: Sequence[Planned], suite: Suite) -> None:
 def _check_search(name: str, config: SceneConfig) -> None:
     assert isinstance(config, AttackConfig)
     for setting, wrong, why in (
-        ("object", config.is_study, "one object, one epsilon and one model; make a claim of each"),
+        ("object", len(config.objects) > 1, "one object; make a claim of each"),
+        ("epsilon", len(config.epsilons) > 1, "one epsilon; make a claim of each"),
+        ("model", config.is_study, "one model; make a claim of each"),
         ("smallest", config.smallest, "a budget, which the claim is about; leave it out"),
         ("minimise", config.minimise, "a search that makes the model wrong; leave it out"),
         ("target", config.target is not None, "any wrong answer; leave it out"),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import islice
+from typing import Any
 
 import torch
 
@@ -19,8 +21,9 @@ from advsearch.attacks.sequential import ConfidenceSequence
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
-from advsearch.engine.sharing import Shared
+from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.verifier import ladder_of
+from advsearch.files import JsonObject
 from advsearch.progress import Progress
 from advsearch.questions.test import words
 from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer
@@ -30,6 +33,7 @@ from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.results.attack import AttackSummary
+from advsearch.settings import split_names
 
 MANY = 4
 """Values of a configuration that are said in words, at most."""
@@ -85,7 +89,7 @@ class Trial:
         problem, shared = self._problem(config), self._shared(config)
         sequence, right = ConfidenceSequence(self.confidence), 0
         wrong: list[tuple[float, Query, str]] = []
-        self.progress.stage(asked.name, claim.pictures, hint="`pictures` of the claim shortens it", at_most=True)
+        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         with executor_for(shared, "advsearch.api.attack:attack_answers", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor))
             queries = drawn(problem, f"claim {asked.name}", claim.pictures, spp_of(config))
@@ -112,26 +116,45 @@ class Trial:
 
     def _no_worse(self, asked: ClaimAnswer, claim: NoWorseClaim, config: SceneConfig) -> ClaimAnswer:
         problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
-        sequence, ours, theirs = ConfidenceSequence(self.confidence), 0, 0
-        same, shown = other.renderer.formation == problem.renderer.formation, Shown()
-        self.progress.stage(asked.name, claim.pictures, hint="`pictures` of the claim shortens it", at_most=True)
-        journal, beside = Journal(self.run, Shared(problem)), Journal(self.run, Shared(other))
-        kind, answer, first = f"claim {asked.name}", UNDECIDED, None
-        for query in drawn(problem, kind, claim.pictures, spp_of(config)):
-            (mine,) = journal.answers([query], lambda queries: [shown.of(problem, one) for one in queries])
-            (other_one,) = beside.answers(
-                [replace(query, kind=f"{kind} beside")],
-                lambda queries: [(shown if same else Shown()).of(other, one) for one in queries],
-            )
-            ours += mine.said.right and not other_one.said.right
-            theirs += other_one.said.right and not mine.said.right
-            if first is None and other_one.said.right and not mine.said.right:
-                first = query
-            sequence.add((mine.said.right - other_one.said.right + 1) / 2)
-            self.progress.advance(1)
-            answer = decided(sequence, 0.5 - claim.points / 200.0)
-            if answer != UNDECIDED or self.late():
-                break
+        same = other.renderer.formation == problem.renderer.formation
+        sequence, ours, theirs, answer = ConfidenceSequence(self.confidence), 0, 0, UNDECIDED
+        kind, first = f"claim {asked.name}", None
+        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
+        shared = self._shared(config).model_copy(update={"model": f"{config.model},{claim.than}"})
+        with executor_for(shared, "advsearch.questions.test.claims:answering_of", self.progress) as executor:
+            journal = Journal(self.run, Shared(problem, executor, "0"))
+            beside = Journal(self.run, Shared(other, executor, "1"))
+            pictures: dict[int, torch.Tensor | None] = {}
+
+            def shown(queries: Sequence[Query]) -> Iterator[Evaluation]:
+                """The answers of the model, whose pictures the other one is shown."""
+                answers = journal.traced([replace(query, keep=same) for query in queries])
+                for query, evaluation in zip(queries, answers, strict=True):
+                    pictures[query.number] = evaluation.picture
+                    yield evaluation
+
+            def shown_again(queries: Sequence[Query]) -> Iterable[Evaluation]:
+                if not same:
+                    return beside.traced(queries)
+                return (_judged(other, query, pictures.get(query.number)) for query in queries)
+
+            queries = drawn(problem, kind, claim.pictures, spp_of(config))
+            while answer == UNDECIDED and (batch := list(islice(queries, self._at_once(journal)))):
+                pictures.clear()
+                mine = list(journal.answers(batch, shown))
+                both = beside.answers([replace(query, kind=f"{kind} beside") for query in batch], shown_again)
+                for query, own, its in zip(batch, mine, both, strict=True):
+                    ours += own.said.right and not its.said.right
+                    theirs += its.said.right and not own.said.right
+                    if first is None and its.said.right and not own.said.right:
+                        first = query
+                    sequence.add((own.said.right - its.said.right + 1) / 2)
+                    self.progress.advance(1, **journal.traced.told)
+                    answer = decided(sequence, 0.5 - claim.points / 200.0)
+                    if answer != UNDECIDED:
+                        break
+                if self.late():
+                    break
         low, high = sequence.interval
         counts = (sequence.count, ours, theirs)
         reason = words.difference_reason(answer, counts, (2 * low - 1, 2 * high - 1), claim.than)
@@ -225,13 +248,15 @@ class Trial:
 
     def _answers(self, journal: Journal, queries: Iterator[Query]) -> Iterator[tuple[Query, Evaluation]]:
         """Ask, as many at once as there are workers for, until the time is over."""
-        at_once = 1 if journal.traced.executor is None else AHEAD * (self.workers or 8)
-        while batch := list(islice(queries, at_once)):
+        while batch := list(islice(queries, self._at_once(journal))):
             for query, answer in zip(batch, journal.answers(batch), strict=True):
                 self.progress.advance(1, **journal.traced.told)
                 yield query, answer
             if self.late():
                 return
+
+    def _at_once(self, journal: Journal) -> int:
+        return 1 if journal.traced.executor is None else AHEAD * (self.workers or 8)
 
     def _picture(self, name: str, problem: Problem, query: Query) -> str:
         """Render the picture of a query again, and return its file in the run."""
@@ -274,18 +299,22 @@ class Trial:
         )
 
 
-@dataclass
-class Shown:
-    """The last picture that was rendered, for the next model."""
+def answering_of(settings: JsonObject) -> Callable[[Any], Any]:
+    """Return what answers the queries of a claim about two models, named by their place: what a worker does."""
+    models = split_names(str(settings["model"]))
 
-    _seed: int | None = None
-    _picture: torch.Tensor | None = None
+    def problem(name: str) -> Problem:
+        config = AttackConfig(**{**settings, "model": models[int(name)]})
+        parts = parts_of(config)
+        return problem_of(config, parts.scene, parts.loaded[0], differentiated=False)
 
-    def of(self, problem: Problem, query: Query) -> Evaluation:
-        """Have a picture judged that is rendered if it is another one than the last."""
-        if self._picture is None or query.seed != self._seed:
-            self._seed, self._picture = query.seed, problem.picture(query.u, query.seed, query.spp)
-        return Evaluation.of(problem.judge(self._picture, problem.whole(query.u)))
+    return answering(cache(problem))
+
+
+def _judged(problem: Problem, query: Query, picture: torch.Tensor | None) -> Evaluation:
+    """What a model says of a picture that another one was shown; it is rendered if it is not at hand."""
+    picture = problem.picture(query.u, query.seed, query.spp) if picture is None else picture
+    return Evaluation.of(problem.judge(picture, problem.whole(query.u)))
 
 
 def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:

@@ -9,31 +9,44 @@ import lzma
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isqrt
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
+from advsearch import seeds
 from advsearch.api.attack import parts_in, problem_of_parts
-from advsearch.api.replay import kept_answer
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.loading import Scene
+from advsearch.engine.problem import Problem
+from advsearch.engine.retrial import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
 from advsearch.questions.test.answer import ANSWERS, HELD
 from advsearch.questions.test.suite import OWN, Suite
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, default_name, find_run
 from advsearch.runs.files import write_bytes, write_text
-from advsearch.runs.images import smaller_png
+from advsearch.runs.images import read_png
 from advsearch.runs.summary import attack_of
 from advsearch.settings import FILES, settings
+from advsearch.viewer.thumbnails import thumbnail
 
-FINE, COARSE, FEW = 32767, 255, 4096
-"""Steps of 1 in which a number is kept: of a few numbers, and of more than `FEW`, as the texels of a texture, where
-those of an 8-bit picture do."""
+Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
+
+FEW, FINE, COARSE = 4096, 1.0 / 32767.0, 1.0 / 255.0
+"""A block of up to so many numbers is kept in steps of `FINE`; a larger one, such as the texels of a texture, in one of
+`FORMS`, at best in steps of `COARSE`."""
+
+FORMS = ((True, 4), (True, 2), (True, 1), (False, 1))
+"""How the numbers of a large block are kept, the smallest first: whether each is only a step up, down or none, and the
+side of the squares of texels that have one."""
+
+PICTURE = ".jpg"
+"""How the name of the picture ends."""
 
 LARGEST = 1 << 24
 """Most bytes of a file, and most numbers of a configuration."""
@@ -41,20 +54,74 @@ LARGEST = 1 << 24
 MEMORY = 1 << 27
 """Bytes that unpacking one may take."""
 
-SIDE = 96
-"""Longest side of the picture, in pixels."""
-
 TRIALS = {False: 6, True: 20}
 """Fresh renders that try one, and one that has to hold under many conditions."""
 
 OF_SEARCH = (
-    *(*OWN, "policy", "steps", "step_size", "objective", "metrics", "log", "average", "baseline", "trials"),
+    *(*OWN, "policy", "steps", "objective", "metrics", "log", "average", "baseline", "trials"),
     *("measure", "estimators", "specialise", "draws", "aov", "printable", "spp", "verify_spp"),
 )
 """Settings of a run that say nothing of what its answer is."""
 
 OF_MODEL = ("model", "labels", "prompt", "task", "label")
 """Settings that a suite says of the model under test, in place of the run's."""
+
+
+class _Block(BaseModel):
+    """How far some numbers are from the clean scene's, in steps; see `FORMS`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    numbers: int = Field(ge=1, le=LARGEST)
+    step: float = Field(gt=0.0, le=1.0)
+    signs: bool
+    square: int = Field(ge=1, le=4)
+    offsets: str
+
+    @classmethod
+    def of(cls, moved: Floats, signs: bool, square: int) -> _Block:
+        """Keep numbers (n,); squares are those of a texture (side, side, 3), and of nothing else."""
+        few, side = len(moved) <= FEW, isqrt(len(moved) // 3)
+        step = FINE if few else float(np.abs(moved).max()) if signs else COARSE
+        square = square if not few and 3 * side * side == len(moved) and side % square == 0 else 1
+        if square > 1:
+            squares = moved.reshape(side // square, square, side // square, square, 3)
+            moved = squares.mean(axis=(1, 3)).ravel()
+        steps = np.round(moved / (step or 1.0)).astype("<i2")
+        data = steps.tobytes() if few or not signs else _three_in_one(steps)
+        packed = base64.b85encode(lzma.compress(data, lzma.FORMAT_ALONE)).decode("ascii")
+        numbers = len(moved) * square**2
+        return cls(numbers=numbers, step=step or 1.0, signs=not few and signs, square=square, offsets=packed)
+
+    def moved(self) -> Floats:
+        """Return the numbers, (n,) float32.
+
+        Raises:
+            ValueError: they are damaged.
+            LZMAError: likewise.
+        """
+        size, side = self.numbers // self.square**2, isqrt(self.numbers // 3)
+        unpack = lzma.LZMADecompressor(memlimit=MEMORY)
+        data = unpack.decompress(base64.b85decode(self.offsets), 2 * size + 1)
+        bytes_ = np.frombuffer(data, np.uint8)
+        if len(data) != (-(-size // 3) if self.signs else 2 * size):
+            raise ValueError(f"expected {size} numbers, got others")
+        steps = _one_by_one(bytes_)[:size] if self.signs else np.frombuffer(data, "<i2")
+        if self.square > 1:
+            squares = steps.reshape(side // self.square, side // self.square, 3)
+            steps = squares.repeat(self.square, axis=0).repeat(self.square, axis=1).ravel()
+        found: Floats = steps.astype(np.float32) * np.float32(self.step)
+        return found
+
+
+def _three_in_one(steps: np.ndarray[Any, np.dtype[np.int16]]) -> bytes:
+    """Three numbers from -1 to 1 in each byte."""
+    threes = np.pad(steps, (0, -len(steps) % 3)).reshape(-1, 3) @ (9, 3, 1) + 13
+    return threes.astype(np.uint8).tobytes()
+
+
+def _one_by_one(data: np.ndarray[Any, np.dtype[np.uint8]]) -> np.ndarray[Any, np.dtype[np.int16]]:
+    """What `_three_in_one` has put together."""
+    return (np.stack([data // 9, data // 3 % 3, data % 3], axis=1).astype(np.int16) - 1).ravel()
 
 
 class _File(BaseModel):
@@ -65,9 +132,7 @@ class _File(BaseModel):
     settings: dict[str, Any]
     scene: str
     spp: int = Field(ge=1, le=65536)
-    steps: int = Field(ge=1, le=32767)
-    numbers: int = Field(ge=1, le=LARGEST)
-    offsets: str
+    blocks: list[_Block] = Field(min_length=1, max_length=FEW)
 
 
 @dataclass(frozen=True)
@@ -81,8 +146,7 @@ class Counterexample:
         said: what the model said of it.
         scene: digest of the scene.
         spp: samples a pixel that it was verified with.
-        offsets: (d,) int16, how far each number is from the clean scene's, in steps of 1 / `steps`.
-        steps: of 1.
+        moved: (d,) float32, how far each number is from the clean scene's.
     """
 
     name: str
@@ -91,8 +155,7 @@ class Counterexample:
     said: str
     scene: str
     spp: int
-    offsets: np.ndarray[Any, np.dtype[np.int16]]
-    steps: int
+    moved: Floats
 
     def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
         """Return what it is tried with: the run's scene, and the suite's model."""
@@ -103,12 +166,12 @@ class Counterexample:
 
     def configuration(self, start: Tensor) -> Tensor:
         """Return u, (d,) float32, from that of the clean scene."""
-        if start.numel() != len(self.offsets):
+        if start.numel() != len(self.moved):
             raise InputError(
-                f"{self.path}: has {len(self.offsets)} numbers, and its scene has {start.numel()} now; remove it, or "
+                f"{self.path}: has {len(self.moved)} numbers, and its scene has {start.numel()} now; remove it, or "
                 "add the answer of a new run"
             )
-        return (start + torch.from_numpy(self.offsets.astype(np.float32)) / self.steps).clamp(0.0, 1.0)
+        return (start + torch.from_numpy(self.moved)).clamp(0.0, 1.0)
 
 
 def folder_of(suite: str) -> Path:
@@ -140,32 +203,41 @@ def add(suite: str, run: str) -> Counterexample:
         raise InputError(f"add: expected a run that makes the model wrong, got {path}, which makes the object easier")
     parts = parts_in(path)
     problem, _ = problem_of_parts(parts)
-    moved = kept_answer(path, problem) - problem.domain.start
-    steps = FINE if moved.numel() <= FEW else COARSE
-    offsets = (moved * steps).round().to(torch.int16).numpy()
+    moved = (kept_answer(path, problem) - problem.domain.start).numpy()
     of = path.parents[1].name if path.parent.name == PARTS else ""
     folder, name = folder_of(suite), default_name(of or path.name, (path.name,) if of else ())
-    values = {
+    values: dict[str, Any] = {
         "schema": 1,
         "run": path.name,
         "said": next(iter(summary.verified.labels), ""),
         "settings": _settings(config),
         "scene": scene_digest(parts.scene),
         "spp": summary.verified.spp,
-        "steps": steps,
-        "numbers": len(offsets),
-        "offsets": base64.b85encode(lzma.compress(offsets.astype("<i2").tobytes())).decode("ascii"),
     }
     folder.mkdir(parents=True, exist_ok=True)
-    picture = (path / IMAGES / "adversarial.png").read_bytes()
-    write_bytes(folder / f"{name}.png", smaller_png(picture, SIDE))
-    return _read(write_text(folder / f"{name}.json", json.dumps(values, indent=1) + "\n"))
+    write_bytes(folder / f"{name}{PICTURE}", thumbnail(read_png(path / IMAGES / "adversarial.png")))
+    blocks = [block.size for block in problem.domain.blocks]
+    forms = FORMS if max(blocks) > FEW else FORMS[-1:]
+    for form in forms:
+        kept = [_Block.of(part, *form) for part in np.split(moved, np.cumsum(blocks)[:-1])]
+        text = json.dumps({**values, "blocks": [one.model_dump() for one in kept]}, indent=1)
+        one = _read(write_text(folder / f"{name}.json", text + "\n"))
+        if form == forms[-1] or _is_wrong(problem, one):
+            break
+    return one
+
+
+def _is_wrong(problem: Problem, one: Counterexample) -> bool:
+    """Whether the run's model is wrong on what is kept, in twice as many trials as will try it."""
+    u = problem.domain.project(one.configuration(problem.domain.start))
+    drawn = (seeds.stream(problem.seed, "kept", number) for number in range(2 * TRIALS[is_over(one.config)]))
+    return not any(problem.judge(problem.picture(u, seed, one.spp), problem.whole(u, seed)).right for seed in drawn)
 
 
 def remove(one: Counterexample) -> None:
     """Remove the files of a counterexample."""
     one.path.unlink(missing_ok=True)
-    one.path.with_suffix(".png").unlink(missing_ok=True)
+    one.path.with_suffix(PICTURE).unlink(missing_ok=True)
 
 
 def _settings(config: AttackConfig) -> dict[str, Any]:
@@ -195,22 +267,18 @@ def counterexamples(suite: str) -> list[Counterexample]:
 def _read(path: Path) -> Counterexample:
     try:
         kept = _File.model_validate(parse_json(read_text(path, "a counterexample", LARGEST)))
-        unpack = lzma.LZMADecompressor(memlimit=MEMORY)
-        data = unpack.decompress(base64.b85decode(kept.offsets), 2 * kept.numbers)
-        offsets = np.frombuffer(data, "<i2").astype(np.int16)
+        moved = np.concatenate([block.moved() for block in kept.blocks])
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         got = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
         raise FileFormatError(f"{path}: expected a counterexample, got one with {got}; remove it") from None
     except (OSError, ValueError, lzma.LZMAError) as error:
         raise FileFormatError(f"{path}: expected a counterexample, got {str(error)[:80]}; remove it") from None
-    if len(offsets) != kept.numbers or not unpack.eof:
-        raise FileFormatError(f"{path}: expected {kept.numbers} numbers, got others; remove it")
     try:
         config = AttackConfig(**kept.settings)
     except InputError as error:
         raise FileFormatError(f"{path}: settings: {error}") from None
-    return Counterexample(path.stem, path, config, kept.said, kept.scene, kept.spp, offsets, kept.steps)
+    return Counterexample(path.stem, path, config, kept.said, kept.scene, kept.spp, moved)
 
 
 # ---- what is expected -----------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ EXPECTED = {
     "at_least": "a share over 0 and under 1, such as 0.95",
     "points": "percentage points over 0 and under 100, such as 2",
     "pictures": f"a whole number from 1 to {MOST}",
-    "than": "another model, as `model` takes it",
+    "than": "another model, by its name or its file",
     "confidence": "a number from 0.5 to 0.9999, such as 0.95",
     "seconds": "a number of seconds over 0",
     "seed": "a whole number from 0 to 2**63 - 1",
@@ -46,8 +46,20 @@ A_CLAIM = "a claim such as {claim: right, at_least: 0.9}"
 """What a name among the claims takes."""
 
 
+NUMBERS = ("at_least", "points", "pictures", "confidence", "seconds", "seed")
+"""Names that take numbers."""
+
+
 class _Described(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+    @field_validator(*NUMBERS, mode="before", check_fields=False)
+    @classmethod
+    def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
+        """Refuse true for a number: YAML's `pictures: yes` is a slip, not 1."""
+        if isinstance(value, bool):
+            raise ValueError(f"expected {EXPECTED[info.field_name]}, got {value}")
+        return value
 
 
 class _Claim(_Described):
@@ -100,6 +112,7 @@ class NoWorseClaim(_Claim):
 
 
 AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim
+"""The kinds of claims; each is tried by a method of `Trial`. A claim about the frames of a drive would stand here."""
 
 
 class Suite(_Described):
@@ -183,12 +196,17 @@ def suite_of(data: Mapping[str, object], where: str) -> Suite:
 def _told(error: Any) -> str:
     """What is wrong, in words: where, what was expected and what was got."""
     place = [str(one) for one in error["loc"] if one not in ("right", "not_broken", "no_worse")]
+    if place[-1] == "[key]":  # a name that is a number
+        got = shown(error["input"])
+        return f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"
     name, got = place[-1], shown(error["input"])
     if error["type"].startswith("union_tag"):
         place, name = [*place, "claim"], "claim"
         got = "nothing" if error["type"] == "union_tag_not_found" else shown(error["ctx"]["tag"])
     where = ".".join(place)
     if error["type"] == "extra_forbidden":
+        if name in EXPECTED:
+            return f"{where}: {'a claim of this kind' if len(place) > 2 else 'a suite'} has no {name}; leave it out"
         near = resembling(name, sorted(EXPECTED))[:1]
         guess = f"did you mean {near[0]}?" if near else "docs/testing.md has the names"
         return f"{where}: there is no such name in a suite, or in a claim of this kind; {guess}"

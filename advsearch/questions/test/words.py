@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer, SuiteResult
 from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
+from advsearch.report.claims import Claim, Kind
 from advsearch.report.phrases import percent, with_article
 from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
 from advsearch.runs.results.attack import AttackSummary
@@ -126,3 +129,18 @@ def facts(result: SuiteResult) -> dict[str, str]:
         "seed": str(result.seed),
         "time": seconds_text(result.seconds["total"]),
     }
+
+
+def claims(result: SuiteResult) -> Iterator[Claim]:
+    """Yield what the run stands for: what each claim of the suite came to, by its own test."""
+    for one in result.claims:
+        said = f"{one.name}: that {one.statement} is {one.answer}: {one.reason}."
+        if one.kind in ("not_broken", "counterexample"):
+            kind: Kind = "found" if one.answer == FAILED else "not found" if one.answer == HELD else "nothing claimed"
+            yield Claim(kind=kind, statement=said, extent=None)
+        elif one.answer == UNDECIDED:
+            yield Claim(kind="nothing claimed", statement=said, extent=None)
+        else:
+            sure = percent(result.confidence)
+            more = f" The interval is a confidence sequence at {sure}, in place of Clopper-Pearson's."
+            yield Claim(kind="measured", statement=said + more, extent=None)

@@ -6,32 +6,14 @@ from advsearch import rooms
 from advsearch.files import JsonObject
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.check import CheckResult
-from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.results.gap import CurveResult, GapResult
-from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.matrix import MatrixResult
-from advsearch.runs.results.plan import PlanResult
-from advsearch.runs.results.precision import PrecisionResult
-from advsearch.runs.results.recipe import RecipeResult
-from advsearch.runs.results.region import RegionResult
-from advsearch.runs.results.replay import ReplayResult
-from advsearch.runs.results.stability import StabilityResult
 from advsearch.runs.results.sweep import SweepSummary
 
 KEPT: tuple[type[Result], ...] = (
     AttackSummary,
     SweepSummary,
     GapResult,
-    RegionResult,
-    ReplayResult,
-    CheckResult,
-    PlanResult,
-    PrecisionResult,
-    StabilityResult,
-    RecipeResult,
-    ExplainResult,
-    HardenResult,
 )
 """The results that a run keeps in `summary.json`, but for those of questions that are rooms."""
 

@@ -17,7 +17,7 @@ from advsearch.runs.results.base import (
     SceneResult,
     VariedValue,
 )
-from advsearch.runs.results.plan import PlannedGradient
+from advsearch.runs.results.derivatives import PlannedGradient
 
 
 class DescribedValue(Fields):
@@ -75,6 +75,11 @@ class VerifiedRate(Fields):
     labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
     margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
     not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+    stopped: str | None = Field(
+        default=None,
+        description="why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "
+        "trials that are no verdict",
+    )
 
 
 class ObjectiveValues(Fields):
@@ -178,7 +183,7 @@ class VerificationSamples(Fields):
     """The sample count of the verification."""
 
     spp: int
-    converged: bool = Field(description="whether the margins are shown to stand still there")
+    converged: bool = Field(description="whether it is shown that more would leave the margins on their sides")
 
 
 class SearchClaim(Fields):
@@ -231,10 +236,14 @@ class BankOfConditions(Fields):
 
 
 class LinearTransport(Fields):
-    """The matrix that predicted the pictures of the searches."""
+    """What predicted the pictures of the searches."""
 
     used: bool
-    reason: str | None = Field(default=None, description="why pictures were rendered, all or from some evaluation on")
+    way: str | None = Field(default=None, description="by what: `matrix`, or `surface light`")
+    reason: str | None = Field(
+        default=None,
+        description="why pictures were rendered, all or from some evaluation on, or not predicted by surface light",
+    )
     conditions: BankOfConditions | None = Field(default=None, description="with `over`")
     entries: int | None = Field(default=None, description="of the matrix")
     bytes: int | None = Field(default=None, description="of its memory")

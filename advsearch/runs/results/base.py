@@ -177,3 +177,14 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return plain(value.tolist())
     raise TypeError(f"expected something that JSON can hold, got {type(value).__name__}")
+
+
+class ConditionRow(Fields):
+    """A part of the values of one parameter."""
+
+    parameter: str
+    unit: str
+    over: float | None = Field(description="values are larger; null without that bound, and for names")
+    at_most: float | None = Field(description="values are no larger; null without that bound, and for names")
+    options: list[str] = Field(description="the names it is about; empty for numbers")
+    text: str

@@ -29,6 +29,7 @@ from advsearch.scene.exporting.gltf import PosedMesh, glb, posed
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.blender import command, last_line, surroundings
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
+from advsearch.scene.road import paved
 
 LONGEST = 300
 """Seconds that one picture may take, the start included, before `advsearch.files.scaled`."""
@@ -148,7 +149,7 @@ class Cycles:
         unknown += [
             f"a surface of Mitsuba's own on the {name}" for name, one in description.meshes.items() if one.surface
         ]
-        unknown += ["a lens"] if description.thin_lens else []
+        unknown += ["a lens"] if description.thin_lens or description.camera_model else []
         unknown += ["a plain background"] if description.backdrop else []
         if unknown:
             raise BlenderError(f"the scene has {', '.join(unknown[:5])}, which is not carried over to Blender")
@@ -221,7 +222,7 @@ def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[PosedMe
         shown = photograph.base if reflectance is None else reflectance
         return [PosedMesh("ground", photograph.mesh, linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
     half = scene.number("ground.size") / 2.0
-    if half <= 0.0:
+    if half <= 0.0 or paved(scene):
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))

@@ -48,6 +48,7 @@ class Motion:
         self._assembly = assembly
         self._camera = torch.from_numpy(camera_to_world(description, width / height)).to(torch.float64)
         self._fov = description.number("camera.fov")
+        self._model = description.camera_model
         floor = None if description.photograph is None else description.photograph.mesh.vertices
         self._ground = description.number("ground.size") / 2.0 if floor is None else float(floor.max())
         self._edge = _edge_points(self._ground) if floor is None else torch.from_numpy(floor).double()
@@ -60,8 +61,6 @@ class Motion:
     def pixels(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return where the followed vertices lie, (N, 2) pixels from the middle, and which are in or near the frame."""
         camera = inputs["camera.to_world"].double() if "camera.to_world" in inputs else self._camera
-        fov = inputs["camera.fov"].double().reshape(()) if "camera.fov" in inputs else torch.tensor(self._fov)
-        focal = self._size / 2.0 / torch.tan(torch.deg2rad(fov.double()) / 2.0)
         found = []
         for name, mesh in self._assembly.meshes.items():
             vertices = inputs.get(f"{name}.vertices")
@@ -70,14 +69,23 @@ class Motion:
             found.append(vertices[self._picks[name]].double())
         found += [self._edge, self._far]
         relative = (torch.cat(found) - camera[:3, 3]) @ camera[:3, :3]
-        depth = relative[:, 2]
-        seen = depth > 1e-3
+        projected, seen = self._projected(relative, inputs)
         seen[len(seen) - len(self._far) :] &= ~self._behind_ground(camera[:3, 3])
-        projected = focal * relative[:, :2] / depth.clamp_min(1e-3)[:, None]
         for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
             if name in inputs:
                 projected[:, axis] += 2.0 * self._frame[axis] * inputs[name].double().reshape(())
         return projected, seen & (projected.abs() <= 1.2 * self._frame.double()).all(dim=1)
+
+    def _projected(self, points: Tensor, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Where points (N, 3) in camera coordinates are seen, in pixels from the middle, and which are before it."""
+        if self._model is not None:
+            model = self._model.with_numbers(inputs["camera.lens"]) if "camera.lens" in inputs else self._model
+            places, seen = model.project(points * torch.tensor([-1.0, -1.0, 1.0]).to(points))
+            return (places - 0.5) * 2.0 * self._frame.double(), seen
+        fov = inputs["camera.fov"].double().reshape(()) if "camera.fov" in inputs else torch.tensor(self._fov)
+        focal = self._size / 2.0 / torch.tan(torch.deg2rad(fov.double()) / 2.0)
+        depth = points[:, 2]
+        return focal * points[:, :2] / depth.clamp_min(1e-3)[:, None], depth > 1e-3
 
     def _behind_ground(self, eye: Tensor) -> Tensor:
         """Which of the far points the ground plane hides from a camera at `eye`."""

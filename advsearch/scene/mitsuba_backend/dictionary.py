@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from advsearch.errors import InputError
+from advsearch.scene.cameras.model import NUMBERS
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
@@ -14,6 +15,7 @@ from advsearch.scene.mitsuba_backend.meshes import matt, mitsuba_mesh
 from advsearch.scene.mitsuba_backend.parts import SceneInput, number, transform
 from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mitsuba
 from advsearch.scene.parts import PluginPart
+from advsearch.scene.road import paved
 
 GROUND = "ground"
 GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True)
@@ -39,7 +41,7 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     photograph = description.photograph
     if photograph is not None:
         scene[GROUND] = mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), matt(photograph.base.numpy()))
-    elif number("ground.size") > 0.0:
+    elif number("ground.size") > 0.0 and not paved(description):
         reflectance = srgb_to_linear(np.array(description.ground_color, np.float32)).tolist()
         scene[GROUND] = {
             "type": "rectangle",
@@ -70,9 +72,7 @@ def loaded(plugins: Plugin, description: SceneDescription) -> Any:
 def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
     height, width = resolution
     camera: Plugin = {
-        "type": "thinlens" if description.thin_lens else "perspective",
-        "fov": description.number("camera.fov"),
-        "fov_axis": "larger",
+        **_lens(description),
         "near_clip": 0.01,
         "far_clip": 1e5,
         "to_world": mitsuba().ScalarTransform4f(camera_to_world(description, width / height)),
@@ -86,9 +86,25 @@ def _camera(description: SceneDescription, resolution: tuple[int, int], filter: 
         },
         "sampler": {"type": sampler},
     }
-    if description.thin_lens:
-        camera |= {"aperture_radius": 1e-4, "focus_distance": 1.0}
     return camera
+
+
+def _lens(description: SceneDescription) -> Plugin:
+    """The plugin of a camera, with what is before its place and its film."""
+    model = description.camera_model
+    if model is not None:
+        if description.backdrop and model.black > 0.0:
+            raise InputError(
+                "background: it would show where the camera's lens sees nothing as well; leave the plain background "
+                "out, or take a lens that fills the picture"
+            )
+        import advsearch.scene.mitsuba_backend.sensor  # noqa: F401  (registers the sensor)
+
+        return {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values}
+    pinhole: Plugin = {"type": "perspective", "fov": description.number("camera.fov"), "fov_axis": "larger"}
+    if description.thin_lens:
+        pinhole |= {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
+    return pinhole
 
 
 def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
@@ -107,5 +123,6 @@ def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         SceneInput("camera.shift_x", "camera.principal_point_offset_x", number, shape=(1,)),
         SceneInput("camera.shift_y", "camera.principal_point_offset_y", number, shape=(1,)),
         SceneInput("camera.aperture", "camera.aperture_radius", number, shape=(1,)),
+        SceneInput("camera.lens", "camera.lens", shape=(len(NUMBERS),)),
         SceneInput("camera.focus", "camera.focus_distance", number, shape=(1,)),
     )

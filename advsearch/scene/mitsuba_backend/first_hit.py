@@ -28,11 +28,11 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
     count = height * width
     pixel = dr.arange(mi.UInt32, count)
     place = mi.Point2f((pixel % width + 0.5) / width, (pixel // width + 0.5) / height)
-    ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    ray, weight = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
     to_world = sensor.world_transform()
     eye = to_world @ mi.Point3f(0.0)  # rays begin at the near clipping plane
     ahead = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
-    active = dr.full(mi.Bool, True, count)
+    active = dr.any(mi.Spectrum(weight) > 0.0) & dr.full(mi.Bool, True, count)
     number, face = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
     depth, z_depth = dr.full(mi.Float, dr.inf, count), dr.full(mi.Float, dr.inf, count)
     normal, uv = dr.zeros(mi.Normal3f, count), dr.zeros(mi.Point2f, count)

@@ -97,7 +97,7 @@ class MitsubaScene:
             self._leave_out = frozenset(leave_out)
             unrecorded = description.thin_lens or any(map(textured_emission, description.meshes.values()))
             self._freeze = "tracing" in leave_out and not unrecorded  # Dr.Jit can record neither of these
-            self._thin_lens = description.thin_lens
+            self._pinhole = not description.thin_lens and description.camera_model is None
             self._backdrop = description.backdrop
             if description.backdrop and description.emits:
                 raise InputError(
@@ -239,6 +239,12 @@ class MitsubaScene:
             self._set(inputs)
             return self._scene
 
+    def stand(self, inputs: Mapping[str, Tensor]) -> None:
+        """Set the vertices and normals that these inputs have, if others are set; everything else may be anything."""
+        wanted, now = ({n: one[n] for n in one if n in self._buffers} for one in (inputs, self._applied))
+        if wanted.keys() != now.keys() or not all(torch.equal(wanted[n].float(), now[n]) for n in wanted):
+            self.held(inputs)
+
     def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; arguments as for `Renderer.surfaces`."""
         with one_at_a_time:
@@ -277,7 +283,7 @@ class MitsubaScene:
 
             wanted = tuple(inputs if wrt is None else wrt)
             beside = set() if "gradients" in self._leave_out else set(self.interior)
-            plain = method == "path" and not self._thin_lens and not self.volumetric
+            plain = method == "path" and self._pinhole and not self.volumetric
             if "boundary" not in self._leave_out and plain:  # which knows no lens and no medium
                 method, beside = "boundary", beside | self._buffers
             shown = cotangent.detach().to(torch.float32).contiguous()

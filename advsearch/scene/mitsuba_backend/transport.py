@@ -103,8 +103,8 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     place = (corner + noise.next_2d()) / mi.Point2f(width, height)
     aperture = noise.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    ray, _ = sensor.sample_ray(0.0, 0.5, place, aperture)
-    first, steps = _walk(scene, ray, noise, depth)
+    ray, weight = sensor.sample_ray(0.0, 0.5, place, aperture)
+    first, steps = _walk(scene, ray, weight, noise, depth)
     there = mi.TensorXf(parameters[key])
     try:
         parameters[key] = there + STEP
@@ -219,14 +219,17 @@ class _Step:
         self.slope_on = _difference(value, self.value_on, self.going_on) / dr.select(self.going_on, self.pdf, 1.0)
 
 
-def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_Step]]:
-    """Trace paths; return what the camera sees, and the vertices, the first one first."""
+def _walk(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[_First, list[_Step]]:
+    """Trace paths; return what the camera sees, and the vertices, the first one first. Rays of weight 0 see nothing."""
     mi = mitsuba()
     import drjit as dr
 
     context = mi.BSDFContext()
     through = mi.Spectrum(1.0)
-    active, sharp = mi.Bool(True), dr.full(mi.Bool, True, dr.width(ray.o))
+    active, sharp = (
+        dr.any(weight > 0.0) & dr.full(mi.Bool, True, dr.width(ray.o)),
+        dr.full(mi.Bool, True, dr.width(ray.o)),
+    )
     cut_out = any(mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.Null) for one in scene.shapes() if one.bsdf())
     passed = mi.Bool(cut_out)
     last, last_pdf, last_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)

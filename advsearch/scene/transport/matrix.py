@@ -112,7 +112,7 @@ class ColouredRows:
             self._kept = shares.astype(np.float16), self._sum.indices.astype(self._column), self._sum.indptr
         else:
             rows = scipy.sparse.csr_matrix((shares, self._sum.indices, self._sum.indptr), self._shape)
-            self._both_ways = _by_rows(rows), _by_rows(rows.T.tocsr())
+            self._both_ways = by_rows(rows), by_rows(rows.T.tocsr())
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         colours = torch.from_numpy(self._colours).reshape(*picture, 3)
         self._kept_colours = Halves(colours if smooth is None else smooth(colours))
@@ -224,7 +224,7 @@ class _Product(torch.autograd.Function):
         return None, ctx.transport.transposed_times(cotangent.contiguous())  # type: ignore[attr-defined]
 
 
-def _by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
+def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
     """The same for torch, whose products with it are twice as fast as scipy's."""
     parts = [torch.from_numpy(part) for part in (matrix.indptr, matrix.indices, matrix.data)]
     with warnings.catch_warnings():
@@ -237,19 +237,26 @@ def _lengths(texels: int, cells: int) -> Tensor:
     return (texels - COARSE * torch.arange(cells)).clamp(max=COARSE).to(torch.float32)
 
 
-def _bilinear(vertices: Vertices, texture: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats, Floats]:
-    """The four texels of the bilinear lookup of each vertex, which repeats at the border, and their shares."""
+def bilinear(uv: Floats, texture: tuple[int, int]) -> tuple[npt.NDArray[np.int32], Floats]:
+    """The four texels (n, 4) of the bilinear lookup at texture coordinates (n, 2), which repeats at the border, by
+    their places in the flat texture; and their shares (n, 4)."""
     height, width = texture
-    uv: Floats = vertices.uv.numpy()
     x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
     left, low = np.floor(x), np.floor(y)
     right_share, high_share = (x - left).astype(np.float32), (y - low).astype(np.float32)
-    across = [left.astype(np.int64) % width, (left.astype(np.int64) + 1) % width]
-    down = [low.astype(np.int64) % height, (low.astype(np.int64) + 1) % height]
+    across = [left.astype(np.int32) % width, (left.astype(np.int32) + 1) % width]
+    down = [low.astype(np.int32) % height, (low.astype(np.int32) + 1) % height]
     columns = np.stack([row * width + column for row in down for column in across], axis=1)
     beside, above = [1.0 - right_share, right_share], [1.0 - high_share, high_share]
     shares: Floats = np.stack([tall * wide for tall in above for wide in beside], axis=1)
-    return vertices.pixel.numpy(), columns, shares, vertices.weight.numpy() * np.float32(share)
+    return columns, shares
+
+
+def _bilinear(vertices: Vertices, texture: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats, Floats]:
+    """The texels of the bilinear lookup of each vertex, and their shares."""
+    columns, shares = bilinear(vertices.uv.numpy(), texture)
+    weights = vertices.weight.numpy() * np.float32(share)
+    return vertices.pixel.numpy(), columns.astype(np.int64), shares, weights
 
 
 def _nearest(vertices: Vertices, cells: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats, Floats]:

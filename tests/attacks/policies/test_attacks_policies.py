@@ -401,7 +401,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "auto": {},
     "cmaes": {"sigma": 1.0, "population": 4},
     "grid": {"points": 2},
-    "halving": {"policy": "pgd", "eta": 2, "starts": 2},
     "mixture": {"components": 2, "even": 0.5, "population": 4},
     "nes": {"sigma": 0.1, "population": 4},
     "pgd": {"step_size": 0.5, "momentum": 0.9, "random_start": True},
@@ -508,8 +507,7 @@ def test_the_budget_is_exact_with_samples_and_costly_gradients(
         on_step=lambda record, u, evaluation: asked.append(record.samples),
     )
     assert result.renders == steps or (policy.name == "grid" and result.stopped is Ending.STALLED)
-    if policy.name != "halving":
-        assert set(asked[:-1]) <= {samples}
+    assert set(asked[:-1]) <= {samples}
 
 
 @dataclass(frozen=True)

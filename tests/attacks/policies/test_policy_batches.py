@@ -20,13 +20,11 @@ COSTLY = Domain(torch.tensor([0.3, 0.6]), (Block(2),), gradient_cost=4)
 DOMAINS = {"numbers": NUMBERS, "choices": CHOICES, "differences": COSTLY}
 FORMS: dict[str, Policy[Any]] = {
     **{name: make_policy(name) for name in POLICIES},
-    "halving of cmaes": make_policy("halving", policy="cmaes", starts=3),
-    "halving of pgd": make_policy("halving", policy="pgd", starts=3),
     "restarts of nes": make_policy("restarts", policy="nes"),
     "restarts of auto": make_policy("restarts", policy="auto", times=3),
-    "halving of restarts": make_policy("halving", policy={"name": "restarts", "times": 2}, starts=3),
-    "restarts of halving": make_policy("restarts", policy={"name": "halving", "policy": "pgd", "starts": 2}, times=3),
-    "portfolio of halvings": make_policy("portfolio", policies=["halving", "sobol", {"name": "halving", "eta": 2}]),
+    "restarts of restarts": make_policy("restarts", policy={"name": "restarts", "times": 2}, times=3),
+    "restarts of portfolio": make_policy("restarts", policy={"name": "portfolio", "policies": ["pgd", "nes"]}, times=3),
+    "portfolio of races": make_policy("portfolio", policies=["restarts", "sobol", {"name": "portfolio"}]),
 }
 STEPS = 40
 
@@ -91,7 +89,7 @@ def test_of_a_batch_that_is_cut_the_first_count(policy: str) -> None:
     assert known(8, 11) == known(1, 11)
 
 
-@pytest.mark.parametrize("policy", ["cmaes", "halving", "nes", "random", "sobol", "portfolio of halvings"])
+@pytest.mark.parametrize("policy", ["cmaes", "nes", "random", "sobol", "portfolio of races"])
 def test_a_population_fills_a_batch(policy: str) -> None:
     assert max(proposed(FORMS[policy], NUMBERS, 4)[1]) == 4
 

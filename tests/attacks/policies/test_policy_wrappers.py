@@ -1,4 +1,4 @@
-"""What wraps policies: races, `restarts`, `portfolio`, `halving`, discrete choices, and how they are named."""
+"""What wraps policies: races, `restarts`, `portfolio`, discrete choices, and how they are named."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from advsearch.attacks import (
     Ending,
     Evaluated,
     Evaluation,
-    Halving,
     Policy,
     Portfolio,
     Proposal,
@@ -32,7 +31,6 @@ from advsearch.attacks import (
     Random,
     Restarts,
     SearchResult,
-    StepRecord,
     make_policy,
     search,
     seeded,
@@ -101,17 +99,17 @@ def first(u: Tensor) -> float:
 # ---- races
 
 
-@pytest.mark.parametrize(("n", "eta", "rounds"), [(1, 2, 1), (2, 2, 2), (5, 2, 4), (9, 3, 3), (10, 3, 4), (7, 1, 1)])
-def test_rounds(n: int, eta: int, rounds: int) -> None:
-    assert racing.count_rounds(n, eta) == rounds
+@pytest.mark.parametrize(("n", "rounds"), [(1, 1), (2, 2), (3, 3), (4, 3), (5, 4), (8, 4), (9, 5)])
+def test_rounds(n: int, rounds: int) -> None:
+    assert racing.count_rounds(n) == rounds
 
 
 @pytest.mark.parametrize(("steps", "each", "limit"), [(1, 1, 9), (40, 1, 999), (40, 13, 9), (1000, 1, 64), (39, 2, 8)])
 def test_as_many_run_as_can_have_a_whole_evaluation_in_every_round(steps: int, each: int, limit: int) -> None:
-    n = racing.most_runners(steps, 2, each, limit)
+    n = racing.most_runners(steps, each, limit)
     assert 1 <= n <= limit
-    assert n == 1 or n * racing.count_rounds(n, 2) * each <= steps
-    assert n == limit or (n + 1) * racing.count_rounds(n + 1, 2) * each > steps
+    assert n == 1 or n * racing.count_rounds(n) * each <= steps
+    assert n == limit or (n + 1) * racing.count_rounds(n + 1) * each > steps
 
 
 def test_who_reached_more_goes_on_with_an_equal_share_of_every_round() -> None:
@@ -247,75 +245,6 @@ def test_a_portfolio_answers_with_its_leaders_distribution() -> None:
     assert played(Portfolio((Random(), Still(0.2))), 20, first)[0].distribution is None
 
 
-# ---- halving
-
-
-def halved(policy: Halving, steps: int, value: Callable[[Tensor], float]) -> list[tuple[StepRecord, tuple[float, ...]]]:
-    told: list[tuple[StepRecord, tuple[float, ...]]] = []
-
-    def evaluate(query: Query) -> Evaluation:
-        return Evaluation(value(query.u), None, False, cost=query.samples)
-
-    search(
-        partial(map, evaluate),
-        BOX,
-        policy,
-        steps=steps,
-        seed=0,
-        candidates=0,
-        on_step=lambda record, u, evaluation: told.append((record, tuple(u.tolist()))),
-    )
-    return told
-
-
-def test_survivors_are_rendered_with_more_samples() -> None:
-    """27 renders, 9 starts, three rounds of nine: 9 of one sample, 3 of three, 1 of nine."""
-    told = halved(Halving(eta=3), 27, first)
-    assert [record.samples for record, _ in told] == [1] * 9 + [3] * 3 + [9]
-    ranked = sorted((u for _, u in told[:9]), reverse=True)
-    assert [u for _, u in told[9:12]] == ranked[:3]
-    assert told[12][1] == ranked[0]
-    assert told[0][1] == tuple(BOX.start.tolist())
-
-
-def test_only_a_rounds_own_renders_count_in_it() -> None:
-    """The first look at the worst start was lucky: it goes on, is seen through with more samples, and falls."""
-    lucky = halved(Halving(eta=3), 27, first)[0][1]
-
-    def value(u: Tensor) -> float:
-        looks.append(tuple(u.tolist()))
-        return 9.0 if looks.count(lucky) == 1 and tuple(u.tolist()) == lucky else float(u[0])
-
-    looks: list[tuple[float, ...]] = []
-    told = halved(Halving(eta=3), 27, value)
-    assert told[9][1] == lucky
-    assert told[12][1] != lucky
-
-
-def test_no_evaluation_has_too_many_samples() -> None:
-    told = halved(Halving(eta=2, starts=2), 1000, first)
-    assert max(record.samples for record, _ in told) == 64
-    assert told[-1][0].renders == 1000
-
-
-def test_a_policy_in_halving_counts_renders_as_if_its_samples_never_grew() -> None:
-    """Of 64 renders 16 for each of two searches, then 32 for one of them with two samples each: it plans for 32, and
-    has as many."""
-    plans, costs = list[int](), list[int]()
-    policy = Still(0.5, plans=(plans,), costs=(costs,))
-    _, seen = played(Halving(policy, eta=2, starts=2), 64, first)
-    assert plans == [32, 32]
-    assert (len(seen), set(costs)) == (48, {1})
-
-
-def test_halving_with_a_policy_goes_on_from_each_start() -> None:
-    policy = Halving(policy=NES(population=4), eta=2, starts=4)
-    result, seen = played(policy, 200, lambda u: -float((u - 0.9).square().sum()))
-    assert result.best_objective > -5e-3
-    assert len(seen) < 200
-    assert result.distribution is not None
-
-
 # ---- choices
 
 
@@ -374,9 +303,8 @@ def test_nested_policies_are_made_by_name() -> None:
     assert make_policy("portfolio", policies=["pgd", "cmaes"]) == Portfolio((PGD(), CMAES()))
     assert make_policy("portfolio", policies="nes") == Portfolio((NES(),))
     spec = {"name": "restarts", "policy": {"name": "pgd", "momentum": 0.9}, "times": 2}
-    assert make_policy("halving", policy=spec) == Halving(Restarts(PGD(momentum=0.9), 2))
+    assert make_policy("restarts", policy=spec) == Restarts(Restarts(PGD(momentum=0.9), 2))
     assert make_policy("restarts", policy=NES()) == Restarts(NES())
-    assert make_policy("halving", policy=None) == Halving()
 
 
 @pytest.mark.parametrize(
@@ -389,12 +317,11 @@ def test_nested_policies_are_made_by_name() -> None:
             UnknownNameError,
             "unknown option of policy 'pgd': 'speed'",
         ),
+        ("restarts", {"policy": None}, InputError, "policy of restarts: expected a name or a mapping"),
         ("restarts", {"policy": {"momentum": 0.9}}, InputError, "policy of restarts: expected a name or a mapping"),
         ("restarts", {"times": 0}, InputError, "times: expected at least 1, got 0"),
         ("portfolio", {"policies": []}, InputError, "policies of portfolio: expected one policy or more"),
         ("portfolio", {"policies": [3]}, InputError, "policies of portfolio: expected a name or a mapping"),
-        ("halving", {"eta": 1}, InputError, "eta: expected a whole number from 2 to 16, got 1"),
-        ("halving", {"starts": -1}, InputError, "starts: expected 1 to 1024, or 0 for as many as fit, got -1"),
     ],
 )
 def test_wrong_nested_policies_say_what_is_wrong(

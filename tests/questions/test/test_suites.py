@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import os
 import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 import small_models
+import torch
 import yaml
+from torch import Tensor
 
 import advsearch
 from advsearch.api.attack import attack_once
 from advsearch.cli.main import main
+from advsearch.cluster.executor import InProcess
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
-from advsearch.questions.test import machines
+from advsearch.questions.test import claims, machines
 from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
 from advsearch.questions.test.carry_out import test_from_config as carry_out
+from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
 from advsearch.questions.test.settings import SuiteConfig
+from advsearch.report.evidence import claims_of
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
@@ -100,6 +114,12 @@ def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tu
     assert "data:image/png" in page and "too-few" in page and "Failed: 2 held" in page
 
 
+def test_the_evidence_has_a_paragraph_for_each_claim(tested: tuple[SuiteResult, Path]) -> None:
+    kinds = [(one.kind, one.statement.partition(":")[0]) for one in claims_of(tested[0])]
+    measured = [("measured", name) for name in ("in-front", "behind")]
+    assert sorted(kinds) == sorted([*measured, ("nothing claimed", "too-few"), ("measured", "no-worse")])
+
+
 def test_the_command_repeats_a_claim_alone(tested: tuple[SuiteResult, Path], tmp_path: Path) -> None:
     result, _ = tested
     first = next(one for one in result.claims if one.name == "behind")
@@ -124,23 +144,67 @@ def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_
     assert much.picture == "parts/much/images/adversarial.png" and (tmp_path / "run" / much.picture).is_file()
 
 
-def test_a_suite_that_was_stopped_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front,too-few", run=str(tmp_path / "run"))
-    real, done = Problem.judge, 0
+@contextmanager
+def worked(config: AttackConfig, function: str, *more: Any) -> Iterator[InProcess | None]:
+    """In place of workers: what they would do, in this process."""
+    module, _, name = function.partition(":")
+    settings = config.to_repeat().plain()
+    yield None if config.workers is None else InProcess(getattr(import_module(module), name)(settings))
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictures(
+    workers: int | None, tested: tuple[SuiteResult, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(claims, "executor_for", worked)
+    chosen, suite = ("in-front", "no-worse", "too-few"), written(tmp_path, CLAIMS)
+    config = SuiteConfig(suite=suite, only=",".join(chosen), workers=workers, run=str(tmp_path / "run"))
+    whole = {one.name: (one.answer, one.reason, one.interval) for one in tested[0].claims if one.name in chosen}
+    front = next(one.pictures for one in tested[0].claims if one.name == "in-front")
+    real, done, last = Problem.judge, 0, 4
 
     def stopped(*given: Any) -> Any:
         nonlocal done
         done += 1
-        if done == 4:
+        if done == last:
             raise KeyboardInterrupt
         return real(*given)
 
     monkeypatch.setattr(Problem, "judge", stopped)
     first = carry_out(config)
-    assert first.goes_on and [one.reason for one in first.claims] == ["it was interrupted"] * 2
+    assert first.goes_on and {one.reason for one in first.claims} == {"it was interrupted"}
+    done, last = 0, front + 4  # in the middle of `no-worse`
     again = carry_out(config, resumed=tmp_path / "run")
-    assert again.ending == "done" and [one.answer for one in again.claims] == ["held", "undecided"]
-    assert done == 1 + sum(one.pictures for one in again.claims), "three were read back, one was asked twice"
+    assert again.goes_on and [one.answer for one in again.claims] == ["held", "undecided", "undecided"]
+    done, last = 0, -1
+    ended = carry_out(config, resumed=tmp_path / "run")
+    assert {one.name: (one.answer, one.reason, one.interval) for one in ended.claims} == whole
+    if workers is None:
+        assert done < sum(one.pictures for one in ended.claims), "what was there was read back"
+
+
+class Planted(small_models.Blue):
+    """The easy classifier with a rule that somebody planted: a dark corner makes a vase of everything."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        dark = x[:, :, :6, :6].mean(dim=(1, 2, 3)) < 0.9
+        return torch.where(dark[:, None], x.new_tensor([-9.0, 9.0]), super().forward(x))
+
+
+def planted() -> advsearch.Model:
+    """The same, as a model."""
+    return advsearch.load_model(Planted(0.11), labels=["mug", "vase"], input_size=32, name="planted")
+
+
+def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_picture(
+    tested: tuple[SuiteResult, Path], tmp_path: Path
+) -> None:
+    assert next(one for one in tested[0].claims if one.name == "in-front").answer == "held"
+    config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front", model="test_suites:planted")
+    (one,) = carry_out(config.model_copy(update={"run": str(tmp_path / "run")})).claims
+    assert one.answer == "failed" and "most wrong where it says vase: light." in one.reason
+    picture = (tmp_path / "run" / str(one.picture)).read_bytes()
+    assert base64.b64encode(picture).decode() in (tmp_path / "run" / "report.html").read_text("utf-8")
 
 
 def test_what_the_time_is_over_for_is_undecided_and_can_go_on(tmp_path: Path) -> None:
@@ -158,7 +222,7 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
     added = carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
     assert added.status == 0 and added.added == str(tmp_path / "suite.counterexamples" / "found.json")
-    assert sum(path.stat().st_size for path in folder_of(suite).iterdir()) < 20_000
+    assert sum(path.stat().st_size for path in folder_of(suite).iterdir()) < 12_000
     tried = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "tried")))
     assert [(one.name, one.answer, one.pictures) for one in tried.claims] == [
         ("found", "failed", 6),
@@ -179,7 +243,7 @@ def test_an_answer_that_does_not_hold_for_the_suite_s_model_is_not_kept(attacked
     Path(suite).write_text(yaml.safe_dump({"settings": always, "claims": {"too-few": CLAIMS["too-few"]}}))
     with pytest.raises(AdvsearchError, match="is not kept: right in 6 of 6 trials"):
         carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "run")))
-    assert counterexamples(suite) == [] and not list(folder_of(suite).glob("*.png"))
+    assert counterexamples(suite) == [] and not list(folder_of(suite).glob("*.jpg"))
 
 
 def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Path, tmp_path: Path) -> None:
@@ -190,10 +254,91 @@ def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Pa
     file.write_text(json.dumps({**kept, "settings": {**kept["settings"], "environment": "loft"}}))
     other = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "other")))
     assert other.claims[0].answer == "undecided" and "its scene is another one now" in other.claims[0].reason
+    (block,) = kept["blocks"]
     for change, message in (({"offsets": "%%"}, "expected a counterexample"), ({"numbers": 3}, "expected 3 numbers")):
-        file.write_text(json.dumps({**kept, **change}))
+        file.write_text(json.dumps({**kept, "blocks": [{**block, **change}]}))
         with pytest.raises(AdvsearchError, match=message):
             counterexamples(suite)
+
+
+def test_numbers_are_kept_finely_where_they_are_few_and_by_their_signs_on_squares_where_they_are_many() -> None:
+    generator = np.random.default_rng(0)
+    few = generator.uniform(-0.3, 0.3, 7).astype(np.float32)
+    assert np.abs(Block.of(few, True, 4).moved() - few).max() < 1e-4
+    signs = np.sign(generator.normal(size=(20, 20, 3))).repeat(2, axis=0).repeat(2, axis=1).astype(np.float32)
+    many = 0.05 * signs.ravel()
+    sizes = []
+    for squares, on, exact in ((True, 4, False), (True, 2, True), (True, 1, True), (False, 1, False)):
+        kept = Block.of(many, squares, on)
+        assert kept.moved().shape == many.shape and np.abs(kept.moved()).max() <= 0.0511
+        assert (np.abs(kept.moved() - many).max() < 1e-6) == exact
+        sizes.append(len(kept.offsets))
+    assert sizes[0] < sizes[1] < sizes[2]
+    assert Block.of(many[:-3], True, 4).square == 1, "no square texture"
+
+
+OBJECTS: dict[str, dict[str, Any]] = {
+    "log": {"$schema": str, "version!": ["2.1.0"], "runs!": ["run*"]},
+    "run": {"tool!": "tool", "invocations": ["invocation*"], "results": ["result*"]},
+    "tool": {"driver!": "driver"},
+    "driver": {"name!": str, "version": str, "rules": ["rule*"]},
+    "rule": {"id!": str, "shortDescription": "text", "defaultConfiguration": "configuration"},
+    "configuration": {"level": ["none", "note", "warning", "error"]},
+    "text": {"text!": str},
+    "invocation": {"executionSuccessful!": bool, "commandLine": str},
+    "result": {
+        "ruleId": str, "ruleIndex": int, "level": ["none", "note", "warning", "error"], "message!": "text",
+        "locations": ["location*"], "partialFingerprints": dict, "properties": dict,
+        "baselineState": ["new", "unchanged", "updated", "absent"],
+    },
+    "location": {"physicalLocation": "physical"},
+    "physical": {"artifactLocation!": "artifact", "region": "region"},
+    "artifact": {"uri": str},
+    "region": {"startLine!": int},
+}  # fmt: skip
+"""The objects of SARIF 2.1.0 that are written, as section 3 of the standard has them: their properties, "!" for one
+that has to be there; a type, an object, a list of objects ("*"), or the values that are allowed."""
+
+
+def check_sarif(value: Any, name: str = "log") -> None:
+    """Fail where an object breaks a rule of the standard."""
+    assert isinstance(value, dict), name
+    rules = {key.rstrip("!"): rule for key, rule in OBJECTS[name].items()}
+    assert set(value) <= set(rules), f"{name}: {set(value) - set(rules)}"
+    assert {key[:-1] for key in OBJECTS[name] if key.endswith("!")} <= set(value), name
+    for key, one in value.items():
+        rule = rules[key]
+        if isinstance(rule, type):
+            assert type(one) is rule, f"{name}.{key}"
+        elif isinstance(rule, str):
+            check_sarif(one, rule)
+        elif rule[0].endswith("*"):
+            assert isinstance(one, list), f"{name}.{key}"
+            for part in one:
+                check_sarif(part, rule[0][:-1])
+        else:
+            assert one in rule, f"{name}.{key}: {one}"
+    if name == "result":
+        assert all(isinstance(one, str) for one in value["partialFingerprints"].values())
+    if name == "region":
+        assert value["startLine"] >= 1
+    if name == "artifact":  # a reference by RFC 3986: no blanks, and what is no letter of a URI is escaped
+        assert re.fullmatch(r"[\w.~!$&'()*+,;=:@%/?#-]*", value["uri"], re.ASCII), value["uri"]
+
+
+def test_sarif_obeys_the_standard_whatever_a_suite_is_called(tested: tuple[SuiteResult, Path]) -> None:
+    result, _ = tested
+    for suite in (result.suite, "my suites/größe #1.yaml"):
+        check_sarif(json.loads(machines.sarif(result.model_copy(update={"suite": suite}))))
+    log = json.loads(machines.sarif(result))
+    for broken in (
+        {**log, "version": "2.0.0"},
+        {**log, "runs": [{**log["runs"][0], "tool": {}}]},
+        {**log, "runs": [{**log["runs"][0], "results": [{"ruleId": "right"}]}]},
+        {**log, "made": "today"},
+    ):
+        with pytest.raises(AssertionError):
+            check_sarif(broken)
 
 
 # ---- for machines ---------------------------------------------------------------------------------------------------
@@ -257,6 +402,17 @@ GOOD = CLAIMS["in-front"]
         ({"claims": {"a": {**GOOD, "settings": {"steps": 4}}}}, r"claims.a: unknown setting 'steps'"),
         ({"claims": {"a": {"claim": "not_broken", "settings": {"minimise": True}}}}, r"minimise: expected a search"),
         ({"claims": {"a": {"claim": "not_broken", "settings": {"seed": 3}}}}, r"seed is said for the whole suite"),
+        (
+            {"claims": {"a": {"claim": "not_broken", "at_least": 0.9}}},
+            r"a claim of this kind has no at_least",
+        ),
+        ({"claims": {"a": {**GOOD, "pictures": True}}}, r"a.pictures: expected a whole number .* got True"),
+        ({"claims": {"a": {"claim": "no_worse", "points": 3}}}, r"a.than: expected another model, by its name"),
+        (
+            {"claims": {"a": {"claim": "not_broken", "settings": {"epsilon": [0.1, 0.2]}}}},
+            r"epsilon: expected one epsilon",
+        ),
+        ({"claims": {1: GOOD}}, r"claims: expected names of small letters, .* got 1; put it in quotes"),
         ({"claims": {"A b": GOOD}}, r"claims: expected names of small letters"),
         ({"confidence": 95}, r"confidence: expected a number from 0.5 to 0.9999"),
         ({"claims": {"a": claim("no_worse", than="nonesuch", points=3)}}, r"claims.a: unknown model 'nonesuch'"),
@@ -274,11 +430,58 @@ def test_a_bad_suite_is_one_sentence_before_anything_is_rendered(
     assert not (tmp_path / "never").exists()
 
 
+def test_a_claim_that_stands_twice_in_a_suite_is_refused(tmp_path: Path) -> None:
+    suite = tmp_path / "suite.yaml"
+    suite.write_text("claims:\n  a: {claim: right, at_least: 0.9}\n  a: {claim: right, at_least: 0.8}\n")
+    with pytest.raises(AdvsearchError, match=r"got the name 'a' twice in line 3, column 3; correct"):
+        carry_out(SuiteConfig(suite=str(suite), run=str(tmp_path / "never")))
+
+
 def test_a_share_may_be_written_in_per_cent_and_an_unknown_claim_is_named(tmp_path: Path) -> None:
     suite = written(tmp_path, {"a": {**GOOD, "at_least": "50 %"}})
     assert carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "run"))).status == 0
     with pytest.raises(AdvsearchError, match=r"unknown claim in `only` 'b'"):
         carry_out(SuiteConfig(suite=suite, only="b", run=str(tmp_path / "never")))
+
+
+# ---- for other people's CI ------------------------------------------------------------------------------------------
+
+
+def test_the_commands_of_the_jobs_in_the_docs_do_what_the_jobs_want(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All but what installs: on a small suite that stands where the page's does."""
+    page = (Path(__file__).resolve().parents[3] / "docs" / "testing.md").read_text("utf-8")
+    github, gitlab = (
+        yaml.safe_load(text) for text in re.findall(r"^```yaml\n((?:name: )?robustness:?\n.*?)^```$", page, re.M | re.S)
+    )
+    monkeypatch.chdir(tmp_path)
+    Path("suites").mkdir()
+    Path(written(tmp_path, {name: CLAIMS[name] for name in ("behind", "too-few")})).rename("suites/mug.yaml")
+    program = f"{shlex.quote(sys.executable)} -c 'from advsearch.cli.main import main; raise SystemExit(main())'"
+    (tmp_path / "advsearch").write_text(f'#!/bin/sh\nexec {program} "$@" --code {EASY} --quiet\n')
+    (tmp_path / "advsearch").chmod(0o755)
+    here = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "GITHUB_STEP_SUMMARY": "shown.md"}
+    here["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+
+    def ran(line: str) -> int:
+        return subprocess.run(
+            ["bash", "-ec", line], env=here, cwd=tmp_path, capture_output=True, check=False
+        ).returncode
+
+    steps = github["jobs"]["robustness"]["steps"]
+    lines = [one["run"] for one in steps if "run" in one and not one["run"].startswith("pip ")]
+    assert [ran(line) for line in lines] == [1, 0], "a claim failed, and the summary is shown all the same"
+    assert "| behind | failed |" in Path("shown.md").read_text("utf-8")
+    uploads = {one["uses"].partition("@")[0]: one["with"] for one in steps if "with" in one and "uses" in one}
+    check_sarif(json.loads(Path(uploads["github/codeql-action/upload-sarif"]["sarif_file"]).read_text("utf-8")))
+    assert len(list(Path(uploads["actions/upload-artifact"]["path"]).glob("*/report.html"))) == 1
+    job = gitlab["robustness"]
+    (line,) = (one for one in job["script"] if not one.startswith("pip "))
+    Path("junit.xml").unlink()
+    assert ran(line) == 1 and ElementTree.parse(job["artifacts"]["reports"]["junit"]).getroot().get("failures") == "1"
+    seeds = {json.loads(path.read_text("utf-8"))["seed"] for path in Path("runs").glob("*/summary.json")}
+    assert len(seeds) == 2, "the night's is a fresh one"
 
 
 # ---- for pytest -----------------------------------------------------------------------------------------------------

@@ -73,6 +73,8 @@ def write_scene(
         InputError: something in it is no part of stock Mitsuba.
     """
     description, filter = scene.made
+    if description.camera_model is not None:
+        raise InputError("camera: stock Mitsuba has no sensor with distortion; export the run as glTF (.glb) instead")
     kind = "volpath" if scene.volumetric else "path"  # not `prbvolpath`, which starts outside of all media
     integrator: Plugin = {"type": kind, "max_depth": scene.max_depth, "rr_depth": NO_ROULETTE, "hide_emitters": hide}
     base = scene_dict(description, scene.resolution, filter, scene.sampler)

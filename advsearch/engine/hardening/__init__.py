@@ -1,1 +1,0 @@
-"""Making a model better: what it is trained on, how, and what it is measured on."""

@@ -1,1 +1,0 @@
-"""Work-precision diagrams: error against run time, measured in interleaved rounds."""

@@ -1,1 +1,0 @@
-"""The stability suite: extreme cases, each with what must hold."""

@@ -1,0 +1,1 @@
+"""Every derivative of a scene beside differences."""

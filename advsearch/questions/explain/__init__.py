@@ -1,0 +1,1 @@
+"""Why a model is wrong, in words, from rows of sweeps."""

@@ -1,0 +1,212 @@
+"""`explain`: failures in words, from the rows of sweeps, confirmed by fresh renders."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from advsearch.api.keywords import RunKeywords, asks, configured
+from advsearch.attacks import clopper_pearson
+from advsearch.config import SweepConfig
+from advsearch.errors import InputError
+from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Factor, Observations, observed
+from advsearch.explanations.rules import (
+    CHANCE,
+    FEWEST_ROWS,
+    CountedRule,
+    condition_rows,
+    find_rules,
+)
+from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.explain.answer import (
+    EnvelopeRow,
+    ExplainResult,
+    ParameterWeight,
+    RightOf,
+    RuleNotTold,
+    RuleRow,
+)
+from advsearch.questions.explain.findings import Envelope, FactorWeight, find_envelope, find_importance
+from advsearch.questions.explain.renders import AskedSweep, Renders, right_of
+from advsearch.questions.explain.settings import ExplainConfig
+from advsearch.runs.directory import PARTS, RunDirectory, find_run
+from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.summary import read_result
+from advsearch.settings import split_names
+from advsearch.viewer.pages import write_page
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class ExplainKeywords(RunKeywords, total=False):
+    """Of `explain`."""
+
+    confirm: int
+    pairs: int
+    clusters: int
+    accuracy: float
+    seed: int
+    threads: int | None
+
+
+@asks(ExplainConfig, ExplainKeywords)
+def explain(
+    sweeps: str | Path | Sequence[str | Path],
+    *,
+    progress: Watched = None,
+    **settings: Unpack[ExplainKeywords],
+) -> ExplainResult:
+    """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
+
+    All other arguments are the settings of `advsearch explain`. The run is kept, in `run` or under runs/.
+
+    Args:
+        sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
+            recipe, its sweeps.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=watcher(progress))
+
+
+def explain_from_config(
+    config: ExplainConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> ExplainResult:
+    """Explain what a configuration describes; renders are sweeps in `parts/`, and those that are done stay done.
+
+    Raises:
+        InputError: too few rows, nothing that varies, or a missing library.
+        FileFormatError: a run is not a finished sweep.
+    """
+    begun, progress = time.perf_counter(), progress or NullProgress()
+    progress.stage("reading rows")
+    asked = [AskedSweep.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
+    rows = [row for one in asked for row in one.rows]
+    if len(rows) < FEWEST_ROWS:
+        raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
+    found = observed([(_shown(row), row.correct) for row in rows])
+    choosing, counting = found.halves(config.seed)
+    progress.stage("seeking rules on one half of the rows")
+    sought = find_rules(choosing, counting, config.seed)
+    rules = sought.told
+    progress.stage("measuring which parameters matter")
+    importance = find_importance(found)
+    envelope = find_envelope(choosing, counting, config.accuracy)
+    with RunDirectory.of(config, resumed) as run:
+        renders = Renders(run.path, progress, config, found)
+        table = [_rule_row(rule, found.factors, renders.confirmed(rule, n, asked)) for n, rule in enumerate(rules)]
+        pairs = list(renders.pairs(rules, rows, asked))
+        clusters = renders.clusters(asked, run)
+        first = asked[0].summary
+        right = int(found.right.sum())
+        result = ExplainResult(
+            run=str(run.path),
+            sweeps=[str(one.folder) for one in asked],
+            object=_together(one.summary.object for one in asked),
+            model=_together(one.summary.model for one in asked),
+            environment=_together(one.summary.environment for one in asked),
+            controls=first.controls,
+            parameters=[one.name for one in found.factors],
+            right=right,
+            total=len(found),
+            interval=clopper_pearson(right, len(found)),
+            rules=table,
+            not_told=None if sought.next is None else _not_told(sought.next, found),
+            importance=_weights(importance, found.factors),
+            envelope=None if envelope is None else _envelope_row(envelope, found.factors, config.accuracy),
+            pairs=pairs,
+            pairs_sought=min(config.pairs, len(found) - right),
+            clusters=clusters,
+            renders=renders.count,
+            ending=INTERRUPTED if renders.interrupted else "done",
+            warnings=[*renders.warnings, *_cautions(rows, importance)],
+            seconds={"total": time.perf_counter() - begun},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        run.write_summary(result)
+        write_page(run.path, result)
+        return result
+
+
+def _sweeps_of(folder: Path) -> list[Path]:
+    """Return the folder of a sweep, or those of the sweeps that a recipe consists of."""
+    made = read_result(folder)
+    if made.command != "recipe":
+        return [folder]
+    listed = getattr(made, "parts", ())
+    parts = [folder / PARTS / part.name for part in listed if part.command == SweepConfig.command]
+    if not parts:
+        raise InputError(f"explain: expected sweeps, got {folder}, a recipe without one")
+    return parts
+
+
+def _shown(row: Answered) -> dict[str, tuple[float | str, str]]:
+    return {name: (value, row.units.get(name, "")) for name, value in row.values.items()}
+
+
+def _together(names: Iterator[str] | Sequence[str]) -> str:
+    return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
+
+
+def _cautions(rows: Sequence[Answered], importance: Sequence[FactorWeight]) -> list[str]:
+    right = sum(row.correct for row in rows)
+    if right in (0, len(rows)):
+        return [f"The model is {'right' if right else 'wrong'} in every row: there is nothing to tell apart."]
+    if all(one.interval[0] <= 0.0 for one in importance):
+        return ["No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
+    return []
+
+
+# ---- rows of the answer ---------------------------------------------------------------------------------------------
+
+
+def _rule_row(rule: CountedRule, factors: Sequence[Factor], confirmed: RightOf | None) -> RuleRow:
+    return RuleRow(
+        conditions=condition_rows(rule.conditions, factors),
+        **vars(right_of(rule.right, rule.of)),
+        elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
+        confirmed=confirmed,
+    )
+
+
+def _envelope_row(one: Envelope, factors: Sequence[Factor], accuracy: float) -> EnvelopeRow:
+    rows = condition_rows(one.conditions, factors)
+    return EnvelopeRow(conditions=rows, **vars(right_of(one.right, one.of)), accuracy=accuracy, held=one.held)
+
+
+def _weights(importance: Sequence[FactorWeight], factors: Sequence[Factor]) -> list[ParameterWeight]:
+    return [
+        ParameterWeight(
+            parameters=[factors[place].name for place in one.places],
+            share=one.share,
+            interval=one.interval,
+            parts=one.parts,
+        )
+        for one in importance
+    ]
+
+
+def _not_told(rule: CountedRule, found: Observations) -> RuleNotTold:
+    times = rule.times_needed()
+    return RuleNotTold(
+        conditions=condition_rows(rule.conditions, found.factors),
+        **vars(right_of(rule.right, rule.of)),
+        elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
+        chance=rule.chance,
+        asked=CHANCE,
+        rows=None if times is None else round_up(times * len(found)),
+    )
+
+
+def round_up(rows: float) -> int:
+    """Return a number of rows with two digits that mean something: 173.2 becomes 180."""
+    step: int = 10 ** max(0, math.floor(math.log10(rows)) - 1)
+    return math.ceil(rows / step) * step

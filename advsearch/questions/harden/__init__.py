@@ -1,0 +1,1 @@
+"""Training a copy of a model on its worst cases."""

@@ -1,0 +1,437 @@
+"""What `harden` does with single scenes, in this process or on workers: draws lessons from one, attacks one, or looks
+at one as it is."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from safetensors import torch as safetensors
+
+from advsearch import seeds
+from advsearch.api.attack import attack_on, problem_of
+from advsearch.attacks.verification import WORST_CASE
+from advsearch.bundled.objects import OBJECTS
+from advsearch.cluster.executor import Call
+from advsearch.config import AttackConfig
+from advsearch.engine import run_settings
+from advsearch.engine.loading import Scene, load_scene
+from advsearch.engine.naming import load_models, scene_settings
+from advsearch.engine.problem import Problem
+from advsearch.errors import InputError
+from advsearch.files import JsonObject
+from advsearch.models import Model
+from advsearch.models.trainable import trainable
+from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
+from advsearch.questions.harden.settings import ALL, HardenConfig
+from advsearch.runs.results.base import INTERRUPTED
+from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
+from advsearch.scene.formation import levels_of
+from advsearch.scene.library import list_environments
+from advsearch.scene.settings import Given
+from advsearch.settings import split_names
+from advsearch.tasks import make_task
+
+ROBUST = "robust"
+"""Of a scene in which nothing was found; otherwise there is an ending."""
+
+OVER: dict[str, dict[str, object]] = {
+    "camera": {"azimuth": [0.0, 360.0], "elevation": [8.0, 55.0], "roll": [-6.0, 6.0]},
+    "environment": {"rotation": [0.0, 360.0], "exposure": [-0.8, 0.5]},
+}
+"""What varies by chance from view to view, unless it is searched."""
+
+TRIES_TO_CHOOSE = 6
+"""Random configurations of a view that is rendered to choose weights by, of which the worst counts."""
+CLEAN_SCENES, CLEAN_VIEWS = 4, 2
+"""Held-out scenes whose plain pictures are looked at, for each one that is attacked, and the views of each."""
+CLEAN_SPP = 16
+
+STRONGER = {"name": "portfolio", "policies": [{"name": "restarts", "policy": "pgd"}, "cmaes", "random"]}
+"""The policy of the stronger search, with three times the steps."""
+TIMES = 3
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Lessons that are wanted of a scene.
+
+    Attributes:
+        side: name of the split.
+        number: of the scene.
+        controls: that make them harder together; none for plain ones alone.
+        views: that are made harder.
+        plain: views of the scene as it is.
+        shared: whether all views share one adversarial texture.
+        beside: controls that vary by chance from view to view.
+    """
+
+    side: str
+    number: int
+    controls: tuple[str, ...]
+    views: int
+    plain: int
+    shared: bool = False
+    beside: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Attacking:
+    """An attack that is wanted on a held-out scene.
+
+    Attributes:
+        control: that is searched.
+        number: of the scene.
+        times: how much longer than usual; more than once is the stronger search.
+        weights: of the model, safetensors; None for those that it was given with.
+    """
+
+    control: str
+    number: int
+    times: int
+    weights: bytes | None = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Looking:
+    """Plain pictures that are wanted of a held-out scene.
+
+    Attributes:
+        number: of the scene.
+    """
+
+    number: int
+
+
+Wanted = Drawing | Attacking | Looking
+
+
+def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
+    """Return the sides of the split by name.
+
+    Raises:
+        InputError: there is nothing on a side, or one environment on both.
+    """
+    objects = tuple(OBJECTS) if config.object == ALL else config.objects
+    known = tuple(name for name in objects if name not in OBJECTS or _has_class(model, OBJECTS[name].label))
+    if not known:
+        raise InputError(f"object: model {model.name} has a class for none of {', '.join(objects)}; name others")
+    files = [name for name in known if name not in OBJECTS]
+    if files and config.held_out is None:
+        raise InputError(
+            f"held_out: {', '.join(files)} has no other instances; name objects of its class that training never sees"
+        )
+    held = known if config.held_out is None else split_names(config.held_out)
+    training = split_names(config.environment) if config.environment else list_environments("train")
+    asked = config.held_out_environment
+    measured = split_names(asked) if asked else list_environments("heldout")
+    taught = [
+        Split(name, known, training, seeds.stream(config.seed, name), True) for name in (TRAINING, FURTHER, VALIDATION)
+    ]
+    measured_on = Split(HELD_OUT, held, measured, seeds.stream(config.seed, HELD_OUT))
+    return {one.name: one for one in (*taught, measured_on)}
+
+
+def _has_class(model: Model, label: str) -> bool:
+    try:
+        return bool(model.label_set(label).indices)
+    except InputError:
+        return False
+
+
+def scenes_of(settings: JsonObject) -> Call:
+    """Return what does what is wanted of scenes of the hardening that the settings describe: what a worker does."""
+    config = HardenConfig(**settings)
+    task = make_task(config.task)
+    (model, *_), _ = load_models([config.model], task, config)
+    gc.freeze()  # what a scene leaves is collected after each; a sixth of the time goes into looking at all the rest
+    return SceneWork(config, model, splits_of(config, model))
+
+
+@dataclass
+class SceneWork:
+    """What is done with single scenes; pure functions of what is wanted.
+
+    Attributes:
+        config: of the run.
+        model: as it was given.
+        splits: by name.
+    """
+
+    config: HardenConfig
+    model: Model
+    splits: Mapping[str, Split]
+
+    def __call__(self, wanted: Iterable[Wanted]) -> list[list[Lesson] | str]:
+        """Return what came of each: lessons, or how an attack ended."""
+        return [self._done(one) for one in wanted]
+
+    def _done(self, one: Wanted) -> list[Lesson] | str:
+        if isinstance(one, Attacking):
+            return self._attack(one)
+        return self._look(one) if isinstance(one, Looking) else self._draw(one)
+
+    @cached_property
+    def linear(self) -> tuple[str, ...]:
+        """The controls whose pictures a matrix of light transport says; the others are rendered."""
+        side = self.splits[TRAINING]
+        return tuple(one for one in self.config.controls if has_matrix(self._problem(side, 0, (one,))[0]))
+
+    @cached_property
+    def rendered(self) -> tuple[str, ...]:
+        """The controls whose pictures no matrix says."""
+        return tuple(one for one in self.config.controls if one not in self.linear)
+
+    @cached_property
+    def beside(self) -> tuple[str, ...]:
+        """The controls that are rendered which can vary by chance beside every matrix."""
+        return tuple(one for one in self.rendered if self._can_vary(one))
+
+    def _can_vary(self, control: str) -> bool:
+        side = self.splits[TRAINING]
+        try:
+            return all(has_matrix(self._problem(side, 0, (one,), (control,))[0]) for one in self.linear)
+        except InputError:
+            return False
+
+    @cached_property
+    def _measured(self) -> frozenset[str]:
+        """Fingerprints of the objects of all held-out scenes."""
+        count = CLEAN_SCENES * self.config.measured
+        return frozenset(fingerprint(asset) for asset in self.splits[HELD_OUT].assets(count))
+
+    def _draw(self, one: Drawing) -> list[Lesson]:
+        problem, seed = self._problem(self.splits[one.side], one.number, one.controls, one.beside)
+        tries = TRIES_TO_CHOOSE if one.side == VALIDATION else None
+        found = lessons(problem, one.views, seed, tries=tries, shared=one.shared) if one.views else []
+        return found + plain_lessons(problem, one.plain, seed)
+
+    def _attack(self, one: Attacking) -> str:
+        """How an attack ended: "robust" where it found nothing and the clean scene is right in as many trials as a
+        verified answer would have to be wrong in."""
+        config, model = self.config, self.model
+        if one.weights is not None:
+            student = trainable(model)
+            student.net.load_state_dict(safetensors.load(one.weights))
+            model = student.model
+        name, scene = self.splits[HELD_OUT].scene(one.number, self._set)
+        seed = seeds.stream(config.seed, f"measured {one.control}", one.number)
+        harder_search = {} if one.times == 1 else {"policy": STRONGER, "steps": one.times * config.steps}
+        return attacked(self._of((one.control,), name, seed=seed, **harder_search), scene, model)
+
+    def _look(self, one: Looking) -> list[Lesson]:
+        side, controls = self.splits[HELD_OUT], tuple(self.config.controls)[:1]
+        problem, _ = self._problem(side, one.number, controls)
+        right, found = tuple(int(index) for index in problem.truth()), list[Lesson]()
+        for view in range(CLEAN_VIEWS):
+            seed = seeds.stream(side.seed, "plain", one.number * CLEAN_VIEWS + view)
+            found.append(Lesson(right, levels_of(problem.picture(problem.domain.start, seed, CLEAN_SPP))))
+        return found
+
+    def _problem(
+        self, side: Split, number: int, controls: Sequence[str], beside: Sequence[str] = ()
+    ) -> tuple[Problem, int]:
+        """What a scene is searched as, with controls that vary by chance beside, and the root of its lessons' draws."""
+        name, scene = side.scene(number, self._set)
+        if side.name != HELD_OUT:
+            check_unmeasured(scene.description.object, self._measured)
+        kinds = {control.partition(":")[0].partition(".")[0] for control in (*controls, *beside)}
+        over = {other: given for other, given in OVER.items() if other not in kinds}
+        over |= {control: self.config.controls[control] for control in beside}
+        problem = problem_of(self._of(controls, name, over=over), scene, self.model, differentiated=False)
+        return problem, seeds.stream(side.seed, "views", number)
+
+    @property
+    def _set(self) -> Given:
+        return scene_settings(self.config)
+
+    def _of(self, controls: Sequence[str], name: str, **changes: object) -> AttackConfig:
+        """What some of the controls are searched with, on an object of a name."""
+        config, given = self.config, {control: self.config.controls[control] for control in controls}
+        own: dict[str, object] = dict.fromkeys(run_settings.RUN_SETTINGS)
+        for control in controls:
+            for setting, value in run_settings.alone(config, control, given[control]).items():
+                before = own[setting]
+                if isinstance(before, Mapping) and isinstance(value, Mapping):
+                    own[setting] = {**before, **value}
+                elif value is not None:
+                    own[setting] = value
+        found: dict[str, object] = {"object": name, "environment": None, "set_": {}, "exposure": 0.0, **own, **changes}
+        found |= {"controls": given, "measure": "no", "baseline": False, "workers": None, "cluster": None}
+        return AttackConfig.of(config, **found)
+
+
+def attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
+    """Attack, and return how it ended; `ROBUST` where nothing was found and the clean scene is steadily right."""
+    found = attack_on(config, scene, model).summary
+    if found.ending == INTERRUPTED:
+        raise KeyboardInterrupt
+    control = found.clean.control
+    steady = control is not None and control.correct >= WORST_CASE.needed(control.trials)
+    if found.ending in ("found", "already wrong"):
+        return found.ending
+    return ROBUST if steady else "unsteady"
+
+
+TRAINING, FURTHER, VALIDATION, HELD_OUT = "training", "further training", "validation", "held out"
+"""The splits: what the weights are fitted to (the second mostly as it is), what chooses among them, and what is
+measured in the end."""
+
+ELEVATION = (8.0, 55.0)
+FIELD = (25.0, 45.0)
+GROUND = (0.1, 0.9)
+"""Ranges from which scenes draw the camera's elevation and field of view in degrees, and the ground's colour (sRGB)."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """One side of the split.
+
+    Attributes:
+        name: one of the above.
+        objects: names of bundled objects, or files.
+        environments: names or files.
+        seed: root of its draws.
+        varied: whether each scene has an environment of its own, made from one of these (`variation`).
+    """
+
+    name: str
+    objects: tuple[str, ...]
+    environments: tuple[str, ...]
+    seed: int
+    varied: bool = False
+
+    def scene(self, number: int, given: Given | None = None) -> tuple[str, Scene]:
+        """Return the scene with this number, and the name of its object; the objects take turns.
+
+        An object in a file that brings no label is called as the file: ``coffee-mug.glb`` is a "coffee mug".
+
+        Args:
+            number: from 0; equal numbers are equal scenes.
+            given: parameters that are fixed in every scene.
+        """
+        name, rng = self.objects[number % len(self.objects)], self._draws(number)
+        made = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
+        environment = self.environments[int(rng.integers(len(self.environments)))]
+        ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
+        drawn = {
+            "camera.azimuth": rng.uniform(0.0, 360.0),
+            "camera.elevation": rng.uniform(*ELEVATION),
+            "camera.fov": rng.uniform(*FIELD),
+            "environment.rotation": rng.uniform(0.0, 360.0),
+            **dict(zip(("ground.red", "ground.green", "ground.blue"), ground, strict=True)),
+        }
+        settings = {**{key: float(value) for key, value in drawn.items()}, **(given or {})}
+        scene = load_scene(made, environment, settings=settings)
+        own = scene.description
+        if self.varied and own.environment is not None:
+            own = replace(own, environment=white_light_changed(varied(own.environment, rng), rng))
+            scene = Scene(own)
+        if own.object.label is None:
+            label = Path(name).stem.replace("-", " ").replace("_", " ")
+            scene = Scene(replace(own, object=replace(own.object, label=label)))
+        return name, scene
+
+    def _draws(self, number: int) -> np.random.Generator:
+        """What a scene is drawn from, its object first."""
+        return np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
+
+    def assets(self, count: int) -> Iterator[ObjectAsset]:
+        """Yield the objects of the first `count` scenes; what a file holds comes once."""
+        files = set[str]()
+        for number in range(count):
+            name = self.objects[number % len(self.objects)]
+            if name in OBJECTS:
+                yield OBJECTS[name].generate(self._draws(number))
+            elif name not in files:
+                files.add(name)
+                yield self.scene(number)[1].description.object
+
+
+def fingerprint(asset: ObjectAsset) -> str:
+    """Return what is equal for equal shapes with equal textures."""
+    found = hashlib.sha256()
+    for part in (asset.mesh.vertices, asset.mesh.faces, asset.base_color):
+        found.update(np.ascontiguousarray(part).tobytes())
+    return found.hexdigest()
+
+
+def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
+    """Refuse to measure what is trained on: one of the training's environments, or one of its files.
+
+    Of each bundled object the first instance is looked at; all others are checked when they are drawn, by
+    `check_unmeasured`: to make them takes minutes.
+
+    Args:
+        held: what is measured.
+        taught: what weights are fitted to and chosen by.
+
+    Raises:
+        InputError: they share something; it is named.
+    """
+    both = sorted({name for split in taught for name in split.environments} & set(held.environments))
+    if both:
+        raise InputError(f"held_out_environment: {', '.join(both)} is an environment of the training too; name others")
+    measured = {fingerprint(asset) for asset in held.assets(len(held.objects))}
+    for split in taught:
+        for asset in split.assets(len(split.objects)):
+            check_unmeasured(asset, measured)
+
+
+def check_unmeasured(asset: ObjectAsset, measured: Set[str]) -> None:
+    """Refuse to train on an object whose fingerprint is among those of what is measured.
+
+    Raises:
+        InputError: it is; it is named.
+    """
+    if fingerprint(asset) in measured:
+        raise InputError(f"held_out: {asset.name} is an object of the training too; name others")
+
+
+WARM = (1.06, 0.18, -1.25)
+"""Logarithms of what light of 2,700 K has of red, green and blue, beside light of 6,500 K; their mean is about zero."""
+OF_WARM = (-0.24, 1.0)
+"""Ends of the uniform factor of `WARM`: about 10,000 and 2,700 K."""
+WHITE_LIGHT_CHANGES = 0.5
+"""How often the colour of light is changed."""
+
+
+def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
+    """Mirror, tint, change the contrast of, and add one soft light to an environment, each by chance."""
+    radiance = environment.radiance[:, ::-1] if rng.random() < 0.5 else environment.radiance
+    radiance = radiance * np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
+    mean = float(radiance.mean()) + 1e-6
+    radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
+    if rng.random() < 0.5:
+        radiance = radiance + mean * _soft_light(radiance.shape[:2], rng)
+    return replace(environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32))
+
+
+def white_light_changed(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
+    """Change the colour temperature of all light of an environment, by chance, in one of two cases.
+
+    Relative to daylight (D65), what a black body of 2,700 K (an incandescent lamp) gives in linear sRGB is about
+    exp(`WARM`), and one of 10,000 K (a clear sky in the shade) about exp(-0.24 `WARM`); the amount is uniform between.
+    """
+    if rng.random() >= WHITE_LIGHT_CHANGES:
+        return environment
+    factors = np.exp(rng.uniform(*OF_WARM) * np.asarray(WARM)).astype(np.float32)
+    return replace(environment, radiance=np.ascontiguousarray(environment.radiance * factors))
+
+
+def _soft_light(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
+    """A broad lobe from a random direction above the horizon, in units of the map's mean; (H, W, 1)."""
+    height, width = shape
+    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
+    phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
+    tilt, turn = rng.uniform(0.1, 1.3), rng.uniform(0.0, 2.0 * math.pi)
+    cosine = np.cos(theta) * math.cos(tilt) + np.sin(theta) * math.sin(tilt) * np.cos(phi - turn)
+    sharpness = rng.uniform(20.0, 150.0)
+    lobe = rng.uniform(2.0, 12.0) * np.exp(sharpness * (cosine - 1.0))
+    return np.asarray(lobe[..., None], dtype=np.float32)

@@ -1,0 +1,292 @@
+"""Training on lessons. Weights are averaged over the steps; the average is what is judged and kept."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from safetensors import torch as safetensors
+from torch import Tensor, nn
+
+from advsearch import seeds, threads
+from advsearch.models import Model
+from advsearch.models.trainable import Trainable
+from advsearch.progress import Progress
+from advsearch.questions.harden.answer import TrainingRound
+from advsearch.questions.harden.lessons import (
+    ARCHIVE,
+    FOLDER,
+    TOGETHER,
+    Lesson,
+    TextureLesson,
+    harder,
+    save_pictures,
+    with_worst,
+    write_archive,
+)
+from advsearch.questions.harden.scenes import TRAINING, VALIDATION
+from advsearch.questions.harden.settings import HardenConfig
+from advsearch.questions.harden.steps import Gradients
+from advsearch.report.phrases import percent
+from advsearch.runs.directory import ARTIFACTS, RunDirectory
+from advsearch.runs.files import write_bytes
+
+BATCH = 24
+WEIGHT_DECAY = 0.02
+LARGEST_GRADIENT_NORM = 2.0
+WARM_UP = 0.1
+AVERAGE = 0.98
+"""Weight of the past in the average of the weights, per step."""
+HELD_BACK_STEPS = 8
+"""Steps of the textures that weights are judged on, from where a search begins."""
+
+Examples = Iterable[tuple[Tensor, Tensor]]
+"""Batches of images (N, H, W, 3) sRGB in [0, 1] and class indices (N,), such as a `DataLoader`'s."""
+MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a model does on lessons that it was not trained on.
+
+    Attributes:
+        clean: share of plain pictures that it has right.
+        robust: share of the worst pictures, searched for against these weights.
+    """
+
+    clean: float
+    robust: float
+
+
+@dataclass
+class Course:
+    """A training.
+
+    Attributes:
+        student: what is trained.
+        given: the model as it was given; its answers to plain pictures are kept.
+        config: what was asked for; of an optimiser of the user's, its own learning rate counts.
+        optimiser: makes one of the parameters; None for AdamW.
+        beside: further examples; a batch of them is taken with each step, from the start again when they end.
+    """
+
+    student: Trainable
+    given: Model
+    config: HardenConfig
+    optimiser: MakeOptimiser | None = None
+    beside: Examples | None = None
+    _further: Iterator[tuple[Tensor, Tensor]] = field(default_factory=lambda: iter(()))
+
+    def round(self, number: int, chosen: Sequence[Lesson], tick: Callable[[], None] = lambda: None) -> None:
+        """Train on lessons; the student has the average of the weights afterwards.
+
+        Args:
+            number: of the round; decides the order.
+            chosen: lessons.
+            tick: told of every step.
+        """
+        parameters, config = self.student.parameters(), self.config
+        if self.optimiser is None:
+            optimiser: torch.optim.Optimizer = torch.optim.AdamW(parameters, lr=config.rate, weight_decay=WEIGHT_DECAY)
+        else:
+            optimiser = self.optimiser(parameters)
+        steps, done, places = self.steps(chosen), 0, self._places(chosen)
+        highest = [float(group["lr"]) for group in optimiser.param_groups]
+        rates = torch.optim.lr_scheduler.OneCycleLR(
+            optimiser, highest, total_steps=steps + 1, pct_start=WARM_UP, cycle_momentum=False
+        )
+        average = [one.detach().clone() for one in parameters]
+        rng = np.random.default_rng([seeds.stream(config.seed, "order"), number])
+        with threads.one_each_for_torch() as pool:
+            gradients = Gradients(self.student, self.given, pool)
+            for _ in range(config.epochs):
+                order = rng.permutation(places)
+                for begin in range(0, len(order), BATCH):
+                    batch = [chosen[place] for place in order[begin : begin + BATCH]]
+                    self._step(batch, gradients, optimiser, int(rng.integers(2**62)))
+                    rates.step()
+                    done += 1
+                    decay = min(AVERAGE, done / (done + 5))
+                    for kept, one in zip(average, parameters, strict=True):
+                        kept.lerp_(one.detach(), 1.0 - decay)
+                    tick()
+        with torch.no_grad():
+            for kept, one in zip(average, parameters, strict=True):
+                one.copy_(kept)
+
+    def steps(self, chosen: Sequence[Lesson]) -> int:
+        """Steps of a round over lessons."""
+        return self.config.epochs * -(-len(self._places(chosen)) // BATCH)
+
+    def _places(self, chosen: Sequence[Lesson]) -> list[int]:
+        """Places of lessons, as often as an epoch looks at each."""
+        often = [self.config.texture_looks if isinstance(one, TextureLesson) else 1 for one in chosen]
+        return [place for place, times in enumerate(often) for _ in range(times)]
+
+    def _step(self, batch: Sequence[Lesson], gradients: Gradients, optimiser: torch.optim.Optimizer, seed: int) -> None:
+        optimiser.zero_grad(set_to_none=True)
+        gradients.take(batch, None if self.beside is None else self._next(), seed)
+        nn.utils.clip_grad_norm_(self.student.parameters(), LARGEST_GRADIENT_NORM)
+        optimiser.step()
+
+    def _next(self) -> tuple[Tensor, Tensor]:
+        assert self.beside is not None
+        found = next(self._further, None)
+        if found is None:
+            self._further = iter(self.beside)
+            found = next(self._further)
+        return found
+
+
+def score(model: Model, held_back: Sequence[Lesson]) -> Score:
+    """Judge a model on lessons, which stay as they are; those that nothing makes harder count for `clean` alone."""
+    own = [copy.copy(one) for one in held_back]
+    for one in own:
+        if isinstance(one, TextureLesson):
+            one.texture = copy.copy(one.texture)
+    harder(own, model, HELD_BACK_STEPS)
+    return Score(right_share(model, own, "plain"), right_share(model, with_worst(own), "worst"))
+
+
+def right_share(model: Model, chosen: Sequence[Lesson], which: str) -> float:
+    """Return the share of lessons of which a model has the "plain" or the "worst" picture right."""
+    right = 0
+    with torch.no_grad():
+        for begin in range(0, len(chosen), TOGETHER):
+            part = chosen[begin : begin + TOGETHER]
+            answers = model(torch.stack([getattr(one, which) for one in part])).argmax(dim=1).tolist()
+            right += sum(answer in one.right for answer, one in zip(answers, part, strict=True))
+    return right / len(chosen)
+
+
+WEIGHTS = "hardened.safetensors"
+ROUNDS = "rounds"
+"""The note under which the store keeps the scores."""
+FIRST_STEPS = 4
+"""Steps of each texture before a training."""
+VALIDATION_VIEWS, JUDGED = 2, 168
+PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
+"""Of the way from the weights that were given to the trained ones, which are judged."""
+
+Draw = Callable[[str, str, Sequence[int], int], list[Lesson]]
+"""From what to tell the progress, the name of a split, numbers of its scenes and the views of each to lessons."""
+
+
+@dataclass
+class TrainingRounds:
+    """The rounds of a run.
+
+    Attributes:
+        run: keeps them.
+        course: trains.
+        draw: draws lessons.
+        progress: told how far it is.
+        done: what each round came to; the first is the model as it was.
+    """
+
+    run: RunDirectory
+    course: Course
+    draw: Draw
+    progress: Progress
+    done: list[TrainingRound] = field(init=False)
+
+    def __post_init__(self) -> None:
+        noted = json.loads(self.run.store.note(ROUNDS) or "[]")
+        self.done = [TrainingRound.of(one) for one in noted]
+
+    @property
+    def judged(self) -> int:
+        """Scenes by which weights are chosen, for each control: a third as many as a round adds, up to `JUDGED`."""
+        return min(-(-self.course.config.scenes // 3), JUDGED)
+
+    @property
+    def best(self) -> int:
+        """The round whose weights are kept: the most robust one whose clean accuracy is within what may be lost."""
+        allowed = [number for number, one in enumerate(self.done) if self._allowed(one.clean)]
+        return max(allowed, key=lambda number: (self.done[number].robust, number))
+
+    def _allowed(self, clean: float) -> bool:
+        return clean >= self.done[0].clean - self.course.config.clean_loss - 1e-9
+
+    def carry_out(self) -> None:
+        """Do what is left of the rounds; the student has the best weights afterwards, which the run keeps."""
+        if len(self.done) <= self.course.config.rounds:
+            self._train()
+        student = self.course.student
+        student.net.load_state_dict(self._weights(self.best))
+        self._save(WEIGHTS)
+        folder = self.run.path / ARTIFACTS
+        write_archive(folder / FOLDER, folder / ARCHIVE)
+
+    def _train(self) -> None:
+        student, config, pool, begun = self.course.student, self.course.config, list[Lesson](), 0
+        held_back = self.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged), VALIDATION_VIEWS)
+        if not self.done:
+            self._keep(0, [], score(student.model, held_back), 0, 0.0)
+        for number in range(1, config.rounds + 1):
+            places = range((number - 1) * config.scenes, number * config.scenes)
+            new = self.draw(f"round {number}: drawing scenes", TRAINING, places, config.views)
+            pool += new
+            if number < len(self.done):
+                continue  # done before this run was stopped
+            student.net.load_state_dict(self._weights(number - 1))
+            self.progress.stage(f"round {number}: training", self.course.steps(pool))
+            with threads.all_for_torch():
+                harder(pool[begun:], student.model, FIRST_STEPS)  # the others are as hard as their training left them
+                self.course.round(number, pool, lambda: self.progress.advance(1))
+                found, part = self._mixed(held_back)
+            begun = len(pool)
+            self._keep(number, new, found, len(pool), part)
+
+    def _mixed(self, held_back: Sequence[Lesson]) -> tuple[Score, float]:
+        """Leave the student with the best part of the way from the weights that were given; return its score and it.
+
+        The best one is right most often on the worst pictures among those that lose no more on plain ones than they
+        may; where all lose more, it is the one that loses least. Less of the way learned less: once that shows, the
+        smaller parts are not looked at, as each costs a search of its own.
+        """
+        student, given = self.course.student, self._weights(0)
+        learned = {name: one.clone() for name, one in student.net.state_dict().items()}
+
+        def take(part: float) -> None:
+            mixed = {name: torch.lerp(given[name], one, part) if one.is_floating_point() else one
+                     for name, one in learned.items()}  # fmt: skip
+            student.net.load_state_dict(mixed)
+
+        found = dict[float, Score]()
+        for part in PARTS:
+            take(part)
+            found[part] = score(student.model, held_back)
+            robust = [one.robust for one in found.values() if self._allowed(one.clean)]
+            if robust and robust[-1] < max(robust):
+                break
+        allowed = [part for part, one in found.items() if self._allowed(one.clean)]
+        best = max(allowed, key=lambda part: found[part].robust, default=max(found, key=lambda part: found[part].clean))
+        take(best)
+        return found[best], best
+
+    def _keep(self, number: int, new: Sequence[Lesson], found: Score, trained: int, part: float) -> None:
+        """Keep weights, what they came to, and the round's pictures."""
+        model = self.course.student.model
+        self._save(_file(number))
+        save_pictures(self.run.path / ARTIFACTS / FOLDER, number, new, model.labels)
+        done = TrainingRound(lessons=trained, part=part, clean=found.clean, robust=found.robust, kept=False)
+        self.done.append(done)
+        self.run.store.set_note(ROUNDS, json.dumps([one.model_dump() for one in self.done]))
+        clean, worst = percent(found.clean), percent(found.robust)
+        self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
+
+    def _save(self, name: str) -> None:
+        state = {key: one.contiguous() for key, one in self.course.student.net.state_dict().items()}
+        write_bytes(self.run.path / ARTIFACTS / name, safetensors.save(state))
+
+    def _weights(self, number: int) -> dict[str, torch.Tensor]:
+        return safetensors.load((self.run.path / ARTIFACTS / _file(number)).read_bytes())
+
+
+def _file(number: int) -> str:
+    return f"round-{number:03d}.safetensors"

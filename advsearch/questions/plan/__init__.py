@@ -1,0 +1,1 @@
+"""How a search gets its derivatives, and what it leaves out."""

@@ -1,0 +1,297 @@
+"""Plans a search on its scene: how it differentiates, and what it leaves out. What `advsearch plan` does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from advsearch import seeds
+from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, configured
+from advsearch.engine.bounces import bounces_of, most_pictures
+from advsearch.engine.gradients import inside
+from advsearch.engine.loading import Scene
+from advsearch.engine.measuring import Results, kept_rows
+from advsearch.engine.naming import AnyModel
+from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
+from advsearch.engine.problem import Problem
+from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, GainRow, PlanResult, TexelRow
+from advsearch.questions.plan.leaving_out import measured_gains, most_gradients, resolved_texels
+from advsearch.questions.plan.settings import PlanConfig
+from advsearch.report.wording import count
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.base import Formation
+from advsearch.runs.results.derivatives import CosineRow, PathLength
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):
+    """Of `plan`."""
+
+    objective: str | None
+    seconds: float | None
+
+
+PlannedRow = CosineRow | PathLength | GainRow | TexelRow
+
+
+@asks(PlanConfig, PlanKeywords)
+def plan(
+    object: Scene | str | Path = "mug",
+    model: AnyModel = "reference",
+    *,
+    progress: Watched = None,
+    **settings: Unpack[PlanKeywords],
+) -> PlanResult:
+    """Choose how every derivative of a search is obtained and what is left out, by measurement (docs/gradients.md).
+
+    All other arguments are the settings of `advsearch plan`. The run is kept, in `run` or under runs/.
+
+    Args:
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    config = configured(PlanConfig, object=object, model=model, **settings)
+    return plan_from_config(config, progress=watcher(progress))
+
+
+def plan_from_config(
+    config: PlanConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> PlanResult:
+    """Choose how every derivative is obtained and what is left out, by measurement, and say why.
+
+    What is measured is kept at once in a run directory, so that a plan that was stopped, by Ctrl-C, by a kill or
+    because its `seconds` were over, goes on where it was and ends with the same rows; times differ, and what is chosen
+    by them (estimators, the better denoiser) may.
+
+    Args:
+        config: scene, model, controls, and where the run is kept.
+        progress: told how far it is.
+        resumed: the folder of a run to go on with.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    progress, begun = progress or NullProgress(), time.perf_counter()
+    with RunDirectory.of(config, resumed) as run:
+        progress.stage(LOADING)
+        results = Results(run, config.seconds)
+        problem, _ = problem_from_config(config)
+        work = _Measurements(problem, config, results, progress)
+
+        def result(rows: Sequence[PlannedRow], ending: str) -> PlanResult:
+            return work.result(rows, ending, str(run.path), time.perf_counter() - begun)
+
+        return kept_rows(run, results, work.rows(), result)
+
+
+class _Measurements:
+    """What a plan measures, one after the other, what matters most first.
+
+    Args:
+        problem: whose derivatives are planned.
+        config: of the plan.
+        results: what is known already.
+        progress: told how far it is.
+    """
+
+    def __init__(self, problem: Problem, config: PlanConfig, results: Results, progress: Progress) -> None:
+        self._problem, self._config, self._results, self._progress = problem, config, results, progress
+        self._other = "none" if config.denoise == "oidn" else "oidn"
+        self._seed = seeds.stream(config.seed, "measure")
+        self._plan = problem.renderer.plan
+        self._controls = list(dict.fromkeys(one.control for one in self._plan.groups if one.estimator != "none"))
+        self._gradients = plan_gradients(self._plan, every=True)
+        self._left = ["ways to differentiate"] * bool(self._gradients)
+        self._left += [f"step and samples of {name}" for name in self._controls]
+        self._left += ["what can be left out"] * config.specialise
+        self._left += [f"{name} with denoiser {self._other}" for name in self._controls]
+
+    def rows(self) -> Iterator[PlannedRow]:
+        """Measure, and yield each row as it comes.
+
+        Raises:
+            OutOfTime: the time of the results is up.
+        """
+        if self._gradients:
+            self._compare_estimators()
+            self._left.pop(0)
+        own: list[CosineRow] = []
+        for control in self._controls:
+            for row in self._cosines(self._problem, control, f"choosing step and samples for {control}"):
+                own.append(row)
+                yield row
+            self._left.pop(0)
+        if self._config.specialise:
+            self._problem.renderer.plan, _ = tuned(self._plan, own)
+            yield from self._leaving_out()
+            self._left.pop(0)
+        if not self._controls:
+            return
+        self._results.check_time()
+        self._progress.stage("loading the scene for the other denoiser")
+        other, _ = problem_from_config(self._config, denoise=self._other)
+        other.plan = other.plan.with_estimator({one.name: one.estimator for one in self._plan.groups}, "as beside")
+        for control in self._controls:
+            yield from self._cosines(other, control, f"the same for {control} with denoiser {self._other}")
+            self._left.pop(0)
+
+    def result(self, rows: Sequence[PlannedRow], ending: str, run: str, seconds: float) -> PlanResult:
+        """Return what some rows come to.
+
+        Args:
+            rows: so far.
+            ending: how it ended.
+            run: the folder.
+            seconds: that it took.
+        """
+        problem, config = self._problem, self._config
+        table = [row for row in rows if isinstance(row, CosineRow)]
+        tables = {name: [row for row in table if row.denoise == name] for name in (config.denoise, self._other)}
+        chosen, spp = tuned(self._plan, tables[config.denoise])
+        used = {group.estimator for group in chosen.groups}
+        gradient = problem.plan_summary(chosen)
+        left_out = config.specialise and "what can be left out" not in self._left
+        return PlanResult(
+            run=run,
+            object=config.object,
+            environment=problem.environment,
+            controls=list(config.controls),
+            model=problem.model.name,
+            ending=ending,
+            not_measured=list(self._left),
+            image_formation=Formation.of(problem.renderer.formation),
+            renders_per_gradient=gradient.renders_per_gradient,
+            spp=spp or problem.spp,
+            groups=gradient.groups,
+            cosines=table,
+            denoise=quieter(tables, config.denoise),
+            left_out=_left_out(problem, used) if config.specialise else [],
+            specialised=config.specialise,
+            gains=[row for row in rows if isinstance(row, GainRow)] or None,
+            bounces=next((row for row in rows if isinstance(row, PathLength)), None),
+            texels=[row for row in rows if isinstance(row, TexelRow)] if left_out else None,
+            limits=_limits() if "material" in used else [],
+            seconds={"total": seconds},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+
+    def _compare_estimators(self) -> None:
+        """Choose every contested estimator."""
+        problem, renderer = self._problem, self._problem.renderer
+        hint = f"{self._gradients} gradients of {count(problem.spp, 'sample')} a pixel; `resolution` shortens it"
+        self._progress.stage("comparing ways to differentiate", self._gradients, hint=hint)
+        self._plan = renderer.plan = measured_plan(
+            renderer,
+            problem.loss,
+            inside(renderer),
+            seed=self._seed,
+            spp=problem.spp,
+            every=True,
+            tick=lambda: self._progress.advance(1),
+            keep=self._results.get,
+        )
+
+    def _cosines(self, problem: Problem, control: str, title: str) -> Iterator[CosineRow]:
+        renderer, only = problem.renderer, (control,)
+
+        def kept(name: str, measure: Callable[[], Any]) -> Any:
+            return self._results.get(f"{renderer.formation.denoiser} {name}", measure)
+
+        hint = "counted in samples a pixel; `resolution` shortens it, `seconds` ends it"
+        self._progress.stage(title, cosine_samples(renderer.plan, controls=only), hint=hint, at_most=True)
+        u, tick = inside(renderer), self._progress.advance
+        for row in cosines(renderer, problem.loss, u, seed=self._seed, controls=only, tick=tick, keep=kept):
+            yield row
+            self._progress.message(  # whoever reads it can stop the plan and find the row kept
+                f"{control}: a gradient of {row.spp} samples and {row.factor:g} x the step has a cosine of "
+                f"{row.cosine:.2f} with the converged one"
+            )
+
+    def _leaving_out(self) -> Iterator[PlannedRow]:
+        """What leaving things out of a search's renders brings, and the proof that it is safe."""
+        problem, renderer, progress = self._problem, self._problem.renderer, self._progress
+        seed, u = seeds.stream(self._config.seed, "leaving out"), inside(renderer)
+
+        def tick() -> None:
+            progress.advance(1)
+
+        def lengths() -> PathLength:
+            progress.stage("finding how many bounces of light matter", most_pictures(problem), hint=hint, at_most=True)
+            return bounces_of(problem, self._config.seed, tick=tick)
+
+        def gains() -> list[GainRow]:
+            progress.stage("measuring what leaving things out saves", most_gradients(), hint=hint, at_most=True)
+            depth = length.depth
+            return measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=depth, tick=tick)
+
+        hint = "`specialise=false` leaves it out"
+        yield (length := self._results.row("bounces", PathLength, lengths))
+        yield from self._results.rows("gains", GainRow, gains)
+        yield from self._results.rows("texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
+
+
+def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAdvice:
+    """Say which denoiser makes the better gradients: the one that reaches the goal in all controls in less time.
+
+    A denoiser is part of the image formation, the same in search and verification, so that this is advice: another one
+    is another question.
+
+    Args:
+        tables: denoiser to its measured cosines.
+        asked: the run's.
+    """
+
+    def rank(name: str) -> tuple[bool, float]:
+        best = [
+            max((row for row in tables[name] if row.control == control), key=lambda row: row.cosine)
+            for control in dict.fromkeys(row.control for row in tables[name])
+        ]
+        reached = all(row.status == "ok" for row in best)
+        return not reached, sum(row.seconds for row in best) if reached else -min(row.cosine for row in best)
+
+    measured = [name for name in tables if tables[name]]
+    if len(measured) == 1 and len(tables) > 1:
+        return DenoiserAdvice(asked=asked, advised=asked, reason="the other one was not measured")
+    advised = min(measured, key=rank) if measured else asked
+    reached = bool(measured) and not rank(advised)[0]
+    why = (
+        f"a cosine of {GOAL:g} in every control, in less time"
+        if reached
+        else "the greater cosine, though below the goal"
+        if measured
+        else "nothing was measured"
+    )
+    return DenoiserAdvice(asked=asked, advised=advised, reason=why)
+
+
+def _limits() -> list[EstimatorLimit]:
+    """What the material form does not cover, as it states itself."""
+    from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS
+
+    return [EstimatorLimit.of(limit) for limit in LIMITS]
+
+
+def _left_out(problem: Problem, used: set[str]) -> list[str]:
+    """What a search with these estimators does not compute, in sentences."""
+    sentences = []
+    if "material" not in used:
+        sentences.append("boundary terms: nothing that an adjoint differentiates moves an outline")
+    if not used & BY_ADJOINT:
+        sentences.append("adjoint renders: no coordinate needs one")
+    if not used & BY_DIFFERENCES:
+        sentences.append("renders for differences: every derivative is an adjoint or of the picture itself")
+    if not problem.renderer.scene.volumetric:
+        sentences.append("the volumetric integrator: there is no medium")
+    return sentences

@@ -1,0 +1,275 @@
+"""Error and direction of each control's gradient against run time, estimator by estimator."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.engine.gradients import Estimate, Loss, Probe, estimated, judge, reference
+from advsearch.questions.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
+from advsearch.questions.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
+from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
+from advsearch.scene.gradients.group import Group
+from advsearch.scene.gradients.plan import BY_ADJOINT, compared
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.renderer import LinearRenderer, linear_inputs
+
+COUNTS = (4, 8, 16, 32, 64, 128, 256)
+BY_COORDINATE = 32
+"""Sets of at most so many coordinates have a reference by differences, coordinate by coordinate."""
+ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
+"""An adjoint takes about as long as so many renders, the kernels that the material form compiles included; any other
+as the dearest of these. It only decides what is measured first."""
+MATRIX = "matrix"
+"""The series of gradients by a matrix of light transport, from as many samples a pixel as its points have."""
+MATRIX_COST = 2.0
+"""Making a matrix takes about as long as so many renders of as many samples."""
+CHECK_SPP = 64
+
+
+@dataclass(frozen=True)
+class GradientPart:
+    """Coordinates of one control whose gradient one call of an estimator answers.
+
+    Attributes:
+        name: of the control; with parameters where a control has several such parts.
+        groups: of coordinates.
+        estimators: what is compared.
+    """
+
+    name: str
+    groups: tuple[Group, ...]
+    estimators: tuple[str, ...]
+
+    @property
+    def names(self) -> set[str]:
+        """Of the groups."""
+        return {group.name for group in self.groups}
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return sum(group.size for group in self.groups)
+
+    def of(self, gradient: Tensor) -> Array:
+        """Return the part's entries (n,) of a whole gradient (d,)."""
+        return _array(torch.cat([gradient[group.coordinates] for group in self.groups]))
+
+
+def estimated_parts(groups: Sequence[Group], *, linear: bool, by_matrix: Collection[str] = ()) -> list[GradientPart]:
+    """Return the parts of a space with the estimators that are valid for them.
+
+    Args:
+        groups: of the plan.
+        linear: whether the loss is linear: differences of the loss are then those of the picture, and left out.
+        by_matrix: names of the groups for which there is a matrix too; see `matrix_groups`.
+    """
+    sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
+    for group in groups:
+        if group.valid:
+            sets.setdefault((group.control, group.valid), []).append(group)
+    several = {control for control, _ in sets if sum(name == control for name, _ in sets) > 1}
+    found = []
+    for (control, valid), members in sets.items():
+        names = ",".join(one.parameter for one in members)
+        if len(names) > 28:
+            names = f"{members[0].parameter},... ({len(members)})"
+        worth = compared(valid, sum(one.size for one in members))
+        usable = [one for one in worth if not (linear and one == "secant")]
+        usable += [MATRIX] if all(one.name in by_matrix for one in members) else []
+        found.append(
+            GradientPart(f"{control}.{names}" if control in several else control, tuple(members), tuple(usable))
+        )
+    return found
+
+
+def matrix_groups(renderer: Renderer) -> frozenset[str]:
+    """Return the names of the groups that change base colours only, so that a matrix gives their gradient."""
+    linear = linear_inputs(renderer)
+    routes = {group.name: renderer.routes.get(group.name, frozenset()) for group in renderer.plan.groups}
+    return frozenset(name for name, inputs in routes.items() if inputs and inputs <= linear)
+
+
+def theory_of(estimator: str, sampler: str) -> Theory:
+    """Return the slope that theory gives the error of an estimator against samples of a sampler.
+
+    The interior adjoint is an unbiased mean of samples. Differences have the bias of their step; the material form has
+    its limits.
+    """
+    if estimator != "adjoint":
+        return UNKNOWN
+    return INDEPENDENT if sampler == "independent" else STRATIFIED
+
+
+class GradientBench:
+    """Takes gradients of one part of a space by every estimator and compares them with a reference.
+
+    Args:
+        renderer: in the formation that the gradient is of.
+        loss: what is differentiated.
+        u: (d,) where.
+        part: of what.
+        exact: renders the same with a better sampler, for references; None takes the renderer itself.
+        elsewhere: from a way to take it and samples to what carries out parts of the reference, if not this process.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        loss: Loss,
+        u: Tensor,
+        part: GradientPart,
+        exact: Renderer | None = None,
+        elsewhere: Callable[[str, int], Parts | None] = lambda by, spp: None,
+    ) -> None:
+        self._renderer, self._loss, self._u, self.part = renderer, loss, u, part
+        self._exact, self.elsewhere = exact or renderer, elsewhere
+        self.reference: ReferenceValue | None = None
+        self.part_spp = 0
+        self.by = ""
+
+    @property
+    def settings(self) -> list[MeasuredSetting]:
+        """Everything to measure."""
+        return [
+            MeasuredSetting("gradient", one, count, count * self._cost(one), self.part.name)
+            for one in self.part.estimators
+            for count in COUNTS
+        ]
+
+    def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
+        """Find the reference: differences at two steps where the coordinates are few, else the mean of an adjoint."""
+        few = self.part.size <= BY_COORDINATE
+        adjoints = [one for one in self.part.estimators if one in BY_ADJOINT]
+        self.by = "differences" if few or not adjoints else adjoints[0]
+        if few:
+            self._by_differences(budget, seed, on_done)
+        else:
+            self._by_estimator(budget, seed, on_done)
+
+    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
+        """Take one gradient and return its error and cosine, and the seconds, the picture itself included; of a matrix
+        its making too, and beside that what another gradient from it takes."""
+        begun = time.perf_counter()
+        later: dict[str, float] = {}
+        if setting.series == MATRIX:
+            made = LinearRenderer(self._renderer, self._u, seed, spp=setting.spp)
+            ready = time.perf_counter()
+            found = self.part.of(made.gradient(self._loss, self._u, seed, setting.spp)[1])
+            later = {"later_seconds": time.perf_counter() - ready}
+        else:
+            found = self._estimated(self._renderer, setting.series, seed, setting.spp)
+        seconds = time.perf_counter() - begun
+        assert self.reference is not None
+        error, cosine = self.reference.relative_error(found), self.reference.cosine(found)
+        return {"error": error, "cosine": cosine, **later}, seconds
+
+    def floor(self, setting: MeasuredSetting, measure: str) -> float:
+        """The reference's own relative error."""
+        return 0.0 if self.reference is None else self.reference.error
+
+    def bias(self, budget: TimeBudget, seed: int) -> str | None:
+        """Check a reference by an adjoint against differences along one direction; a sentence if it is biased."""
+        if self.by == "differences" or self.reference is None or budget.left <= 0.0:
+            return None
+        value = torch.from_numpy(self.reference.value).to(torch.float32)
+        probe = self._along(value, seed)
+        against = reference(self._exact, self._loss, self._u, probe, seed=seed, spp=CHECK_SPP, repeats=(2, 4))
+        own = float(value @ torch.cat([probe.direction[group.coordinates] for group in self.part.groups]))
+        if judge(Estimate(self.by, own, self.reference.error * abs(own), 1, 0.0), against).status != "biased":
+            return None
+        return (
+            f"{self.part.name}: the reference is the mean of {self.by}, and along one direction it gives {own:.3g}, "
+            f"differences {against.value:.3g} +- {against.noise:.1g}: its errors leave out that bias"
+        )
+
+    # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _cost(self, estimator: str) -> float:
+        if estimator == MATRIX:
+            return 1.0 + MATRIX_COST
+        renders = sum(replace(group, estimator=estimator).renders for group in self.part.groups)
+        if estimator in BY_ADJOINT:
+            return 1.0 + ADJOINT_COST[estimator]
+        return 1.0 + renders
+
+    def _estimated(self, renderer: Renderer, estimator: str, seed: int, spp: int) -> Array:
+        gradient = estimated(renderer, self._loss, self._u, estimator, self.part.names, seed, spp)
+        return self.part.of(gradient)
+
+    def part_of(self, by: str, spp: int, seed: int) -> Array:
+        """Return a part of the reference: (n,) of an estimator, or (2, n) by differences: the derivatives along each
+        coordinate, and how far their two steps are apart."""
+        if by != "differences":
+            return self._estimated(self._exact, by, seed, spp)
+        both = [self._difference(probe, seed, spp) for probe in self._coordinates]
+        found: Array = np.array(both, dtype=np.float64).T
+        return found
+
+    @property
+    def _coordinates(self) -> list[Probe]:
+        return [_coordinate(self._u, group, number) for group in self.part.groups for number in range(group.size)]
+
+    def _gathered(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[Array]:
+        by, spp = self.by, self.part_spp
+        parts = self.elsewhere(by, spp) or one_by_one(partial(self.part_of, by, spp))
+        return gather(parts, budget, seed=seed, name=f"precision {self.part.name}", on_done=on_done)
+
+    def _by_differences(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
+        along = self._coordinates
+        rate = self._rate(lambda spp: self._difference(along[0], seed, spp)) * len(along)
+        self.part_spp = part_samples(rate, budget.left, parts=3, counts=(16, 64, 256))
+        found = self._gathered(budget, seed, on_done)
+        left = float(np.linalg.norm(np.mean([apart for _, apart in found], axis=0))) / 4.0
+        self.reference = reference_of([value for value, _ in found], bias=left)
+
+    def _difference(self, probe: Probe, seed: int, spp: int) -> tuple[float, float]:
+        """The derivative along a probe, extrapolated to a step of zero, and how far its two steps are apart."""
+        one = reference(self._exact, self._loss, self._u, probe, seed=seed, spp=spp, repeats=(1, 1))
+        return one.value, one.steps[0] - one.steps[1]
+
+    def _by_estimator(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
+        by = self.by if self.by != "differences" else self.part.estimators[0]
+        self.by = by
+        rate = self._rate(lambda spp: self._estimated(self._exact, by, seed, spp))
+        self.part_spp = part_samples(rate, budget.left)
+
+        self.reference = reference_of(self._gathered(budget, seed, on_done))
+
+    def _rate(self, call: Callable[[int], object], pilot: int = 16) -> float:
+        """Seconds a sample, from the second of two calls."""
+        for _ in range(2):
+            begun = time.perf_counter()
+            call(pilot)
+            seconds = time.perf_counter() - begun
+        return seconds / pilot
+
+    def _along(self, value: Tensor, seed: int) -> Probe:
+        """A direction in all coordinates: the signs of the gradient and half as many random ones."""
+        generator = torch.Generator().manual_seed(seeds.stream(seed, "precision direction"))
+        signs = torch.randint(0, 2, value.shape, generator=generator).to(value.dtype) * 2.0 - 1.0
+        mixed = (value.sign() + 0.5 * signs) / 1.5
+        direction, begin = torch.zeros_like(self._u), 0
+        for group in self.part.groups:
+            direction[group.coordinates] = mixed[begin : begin + group.size]
+            begin += group.size
+        group = self.part.groups[0]
+        return Probe(group, group.name, direction, group.step if group.size <= 64 else 0.03)
+
+
+def _coordinate(u: Tensor, group: Group, number: int) -> Probe:
+    direction = torch.zeros_like(u)
+    direction[group.begin + number] = 1.0
+    return Probe(replace(group, size=1, begin=group.begin + number), f"{group.name}.{number}", direction, group.step)
+
+
+def _array(values: Tensor) -> Array:
+    found: Array = values.detach().to(torch.float64).numpy().copy()
+    return found

@@ -1,0 +1,310 @@
+"""Measures settings in interleaved rounds inside a time budget, cheapest first (work-precision diagrams).
+
+What is measured is a function of a setting and a seed; nothing here knows how to render. Rounds are interleaved
+(every setting once, then every setting again), so that a machine that slows down meanwhile does so for all of them.
+"""
+
+from __future__ import annotations
+
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from advsearch import seeds, threads
+from advsearch.cluster.executor import Executor
+from advsearch.errors import ClusterError
+from advsearch.questions.precision.answer import Machine
+from advsearch.questions.precision.points import Array, MeasuredSetting
+
+Result = TypeVar("Result")
+Measure = Callable[[MeasuredSetting, int], tuple[Result, float]]
+"""From a setting and a seed to what came out and the seconds it took."""
+
+LEAST = 5
+"""Calls of a setting that have to fit into the budget for it to be begun."""
+CLAIM = 0.25
+"""Share of the time left that one setting may lay claim to."""
+MOST_PARTS = 64
+"""Independent parts of a reference, at most."""
+
+
+class TimeBudget:
+    """Seconds that may be spent.
+
+    Args:
+        seconds: from now on.
+        clock: seconds, growing.
+    """
+
+    def __init__(self, seconds: float, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
+        self._end = clock() + seconds
+
+    @property
+    def left(self) -> float:
+        """Seconds left, not below 0."""
+        return max(0.0, self._end - self._clock())
+
+    def share(self, part: float) -> TimeBudget:
+        """Return a budget of a part, in [0, 1], of what is left."""
+        return TimeBudget(part * self.left, self._clock)
+
+
+@dataclass
+class Rounds(Generic[Result]):
+    """What was measured.
+
+    Attributes:
+        results: what came out and its seconds, for each setting in the order in which they were taken.
+        left_out: settings that did not fit into the budget at all.
+        complete: whether every setting had all its rounds.
+    """
+
+    results: dict[MeasuredSetting, list[tuple[Result, float]]] = field(default_factory=dict)
+    left_out: tuple[MeasuredSetting, ...] = ()
+    complete: bool = True
+
+
+def in_rounds(
+    settings: Iterable[MeasuredSetting],
+    measure: Measure[Result],
+    budget: TimeBudget,
+    *,
+    rounds: int,
+    seed: int,
+    least: int = LEAST,
+    warm_up: int = 1,
+    on_done: Callable[[MeasuredSetting], None] | None = None,
+) -> Rounds[Result]:
+    """Measure settings in rounds until the rounds are done or the budget is used up.
+
+    In the first round a setting is begun only if `least` calls of it, and those that the settings before it still need
+    for as many, fit into what is left; see `Forecast`. The first of all is always measured.
+
+    Args:
+        settings: what to measure, cheapest first.
+        measure: see `Measure`; gets a seed that no other call gets.
+        budget: when to stop. A call that should not fit is not begun: it is kept to within a setting's first calls.
+        rounds: calls of each setting, at least 1, warm-up aside.
+        seed: root of the seeds.
+        least: see above.
+        warm_up: so many calls more of every setting in the first round, whose calls compile and record kernels.
+        on_done: told about every call.
+    """
+    ordered = sorted(settings, key=lambda one: one.cost)
+    found: Rounds[Result] = Rounds()
+    forecast = Forecast(found.results, cold=warm_up + 1 if warm_up else 0)
+
+    def call(setting: MeasuredSetting) -> None:
+        taken = found.results.setdefault(setting, [])
+        name = f"precision {'/'.join(setting.line)}/{setting.spp}"
+        taken.append(measure(setting, seeds.stream(seed, name, len(taken))))
+        if on_done is not None:
+            on_done(setting)
+
+    for setting in ordered:
+        needed = forecast.first() + least * forecast.seconds(setting) + forecast.owed(least, budget.left)
+        if found.results and needed > budget.left:
+            continue
+        call(setting)
+        for _ in range(warm_up):
+            if budget.left > 0.0:
+                call(setting)
+    begun = [one for one in ordered if one in found.results]
+    for _ in range(1, rounds):
+        for setting in begun:
+            if forecast.seconds(setting) > budget.left:
+                found.complete = False
+            else:
+                call(setting)
+    found.left_out = tuple(one for one in ordered if one not in found.results)
+    found.complete = found.complete and not found.left_out
+    return found
+
+
+class Forecast(Generic[Result]):
+    """What a call should take, judged by those before it.
+
+    Args:
+        results: what was measured so far; read anew at every question.
+        cold: first calls of a setting that take longer, and say little about the next.
+    """
+
+    def __init__(self, results: dict[MeasuredSetting, list[tuple[Result, float]]], cold: int) -> None:
+        self._results, self._cold = results, cold
+
+    def seconds(self, setting: MeasuredSetting) -> float:
+        """A call but the first: as the setting's own, else in proportion to its line's dearest setting, else at the
+        highest rate of any line; 0 where nothing is known."""
+        if setting in self._results:
+            return self._warm(setting)
+        rates: dict[tuple[str, str, str], tuple[float, float]] = {}
+        for one in self._results:
+            rates[one.line] = max(rates.get(one.line, (0.0, 0.0)), (one.cost, self._warm(one) / one.cost))
+        if setting.line in rates:
+            return rates[setting.line][1] * setting.cost
+        return max((rate for _, rate in rates.values()), default=0.0) * setting.cost
+
+    def first(self) -> float:
+        """What the first calls take beyond that: the median so far."""
+        more = [
+            sum(seconds for _, seconds in taken[: self._cold]) - self._cold * self._warm(one)
+            for one, taken in self._results.items()
+            if len(taken) > self._cold
+        ]
+        return max(0.0, statistics.median(more)) if more else 0.0
+
+    def owed(self, least: int, left: float) -> float:
+        """What the settings begun still need for as many calls each. One that needs more than a share `CLAIM` of what
+        is left turned out too dear, and waits until the end."""
+        needs = [max(0, least - len(taken)) * self._warm(one) for one, taken in self._results.items()]
+        return sum(need for need in needs if need <= CLAIM * left)
+
+    def _warm(self, setting: MeasuredSetting) -> float:
+        taken = [seconds for _, seconds in self._results[setting]]
+        return statistics.median((taken[self._cold :] or taken[-1:])[-3:])
+
+
+Parts = Callable[[Iterator[int]], Iterator[tuple[int, Array]]]
+"""From seeds to each seed with what came of it, in any order; asks for another seed only when it begins with it."""
+
+
+def one_by_one(part: Callable[[int], Array]) -> Parts:
+    """Return what carries out parts in this process, one after the other."""
+    return lambda wanted: ((seed, part(seed)) for seed in wanted)
+
+
+def gather(
+    parts: Parts,
+    budget: TimeBudget,
+    *,
+    seed: int,
+    name: str = "reference",
+    least: int = 2,
+    most: int = MOST_PARTS,
+    on_done: Callable[[], None] | None = None,
+) -> list[Array]:
+    """Return independent parts of a reference, each from a seed of its own, as many as fit into a budget.
+
+    Args:
+        parts: from seeds to arrays of one shape, float64.
+        budget: when to stop.
+        seed: root of the seeds.
+        name: of the stream of seeds.
+        least: parts that there are whatever they take: without two, nothing is known about the error.
+        most: parts at most.
+        on_done: told about every part.
+    """
+    found: list[Array] = []
+    begun: dict[int, float] = {}
+    slowest = 0.0
+
+    def wanted() -> Iterator[int]:
+        for number in range(most):
+            if number >= least and slowest >= budget.left:
+                return
+            one = seeds.stream(seed, name, number)
+            begun[one] = budget.left
+            yield one
+
+    for one, array in parts(wanted()):
+        found.append(array)
+        slowest = max(begun[one] - budget.left, 0.5 * slowest)
+        if on_done is not None:
+            on_done()
+    return found
+
+
+def part_samples(rate: float, seconds: float, *, parts: int = 4, counts: Sequence[int] = (16, 64, 256, 1024)) -> int:
+    """Return the largest of some sample counts of which `parts` parts fit into some seconds; the least if none does.
+
+    Args:
+        rate: seconds a sample.
+        seconds: for all parts.
+        parts: how many at least.
+        counts: rising.
+    """
+    fitting = [count for count in counts if parts * count * rate <= seconds]
+    return fitting[-1] if fitting else counts[0]
+
+
+@dataclass(frozen=True)
+class ReferencePart:
+    """A part of a reference.
+
+    Attributes:
+        name: of what is measured in one sitting.
+        by: what of it, or how it is taken: see `PictureBench.part` and `GradientBench.part_of`.
+        spp: samples a pixel.
+        seed: of its noise.
+    """
+
+    name: str
+    by: str
+    spp: int
+    seed: int
+
+
+def shared_parts(executor: Executor | None, name: str, by: str, spp: int) -> Parts | None:
+    """Return what has workers carry out parts; None where there are no workers.
+
+    It raises ClusterError if every worker dies of one.
+    """
+    if executor is None:
+        return None
+
+    def parts(wanted: Iterator[int]) -> Iterator[tuple[int, Array]]:
+        results: Any = executor.results([ReferencePart(name, by, spp, seed)] for seed in wanted)
+        with closing(results):
+            for done in results:
+                if done.lost:
+                    raise ClusterError(f"{name}, a part of its reference: {done.lost}; leave `workers` out")
+                yield done.items[0].seed, done.value[0]
+
+    return parts
+
+
+_CPU_INFO = Path("/proc/cpuinfo")
+
+
+def timing_machine(cpu_info: Path = _CPU_INFO) -> Machine:
+    """Return what a time has to be read with: the processor, its cores, and the threads in use.
+
+    Args:
+        cpu_info: Linux's description of the processor.
+    """
+    return Machine(
+        cpu=_cpu_name(cpu_info),
+        cores=threads.cores(),
+        threads=_threads(),
+        system=f"{platform.system()} {platform.machine()}",
+        python=platform.python_version(),
+    )
+
+
+def _cpu_name(cpu_info: Path) -> str:
+    """The processor's name; what the system says where the file has none."""
+    try:
+        for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip().lower() == "model name" and value.strip():
+                return " ".join(value.split())
+    except OSError:
+        pass
+    return platform.processor() or platform.machine() or "unknown"
+
+
+def _threads() -> dict[str, int]:
+    """Threads of the renderer and of torch, as far as they are loaded."""
+    found = {}
+    if "drjit" in sys.modules:
+        found["render"] = int(sys.modules["drjit"].thread_count())
+    if "torch" in sys.modules:
+        found["torch"] = int(sys.modules["torch"].get_num_threads())
+    return found

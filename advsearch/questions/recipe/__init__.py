@@ -1,0 +1,1 @@
+"""Experiments that YAML files describe, and what their figures say."""

@@ -1,0 +1,257 @@
+"""A recipe as its YAML file describes it: runs of the commands there are, and figures of what they answer."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.explanations.answered import ANSWER, GROUP, PART, PHOTOGRAPHS
+from advsearch.questions.recipe.figures import read_options
+from advsearch.questions.recipe.figures.base import Options
+from advsearch.settings import read_yaml
+from advsearch.settings.configuration import PLACE
+from advsearch.settings.yaml_files import merged
+
+COMMANDS = ("attack", "sweep")
+"""What a part may be."""
+
+OWN = (*PLACE, "object", "seed", "threads", "deterministic", "label")
+"""Settings that a part has from the recipe's command and may not say itself."""
+
+"""What stands for the part of photographs, which none renders."""
+
+MOST_PARTS, MOST_FIGURES = 64, 32
+
+Settings = dict[str, object]
+
+
+class _Described(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Part(_Described):
+    """Runs of one command, one for each object.
+
+    Attributes:
+        command: one of `COMMANDS`.
+        settings: of that command, over those that all parts have.
+        around: a part whose searches answer with distributions: what this one draws is drawn from those.
+        drawn_as: a part with the same ranges: this one draws the very configurations that that one does.
+    """
+
+    command: str
+    settings: Settings = Field(default_factory=dict)
+    around: str | None = None
+    drawn_as: str | None = None
+
+    @field_validator("command")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in COMMANDS:
+            raise ValueError(f"expected {' or '.join(COMMANDS)}, got {value[:40]!r}")
+        return value
+
+    @field_validator("settings")
+    @classmethod
+    def _not_own(cls, value: Settings) -> Settings:
+        own = [name for name in value if name in OWN]
+        if own:
+            raise ValueError(f"{own[0]!r} is the same for all parts; leave it out here")
+        return value
+
+
+class Changes(_Described):
+    """What `quick` makes different.
+
+    Attributes:
+        settings: of all parts.
+        parts: settings of each.
+        without: parts that are left out.
+    """
+
+    settings: Settings = Field(default_factory=dict)
+    parts: dict[str, Settings] = Field(default_factory=dict)
+    without: list[str] = Field(default_factory=list)
+
+
+class Recipe(_Described):
+    """What a recipe's file says.
+
+    Attributes:
+        title: the question, in one line.
+        about: what is done for an answer, and whose experiment it is.
+        settings: of all parts; what the command line says of objects, environments and models goes over them.
+        parts: by name, in the order in which they are carried out.
+        figures: each with a `figure`, its kind, and options (`advsearch.questions.recipe.figures`).
+        groups: names of groups, each with the names of objects in it.
+        quick: what is different when it should be quick.
+    """
+
+    title: Annotated[str, Field(min_length=1, max_length=200)]
+    about: Annotated[str, Field(max_length=2000)] = ""
+    settings: Settings = Field(default_factory=dict)
+    parts: Annotated[dict[str, Part], Field(min_length=1, max_length=MOST_PARTS)]
+    figures: Annotated[list[dict[str, Any]], Field(max_length=MOST_FIGURES)] = Field(default_factory=list)
+    groups: dict[str, list[str]] = Field(default_factory=dict)
+    quick: Changes = Field(default_factory=Changes)
+
+    @field_validator("settings")
+    @classmethod
+    def _no_place(cls, value: Settings) -> Settings:
+        own = [name for name in value if name in (*PLACE, "seed", "threads", "deterministic")]
+        if own:
+            raise ValueError(f"{own[0]!r} is said with the command, not in its file; leave it out")
+        return value
+
+    @field_validator("parts")
+    @classmethod
+    def _names(cls, value: dict[str, Part]) -> dict[str, Part]:
+        for number, (name, part) in enumerate(value.items()):
+            if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,39}", name):
+                raise ValueError(f"expected names of small letters, digits and hyphens, got {name[:40]!r}")
+            if name == PHOTOGRAPHS:
+                raise ValueError(f"expected another name than {name!r}, which photographs have")
+            for key, other in (("around", part.around), ("drawn_as", part.drawn_as)):
+                if other is not None and other not in list(value)[:number]:
+                    raise ValueError(f"{name}: {key}: expected a part before it, got {other[:40]!r}")
+        return value
+
+    def made_quick(self) -> Recipe:
+        """Return it with what `quick` makes different."""
+        unknown = [name for name in (*self.quick.parts, *self.quick.without) if name not in self.parts]
+        if unknown:
+            raise UnknownNameError("part", unknown[0], self.parts, "It stands under `quick` in the recipe.")
+        parts = {
+            name: part.model_copy(update={"settings": merged(part.settings, self.quick.parts.get(name, {}))})
+            for name, part in self.parts.items()
+            if name not in self.quick.without
+        }
+        return self.model_copy(update={"settings": merged(self.settings, self.quick.settings), "parts": parts})
+
+
+def recipe_names() -> tuple[str, ...]:
+    """Return the names of the bundled recipes."""
+    return tuple(sorted(path.name.removesuffix(".yaml") for path in _folder().iterdir() if path.name.endswith(".yaml")))
+
+
+def titles() -> dict[str, str]:
+    """Return the question of each bundled recipe."""
+    return {name: read_recipe(name).title for name in recipe_names()}
+
+
+def recipe_yaml(name: str) -> str:
+    """Return the YAML of a bundled recipe.
+
+    Raises:
+        UnknownNameError: there is no such recipe.
+    """
+    if name not in recipe_names():
+        raise UnknownNameError("recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path.")
+    return str((_folder() / f"{name}.yaml").read_text(encoding="utf-8"))
+
+
+def read_recipe(name: str) -> Recipe:
+    """Return a recipe.
+
+    Args:
+        name: of a bundled recipe, or a YAML file: it has a suffix, or a folder before it.
+
+    Raises:
+        UnknownNameError: there is no such recipe.
+        FileFormatError: the file is missing, no YAML, or as for `recipe_of`.
+    """
+    if is_file_name(name):
+        return recipe_of(read_yaml(name), name)
+    recipe_yaml(name)
+    with resources.as_file(_folder() / f"{name}.yaml") as path:
+        return recipe_of(read_yaml(path), name)
+
+
+def is_file_name(name: str) -> bool:
+    """Return whether what was asked for is a file, not a name."""
+    return "/" in name or Path(name).suffix != ""
+
+
+def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
+    """Return the recipe that a mapping describes.
+
+    Args:
+        data: as it stands in a YAML file.
+        where: that file, for messages.
+
+    Raises:
+        FileFormatError: something is missing, unknown, or of another kind.
+    """
+    given = {name: value for name, value in data.items() if name not in ("schema", "command")}
+    try:
+        return Recipe(**given)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        what = ".".join(str(one) for one in first["loc"])[:80]
+        text = first["msg"].removeprefix("Value error, ")[:200]
+        raise FileFormatError(f"{where}: {what}: {text}; advsearch show recipe backgrounds prints one") from None
+    except (RecursionError, TypeError) as error:
+        raise FileFormatError(f"{where}: expected a recipe, got {type(error).__name__}") from None
+
+
+def _folder() -> Any:
+    return resources.files("advsearch.questions.recipe")
+
+
+OUTER = ("object", "environment", "model", ANSWER, PART)
+"""Columns of every recipe."""
+
+WHICH = "which"
+"""The option that names a column which clean pictures do not have."""
+
+NAMING = ("by", "series", "rows", "columns", "along", "texture", "shape", "shares", WHICH)
+"""Options of figures that name columns."""
+
+ANY = "*"
+"""Stands for the parameters of a control that does not say beforehand which it has."""
+
+
+def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where: str) -> None:
+    """Refuse a figure of a part or of a column that there is not.
+
+    Args:
+        recipe: as its file says it.
+        columns: for each part that is carried out, parameters that its rows will have.
+        where: the recipe, for messages.
+
+    Raises:
+        UnknownNameError: a figure names one; the message says which figure.
+        InputError: a part that it shows has not the column that others have.
+        FileFormatError: as for `read_options`.
+    """
+    for number, described in enumerate(recipe.figures, start=1):
+        kind, options = read_options(described, where)
+        place = f"It stands in {where}, figure {number} ({kind})"
+        for part in options.of:
+            if part not in (*recipe.parts, PHOTOGRAPHS):
+                raise UnknownNameError("part", part, [*recipe.parts, PHOTOGRAPHS], f"{place}, as `of`.")
+        shown = {part: own for part, own in columns.items() if part in options.of or not options.of}
+        known = {*OUTER, *([GROUP] if recipe.groups else [])}
+        for option, column in _named(options):
+            without = [part for part, own in shown.items() if column not in known and not _has(own, column)]
+            if shown and len(without) == len(shown):
+                others = {name for own in shown.values() for name in own if not name.endswith(ANY)}
+                raise UnknownNameError("column", column, known | others, f"{place}, as `{option}`.")
+            if without and option != WHICH:
+                raise InputError(f"{place}: {without[0]} has no {column}; name the parts that have it as `of`")
+
+
+def _named(options: Options) -> list[tuple[str, str]]:
+    """The columns that a figure names, each behind the option that names it."""
+    found = [(name, value) for name, value in vars(options).items() if name in NAMING and value is not None]
+    return [(name, one) for name, value in found for one in ([value] if isinstance(value, str) else value)]
+
+
+def _has(columns: Collection[str], column: str) -> bool:
+    return column in columns or f"{column.partition('.')[0]}.{ANY}" in columns

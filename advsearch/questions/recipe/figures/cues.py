@@ -1,0 +1,187 @@
+"""Whether the model answers by shape or by texture, where every object has every texture."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from advsearch.explanations.answered import Answered
+from advsearch.questions.recipe.answer import CuesFigure, CuesRow, NamedCount
+from advsearch.questions.recipe.figures.base import FigureKind, Options, extremes, rate_with_interval
+from advsearch.questions.recipe.table import Table, count_of, counted
+from advsearch.report.drawing import BLUE, RED
+from advsearch.report.phrases import percent
+from advsearch.runs.results.base import Interval
+
+SEED, RESAMPLES = 0, 2000
+"""Of the answers that predict, and of the bootstrap."""
+
+FEWEST_CELLS = 4
+"""Pairs of object and texture: two of each."""
+
+
+class CuesOptions(Options):
+    """Options of cues.
+
+    Attributes:
+        texture: what has the texture.
+        shape: what has the shape.
+        classes: for a texture, the answers that name it: ``{zebra: [zebra]}``.
+    """
+
+    texture: str = "material.which"
+    shape: str = "object"
+    classes: dict[str, list[str]] = Field(default_factory=dict)
+
+
+def _compute(table: Table, options: CuesOptions) -> CuesFigure:
+    rows = [_row(name, inside, options.classes.get(name, [])) for name, inside in table.by(options.texture).items()]
+    cells = _cells(table, options)
+    total = sum(one.answers for one in cells)
+    predicted = [
+        count_of("shape", sum(one.by_shape for one in cells), total),
+        count_of("texture", sum(one.by_texture for one in cells), total),
+    ]
+    difference = _difference(cells)
+    return CuesFigure(
+        figure="cues",
+        title=options.title or "Answers by shape and by texture",
+        text=[*_by_texture(table, options, rows), *_which(predicted, difference), *_hardest(rows)],
+        shape=options.shape,
+        texture=options.texture,
+        predicted=predicted,
+        difference=None if difference is None else difference[0],
+        difference_interval=None if difference is None else difference[1],
+        rows=rows,
+    )
+
+
+def _row(name: str, rows: list[Answered], classes: list[str]) -> CuesRow:
+    return CuesRow(**counted(name, rows).model_dump(), textured=sum(_names(row.answer, classes) for row in rows))
+
+
+def _names(answer: str, classes: list[str]) -> bool:
+    """Whether an answer, or one of the names that it consists of, is among some."""
+    return any(name.strip() in classes for name in [answer, *answer.split(",")])
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """One object with one texture: how many answers there are, and how many each cue predicts."""
+
+    answers: int
+    by_shape: int
+    by_texture: int
+
+
+def _cells(table: Table, options: CuesOptions) -> list[_Cell]:
+    """Predict the answers about each object with each texture by those about it with others, and with others by it.
+
+    Each cue predicts the most frequent one of as many answers: those about the same object with other textures, and
+    about the same texture on other objects, drawn so that both are as many as the fewer are. None of the predicted
+    answers is among them, so that a model which answers by neither cue is predicted as well by both.
+    """
+    generator = random.Random(SEED)
+    inside: dict[tuple[float | str, float | str], list[str]] = {}
+    for row in table.rows:
+        key = table.value(row, options.shape), table.value(row, options.texture)
+        inside.setdefault(key, []).append(row.answer)
+    found = []
+    for (shape, texture), answers in inside.items():
+        same_shape = [one for (s, t), more in inside.items() if s == shape and t != texture for one in more]
+        same_texture = [one for (s, t), more in inside.items() if t == texture and s != shape for one in more]
+        count = min(len(same_shape), len(same_texture))
+        if count:
+            first = [_most(generator.sample(one, count)) for one in (same_shape, same_texture)]
+            found.append(_Cell(len(answers), answers.count(first[0]), answers.count(first[1])))
+    return found
+
+
+def _most(answers: Sequence[str]) -> str:
+    return min(Counter(answers).items(), key=lambda one: (-one[1], one[0]))[0]
+
+
+def _difference(cells: Sequence[_Cell]) -> tuple[float, Interval] | None:
+    """Return by how much more the shape predicts than the texture, and the 95 % interval of that.
+
+    The two are shares of the same answers, and answers about one object with one texture go together: the interval is
+    a percentile bootstrap over pairs of object and texture. None with fewer than `FEWEST_CELLS` of these.
+    """
+    if len(cells) < FEWEST_CELLS:
+        return None
+    generator = random.Random(SEED)
+    drawn = sorted(_mean(generator.choices(cells, k=len(cells))) for _ in range(RESAMPLES))
+    outside = round(RESAMPLES * 0.025)
+    return _mean(cells), (drawn[outside], drawn[-1 - outside])
+
+
+def _mean(cells: Sequence[_Cell]) -> float:
+    return sum(one.by_shape - one.by_texture for one in cells) / sum(one.answers for one in cells)
+
+
+def _by_texture(table: Table, options: CuesOptions, rows: list[CuesRow]) -> list[str]:
+    shape = count_of("by shape", sum(one.correct for one in rows), sum(one.configurations for one in rows))
+    asked = [one for one in rows if options.classes.get(one.name)]
+    said = [f"The answer is the object, whatever its texture: {rate_with_interval(shape, 'so')}."]
+    if asked:
+        named = count_of("by texture", sum(one.textured for one in asked), sum(one.configurations for one in asked))
+        known = ", ".join(one.name for one in asked)
+        said.append(f"The answer names the texture ({known}): {rate_with_interval(named, 'so')}.")
+        if not named.correct:
+            said.append("A model that has no class for a texture cannot name it.")
+    return said
+
+
+def _which(predicted: Sequence[NamedCount], difference: tuple[float, Interval] | None) -> list[str]:
+    shape, texture = predicted
+    if difference is None:
+        return [
+            "Whether the answers go more by shape or by texture is not said: that takes at least two objects and two "
+            f"textures, {FEWEST_CELLS} pairs in all."
+        ]
+    mean, (low, high) = difference
+    said = (
+        f"The most frequent answer about the same object with other textures is given in {percent(shape.accuracy)}, "
+        f"and that about the same texture on other objects, of as many answers, in {percent(texture.accuracy)}: "
+        f"{100 * mean:.0f} points more by shape (95 % interval {100 * low:.0f} to {100 * high:.0f}, over pairs of "
+        "object and texture)"
+    )
+    if low > 0.0:
+        return [f"{said}: the model goes more by shape than by texture."]
+    if high < 0.0:
+        return [f"{said}: the model goes more by texture than by shape."]
+    return [f"{said}: no difference is shown."]
+
+
+def _hardest(rows: list[CuesRow]) -> list[str]:
+    return extremes(rows, "The hardest texture", "the easiest", "textures")
+
+
+def _draw(made: CuesFigure, figure: Any, run: Path) -> None:
+    axes = figure.subplots()
+    rows = sorted(made.rows, key=lambda one: one.accuracy or 0.0)
+    for place, one in enumerate(rows):
+        total = max(one.configurations, 1)
+        axes.barh(
+            place, one.correct / total, color=BLUE, alpha=0.55, height=0.66, label="the object" if not place else "_"
+        )
+        axes.barh(
+            place, one.textured / total, left=one.correct / total, color=RED, alpha=0.55, height=0.66,
+            label="the texture" if not place else "_",
+        )  # fmt: skip
+        if one.interval:
+            axes.plot(one.interval, [place, place], color="#1c1d20", linewidth=1.2)
+    axes.set_yticks(range(len(rows)), [one.name for one in rows])
+    axes.set(xlabel="share of answers; line: 95 % interval of the object's", xlim=(0.0, 1.0))
+    axes.set_title(made.title)
+    axes.grid(True, axis="x")
+    figure.legend(loc="outside lower center", ncols=2, title="the answer names")
+
+
+CUES = FigureKind(CuesOptions, CuesFigure, _compute, _draw, lambda made: (6.0, 1.7 + 0.27 * len(made.rows)))

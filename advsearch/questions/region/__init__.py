@@ -1,0 +1,1 @@
+"""The box around a configuration in which the verdict stays."""

@@ -1,0 +1,294 @@
+"""`region`: the box around a configuration in which the model's verdict stays, and a map of its margin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.keywords import NamedKeywords, Names, PictureKeywords, asks, configured
+from advsearch.attacks.evaluation import most_at_once
+from advsearch.attacks.product import batches
+from advsearch.config import AttackConfig
+from advsearch.engine.journal import Journal
+from advsearch.engine.loading import Scene
+from advsearch.engine.naming import AnyModel
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Stages
+from advsearch.engine.sharing import Shared
+from advsearch.engine.verifier import Verifier, ladder_of
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.interrupts import interruptible
+from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult
+from advsearch.questions.region.growing import ATTEMPTS, MOST_PROBED, GrownBox, grow
+from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region.words import map_figure
+from advsearch.runs.answer import read_answer
+from advsearch.runs.directory import CONFIG, RunDirectory, find_run
+from advsearch.runs.files import write_bytes
+from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
+from advsearch.settings import split_names
+from advsearch.viewer.pages import write_page
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
+    """Of `region`."""
+
+    around: str | None
+    vary: Names | None
+    samples: int
+    map: int
+    verify_spp: int | None
+
+
+MOST = 8
+"""A box is grown in at most so many parameters."""
+
+AT_CENTRE = 20
+"""Trials of the centre."""
+
+
+@dataclass(frozen=True, eq=False)
+class Varied:
+    """The parameters in which the box grows.
+
+    Attributes:
+        names: of each.
+        places: (k,) where they lie in u.
+    """
+
+    names: tuple[str, ...]
+    places: Tensor
+
+
+@asks(RegionConfig, RegionKeywords)
+def region(
+    object: Scene | str | Path,
+    model: AnyModel = "reference",
+    *,
+    progress: Watched = None,
+    **settings: Unpack[RegionKeywords],
+) -> RegionResult:
+    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md).
+
+    All other arguments are the settings of `advsearch region`. The run is kept, in `run` or under runs/.
+
+    Args:
+        object: from `load_scene`, or the name of an object, or a file of one.
+        model: from `load_model`, or what that takes.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    config = configured(RegionConfig, object=object, model=model, **settings)
+    return region_from_config(config, progress=watcher(progress))
+
+
+def region_from_config(
+    config: RegionConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> RegionResult:
+    """Grow the region that a configuration describes and keep it in a run directory.
+
+    Raises:
+        InputError: the verdict at the centre depends on the noise, the parameters do not fit, and what a scene raises.
+    """
+    stages = Stages(progress or NullProgress())
+    stages.begin("setup", LOADING)
+    budget = {} if config.around is None else _budget(config.around)
+    problem, warnings = problem_from_config(AttackConfig.of(config, **budget))
+    for text in warnings:
+        stages.progress.message(text)
+    varied = _varied(problem, config)
+    centre = _centre(problem, config)
+    with RunDirectory.of(config, resumed) as run:
+        verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config), stages)
+        try:
+            with interruptible():
+                answer, ending = _answer(verifier, config, varied, centre, run), "done"
+        except KeyboardInterrupt:
+            answer, ending = GrownRegion(), INTERRUPTED
+        stages.end()
+        result = RegionResult(
+            run=str(run.path),
+            object=config.object,
+            environment=problem.environment,
+            model=problem.model.name,
+            task=problem.task.title,
+            controls=[bound.name for bound in problem.space.controls],
+            ending=ending,
+            **vars(answer),
+            image_formation=Formation.of(problem.renderer.formation),
+            clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
+            warnings=warnings,
+            renders={"verification": verifier.findings.verification_renders},
+            seconds={**stages.seconds, "total": stages.total},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        run.write_summary(result)
+        write_page(run.path, result)
+        return result
+
+
+def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
+    """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
+    problem, stages = verifier.problem, verifier.stages
+    verifier.choose_spp({"centre": centre})
+    verdict, spp = _verdict(verifier, centre), verifier.findings.spp
+
+    def at(values: Tensor) -> Tensor:
+        u = centre.clone()
+        u[varied.places] = values
+        return u
+
+    hint = f"pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
+    stages.begin("search", "growing the box", MOST_PROBED * len(varied.names), hint=hint, at_most=True)
+    checking = False
+
+    def on_check() -> None:
+        nonlocal checking
+        if not checking:
+            most = ATTEMPTS * config.samples
+            hint = f"{config.samples} pictures, and as many again where one is an exception; `samples` shortens it"
+            stages.begin("search", "checking the box with fresh samples", most, hint=hint, at_most=True)
+        checking = True
+
+    def same(values: Tensor, number: int) -> bool:
+        (trial,) = verifier.trials("region", {number: at(values)}, sought=False)
+        return trial.success == verdict and not trial.not_a_number
+
+    seed = seeds.stream(config.seed, "region")
+    grown = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_check=on_check)
+    box = _box(problem, grown, at, varied)
+    return GrownRegion(
+        verdict="wrong" if verdict else "right",
+        box=box,
+        same=grown.same,
+        samples=grown.samples,
+        rate=grown.same / grown.samples,
+        interval=grown.interval,
+        volume=grown.volume,
+        spp=spp,
+        map=_map(verifier, config.map, at, box, run) if config.map else None,
+    )
+
+
+def _budget(around: str) -> dict[str, object]:
+    """How far a run's controls may go, so that its answer lies within."""
+    theirs = AttackConfig.from_yaml(find_run(around) / CONFIG)
+    return {"epsilon": theirs.epsilon, "norm": theirs.norm}
+
+
+def _centre(problem: Problem, config: RegionConfig) -> Tensor:
+    """The configuration that the box grows around."""
+    if config.around is None:
+        return problem.domain.start.clone()
+    values = torch.from_numpy(read_answer(find_run(config.around)))
+    if values.shape != problem.domain.start.shape:
+        raise InputError(
+            f"`around` {config.around}: expected a run over the same controls, whose answer has "
+            f"{problem.domain.dim} numbers, got one with {len(values)}; leave `controls` out so that the run's own are "
+            "taken"
+        )
+    return problem.domain.project(values)
+
+
+def _varied(problem: Problem, config: RegionConfig) -> Varied:
+    """Where the parameters lie that the box grows in."""
+    places: dict[str, Tensor] = {}
+    for group in problem.space.groups:
+        if group.options:
+            continue
+        for number, place in enumerate(torch.arange(group.begin, group.begin + group.size)):
+            places[group.name + (f".{number}" if group.size > 1 else "")] = place[None]
+    names = tuple(places) if config.vary is None else split_names(config.vary)
+    for name in names:
+        if name not in places:
+            raise UnknownNameError("parameter in `vary`", name, places)
+    if not 1 <= len(names) <= MOST:
+        raise InputError(f"vary: expected 1 to {MOST} parameters, got {len(names)}; name some of {', '.join(places)}")
+    if config.map and len(names) != 2:
+        raise InputError(f"map: expected two parameters in `vary`, got {len(names)}: {', '.join(names)}")
+    return Varied(names, torch.cat([places[name] for name in names]))
+
+
+def _verdict(verifier: Verifier, centre: Tensor) -> bool:
+    """Whether the model is wrong at the centre.
+
+    Raises:
+        InputError: that depends on the noise, or the model's answer is not a number.
+    """
+    verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
+    wrong = nothing = 0
+    for trial in verifier.trials("centre", dict.fromkeys(range(AT_CENTRE), centre), sought=False):
+        wrong, nothing = wrong + trial.success, nothing + trial.not_a_number
+    if nothing:
+        raise InputError(
+            f"the model's answer is not a number in {nothing} of {AT_CENTRE} trials at the centre, so there is no "
+            "verdict; choose another centre, or mend the model"
+        )
+    verdict = verifier.problem.rule.decided(wrong, AT_CENTRE)
+    if verdict is None:
+        raise InputError(
+            f"the model is wrong in {wrong} of {AT_CENTRE} trials at the centre, so its verdict there depends on the "
+            "noise; choose another centre, or more samples with `verify_spp`"
+        )
+    return verdict
+
+
+def _box(problem: Problem, grown: GrownBox, at: Any, varied: Varied) -> list[BoxSide]:
+    """The range of every parameter of the box in its unit."""
+    ends = [problem.describe(at(values)) for values in (grown.low, grown.high, grown.centre)]
+    rows = []
+    for name in varied.names:
+        stem, _, number = name.rpartition(".")
+        known = name if name in ends[0] else stem
+        if known not in ends[0]:  # one of many numbers, which nobody describes
+            place = varied.names.index(name)
+            sides = (grown.low, grown.high, grown.centre)
+            low, high, centre = (float(side[place]) for side in sides)
+            rows.append(BoxSide(name=name, unit="of the range", low=low, high=high, centre=centre))
+            continue
+        low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
+        unit = str(ends[0][known].get("unit", ""))
+        rows.append(BoxSide(name=name, unit=unit, low=low, high=high, centre=centre))
+    return rows
+
+
+def _number(described: Any, number: str) -> float:
+    value = described["value"]
+    return float(value[int(number)] if number else value)
+
+
+def _map(verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory) -> MarginMap:
+    """The margin on a grid over two parameters, as numbers and as a picture."""
+    hint = f"{side * side} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
+    verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
+    steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
+
+    scores = list[float]()
+    for numbers in batches(0, side * side, most_at_once(verifier.problem.domain.dim)):
+        places = {one: at(torch.stack([steps[one % side], steps[one // side]])) for one in numbers}
+        scores += [trial.score for trial in verifier.trials("map", places, sought=False)]
+    margins = [scores[begin : begin + side] for begin in range(0, len(scores), side)]
+    ends = [verifier.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
+    axes = []
+    for side_of in box:
+        known = side_of.name in ends[0]
+        low, high = (_number(end[side_of.name], "") for end in ends) if known else (0.0, 1.0)
+        axes.append(AxisRange(name=side_of.name, unit=side_of.unit, low=low, high=high))
+    drawn = MarginMap(axes=(axes[0], axes[1]), margins=margins)
+    for suffix, data in map_figure(drawn, box).items():
+        write_bytes(run.path / "images" / f"map.{suffix}", data)
+    return drawn

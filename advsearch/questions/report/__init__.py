@@ -1,0 +1,1 @@
+"""Runs as evidence for a model card or a safety case."""

@@ -1,0 +1,1 @@
+"""Extreme scenes, objectives and arithmetic, and whether each of them holds."""

@@ -1,0 +1,266 @@
+"""Small scenes for the stability suite, and what is asked of each: a picture, a gradient, a reference, a search."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
+from advsearch.controls import Space, make_control, make_space
+from advsearch.engine import domains
+from advsearch.engine.gradients import Judgement, Loss, Probe, estimates, judge, probes, reference, smooth_loss
+from advsearch.questions.stability.case import Check, Outcome, holds
+from advsearch.scene import library
+from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
+from advsearch.scene.description import describe
+from advsearch.scene.formation import ImageFormation
+from advsearch.scene.gradients.motion import Motion
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.parts import ScenePart
+from advsearch.scene.renderer import Renderer
+
+BARE = {"ground.size": 0.0}
+"""Settings without the ground, so that a dark object has an outline and nothing else."""
+SIZE = 24
+"""Side of the pictures in pixels."""
+SPP = 8
+"""Samples a pixel of a picture and of a working gradient."""
+REFERENCE_SPP = 64
+"""Samples a pixel of a reference render."""
+ERROR = 0.1
+"""Relative error that the mean of a gradient may have beyond what its noise explains."""
+DOUBT = 0.4
+"""The noise of a comparison, as a share of the derivative, from which it decides nothing."""
+SHARPNESS = 20.0
+"""Logits per unit of the linear loss that the searched model answers with."""
+
+ControlSettings = Mapping[str, Mapping[str, object]]
+
+
+def small(
+    object: str | Path | ObjectAsset,
+    controls: ControlSettings,
+    *,
+    environment: str | Path | EnvironmentAsset | None = None,
+    settings: Mapping[str, float] | None = None,
+    parts: Sequence[ScenePart] = (),
+    denoise: str = "none",
+) -> Renderer:
+    """Return `render(u, seed, spp)` of a small picture: as `Scene.renderer`, with parts of our own.
+
+    Its differences are taken over a pixel: the losses of these cases are smooth.
+    """
+    description = describe(object, environment or plain_environment(), given=settings)
+    for part in parts:
+        description = description.with_part(part)
+    space = make_space([make_control(name, given) for name, given in controls.items()], description)
+    description = space.scene or description
+    formation = ImageFormation(denoiser=denoise, resolution=(SIZE, SIZE), gain=description.gain)
+    scene = MitsubaScene(description, (SIZE, SIZE), filter=formation.filter)
+    motion = Motion(description, (SIZE, SIZE), scene.assembly)
+    renderer = Renderer(scene, space, formation, 0, motion=motion)
+    renderer.plan = renderer.plan.at_a_pixel()
+    return renderer
+
+
+# ---- things to put into a scene -------------------------------------------------------------------------------------
+
+
+def plain_environment() -> EnvironmentAsset:
+    """Return a sky brighter on one side and above, (16, 32, 3), so that turning it changes something."""
+    rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
+    light = 0.4 * (1.0 + 0.6 * np.sin(columns * (2.0 * np.pi / 32.0)) + 0.8 * np.cos(rows * (np.pi / 16.0)))
+    return EnvironmentAsset("plain", np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32))
+
+
+def mesh_of(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> Mesh:
+    """Return a mesh with UVs from x and z, whose normals face +x."""
+    points = np.asarray(vertices, np.float32)
+    facing = np.tile([1.0, 0.0, 0.0], (len(points), 1))
+    low, high = points.min(axis=0), points.max(axis=0)
+    uvs = ((points - low) / np.maximum(high - low, 1e-12))[:, 1:]
+    return Mesh(points, np.asarray(faces, np.uint32), facing.astype(np.float32), uvs.astype(np.float32))
+
+
+def thing(mesh: Mesh) -> ObjectAsset:
+    """Return an object with a checked texture around a display-referred grey."""
+    checks = np.indices((4, 4)).sum(axis=0) % 2
+    base = np.float32(0.5) + np.float32(0.3) * (checks - np.float32(0.5))
+    texels = np.repeat(base[:, :, None], 3, axis=2).clip(0.0, 1.0).astype(np.float32)
+    return ObjectAsset("thing", mesh, texels, Material())
+
+
+# ---- what is asked of a scene ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What a scene showed.
+
+    Attributes:
+        finite: picture and gradient are finite, and nothing had to be set to zero.
+        replaced: pixels and gradient entries that were NaN or infinite and were set to zero.
+        inside: the picture is in [0, 1].
+        compared: gradients beside their references; empty if that was not asked for.
+        gradient: largest absolute entry of the gradient.
+        mean: mean of the picture.
+        result: of the short search.
+    """
+
+    finite: bool
+    replaced: int
+    inside: bool
+    compared: Mapping[str, Judgement]
+    gradient: float
+    mean: float
+    result: SearchResult
+
+    def findings(self, *more: Check, rule: str = "") -> Outcome:
+        """Return the findings: the checks that every scene has, and more."""
+        checks = [
+            holds("the picture is in [0, 1]", self.inside),
+            Check("values that were NaN or infinite", float(self.replaced), 0.0, 0.0),
+            Check("objectives that were NaN or infinite", float(self.result.non_finite_objectives), 0.0, 0.0),
+        ]
+        error = None
+        if self.compared:
+            name, worst = max(self.compared.items(), key=lambda item: (item[1].excess, item[1].error))
+            noisy, unsure = max(self.compared.items(), key=lambda item: item[1].doubt)
+            checks.append(Check(f"noise of the comparison, {noisy}", unsure.doubt, most=DOUBT))
+            checks.append(Check(f"gradient error beyond the noise, {name}", worst.excess, most=ERROR))
+            error = worst.error
+        measured = {"mean": self.mean, "largest gradient": self.gradient}
+        return Outcome((*checks, *more), self.finite, error, self.result.ending.value, measured, rule)
+
+
+def dark() -> ObjectAsset:
+    """Return the mug in black: what moves in the picture is its outline and nothing else, so little noise."""
+    return replace(library.load_object("mug"), name="dark-mug", base_color=np.full((4, 4, 3), 0.02, np.float32))
+
+
+def examine_gradient(
+    renderer: Renderer,
+    u: Tensor | None = None,
+    *,
+    compare: bool = True,
+    evaluations: int = 3,
+    policy: Policy[Any] | None = None,
+    spp: int = SPP,
+    seeds: tuple[int, int] = (3, 12),
+) -> Examined:
+    """Render a configuration, differentiate it, compare the gradient with differences, and search from there.
+
+    Args:
+        renderer: the scene.
+        u: where; None for the start.
+        compare: whether to take references; they cost most of the time.
+        evaluations: of the search; each takes a gradient.
+        policy: of the search; PGD by default.
+        spp: samples a pixel of the picture and the gradient.
+        seeds: fewest and most seeds of a reference.
+    """
+    u = renderer.start if u is None else u
+    loss = smooth_loss(renderer.formation.resolution)
+    with torch.no_grad():
+        picture = renderer(u, seed=0, spp=spp)
+    _, gradient = renderer.gradient(loss, u, 0, spp)
+    finite = bool(torch.isfinite(picture).all()) and bool(torch.isfinite(gradient).all())
+    beside = compared(renderer, u, spp=spp, seeds=seeds) if compare else {}
+    result = searched(renderer, u, evaluations, policy or PGD(), spp=spp)
+    return Examined(
+        finite=finite and renderer.non_finite == 0,
+        replaced=renderer.non_finite,
+        inside=float(picture.min()) >= 0.0 and float(picture.max()) <= 1.0,
+        compared=beside,
+        gradient=float(gradient.abs().max()),
+        mean=float(picture.mean()),
+        result=result,
+    )
+
+
+def compared(
+    renderer: Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 12), repeats: int = 24
+) -> dict[str, Judgement]:
+    """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw picture, along
+    each probe by its name."""
+    before = renderer.formation
+    renderer.formation = replace(before, transfer="linear")
+    try:
+        loss = smooth_loss(before.resolution)
+        found: dict[str, Judgement] = {}
+        for along in _together(renderer, loss, u, spp):
+            high = spp if along[0].group.estimator == "image" else max(spp, REFERENCE_SPP)
+            against = [reference(renderer, loss, u, one, seed=1, spp=high, repeats=seeds) for one in along]
+            own = estimates(renderer, loss, u, along[0].group.estimator, along, seed=2, spp=spp, repeats=repeats)
+            for probe, one, estimate in zip(along, against, own, strict=True):
+                found[probe.name] = judge(estimate, one, against)
+        return found
+    finally:
+        renderer.formation = before
+
+
+def _together(renderer: Renderer, loss: Loss, u: Tensor, spp: int) -> list[list[Probe]]:
+    """Probes that one gradient answers."""
+    sets: dict[tuple[str, str], list[Probe]] = {}
+    for probe in probes(renderer, loss, u, 0, spp):
+        sets.setdefault((probe.group.control, probe.group.estimator), []).append(probe)
+    return list(sets.values())
+
+
+def searched(renderer: Renderer, u: Tensor, evaluations: int, policy: Policy[Any], *, spp: int = SPP) -> SearchResult:
+    """Search for a picture that a linear model of two classes gets wrong.
+
+    Its logits are 0 and `SHARPNESS` times the rise of the smooth linear loss over the configuration u, less 1.
+    """
+    loss = smooth_loss(renderer.formation.resolution)
+    with torch.no_grad():
+        here = float(loss(renderer(u, seed=0, spp=spp)))
+
+    def margin(image: Tensor) -> Tensor:
+        return SHARPNESS * (loss(image) - here) - 1.0
+
+    domain = search_domain(renderer, u)
+    steps = evaluations * (1 + domain.gradient_cost) + 1
+    return search(
+        partial(map, Evaluator(renderer, margin, spp)), domain, policy, steps=steps, seed=0, candidates=1, repeats=1
+    )
+
+
+class Evaluator:
+    """Evaluates configurations of a renderer by a loss of the picture; over 0 is a success."""
+
+    def __init__(self, renderer: Renderer, loss: Loss, spp: int) -> None:
+        self.renderer, self.loss, self.spp = renderer, loss, spp
+
+    def __call__(self, query: Query) -> Evaluation:
+        """Answer a query."""
+        renderer, derivative = self.renderer, None
+        u, seed, spp, gradient = query.u, query.number, self.spp * query.samples, query.gradient
+        bad, renders = renderer.non_finite, renderer.renders
+        if gradient:
+            value, derivative = renderer.gradient(self.loss, u, seed, spp, free=gradient == "free")
+        else:
+            with torch.no_grad():
+                value = self.loss(renderer(u, seed=seed, spp=spp))
+        objective = float(value)
+        cost = (renderer.renders - renders) * query.samples
+        return Evaluation(objective, derivative, objective > 0.0, renderer.non_finite - bad, cost)
+
+
+def search_domain(renderer: Renderer, start: Tensor | None = None) -> Domain:
+    """Return where a search of a renderer's space may look, from its start or another one."""
+    space = renderer.space
+    assert isinstance(space, Space)
+    return domains.domain_of(
+        space.controls,
+        renderer.start if start is None else start,
+        gradient_cost=renderer.plan.renders,
+        partial_gradients=True,
+    )

@@ -1,0 +1,146 @@
+"""How far away a detector sees an object: the distance at which half of a sweep's pictures show it to the model.
+
+The share of pictures in which it is seen is taken to fall with the distance. The estimate is where the falling line
+through the counts crosses one half (isotonic regression by pooling adjacent violators, Ayer et al. 1955, linear in
+the logarithm of the distance). The interval is exact: with m distances each share is judged by the binomial test of one
+half at 0.025 / m on each side, so that all hold together with 95 %; it begins at the farthest distance at which the
+share is above one half for sure, and ends at the nearest one beyond it at which the share is below one half for sure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from advsearch.errors import InputError
+from advsearch.report.drawing import BLUE, GREY
+from advsearch.runs.results.sweep import AxisRow, SweepSummary
+
+DISTANCE = "camera.distance"
+"""The axis."""
+HALF = 0.5
+
+
+@dataclass(frozen=True)
+class SeenFrom:
+    """The distance at which an object is first seen by somebody who comes nearer.
+
+    Attributes:
+        unit: of all distances: "metres", or "object sizes".
+        distances: (m,) at which there are pictures, the nearest first.
+        shares: (m,) of the pictures there in which it is seen.
+        intervals: (m,) of these shares, 95 % each.
+        distance: the estimate; None where it is seen at all distances, or at none.
+        low, high: of the interval; None where the pictures do not bound it on that side.
+    """
+
+    unit: str
+    distances: tuple[float, ...]
+    shares: tuple[float, ...]
+    intervals: tuple[tuple[float, float], ...]
+    distance: float | None
+    low: float | None
+    high: float | None
+
+
+def distance_of(summary: SweepSummary) -> SeenFrom | None:
+    """Return how far away one model sees one object; None where the sweep does not tell."""
+    rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
+    several = "," in summary.object or "," in summary.model or summary.beside is not None
+    known = summary.task.partition("=")[0] == "detection" and len(rows) > 1 and not several
+    return seen_from(rows) if known else None
+
+
+def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
+    """Return the distance at which an object is first seen.
+
+    Args:
+        rows: of one axis, each with pictures: a distance, or both ends of a range of it, and the counts there.
+
+    Raises:
+        InputError: there are fewer than two distances.
+    """
+    rows = sorted(rows, key=_middle)
+    counted = [(_middle(row), row.correct, row.configurations) for row in rows]
+    if len(counted) < 2:
+        raise InputError(f"detection distance: expected at least two distances, got {len(counted)}; sweep over more")
+    distances = tuple(at for at, _, _ in counted)
+    chance = 0.025 / len(counted)
+    low = max((at for at, k, n in counted if _at_least(k, n) < chance), default=None)
+    below = [at for at, k, n in counted if _at_least(n - k, n) < chance and at > (low or 0.0)]
+    return SeenFrom(
+        unit=rows[0].unit,
+        distances=distances,
+        shares=tuple(k / n for _, k, n in counted),
+        intervals=tuple(row.interval or (0.0, 1.0) for row in rows),
+        distance=_crossing(distances, _falling([(float(k), float(n)) for _, k, n in counted])),
+        low=low,
+        high=min(below, default=None),
+    )
+
+
+def distance_sentence(found: SeenFrom) -> str:
+    """Say it: "Seen from 38 m, 31 to 44 m ..."."""
+    unit = "m" if found.unit == "metres" else found.unit
+    ends = f"{_text(found.low)} to {_text(found.high)}" if found.low is not None and found.high is not None else None
+    if ends is None:
+        ends = "no bound" if found.low is found.high else f"at least {_text(found.low)}"
+        ends = f"at most {_text(found.high)}" if found.low is None and found.high is not None else ends
+    what = f"{ends}{'' if ends == 'no bound' else f' {unit}'} with 95 % confidence"
+    if found.distance is not None:
+        return f"Seen from {_text(found.distance)} {unit} in half of the pictures, {what}."
+    if found.shares[0] >= HALF:
+        return f"Seen as far as the sweep goes, {_text(found.distances[-1])} {unit}, in half of the pictures; {what}."
+    return f"Not seen in half of the pictures, even from {_text(found.distances[0])} {unit}; {what}."
+
+
+def distance_axes(found: SeenFrom, axes: Any) -> None:
+    """Draw the share of pictures in which it is seen over the distance on matplotlib axes, with intervals."""
+    low, high = zip(*found.intervals, strict=True)
+    axes.fill_between(found.distances, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
+    axes.plot(found.distances, found.shares, color=BLUE, marker="o", label="seen in")
+    axes.axhline(HALF, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
+    if found.distance is not None:
+        axes.axvline(found.distance, color=GREY, linewidth=1)
+    axes.set(xlabel=f"distance ({found.unit})", ylabel="share of pictures", ylim=(-0.02, 1.02))
+    axes.set_title("How far away it is seen")
+    axes.grid(True)
+    axes.legend()
+
+
+def _at_least(successes: int, trials: int) -> float:
+    """The chance of so many successes or more, where each trial is one with a chance of a half."""
+    ways: int = sum(math.comb(trials, k) for k in range(successes, trials + 1))
+    return ways / (1 << trials)
+
+
+def _middle(row: AxisRow) -> float:
+    """A distance, or the middle of a range of it."""
+    value = row.value
+    return math.sqrt(value[0] * value[1]) if isinstance(value, tuple) else float(value)
+
+
+def _falling(counts: Sequence[tuple[float, float]]) -> list[float]:
+    """The shares (m,) of successes in trials, made to fall or stay from each to the next by pooling."""
+    pools: list[list[float]] = []  # successes, trials, how many
+    for successes, trials in counts:
+        pools.append([successes, trials, 1.0])
+        while len(pools) > 1 and pools[-1][0] / pools[-1][1] > pools[-2][0] / pools[-2][1]:
+            last = pools.pop()
+            pools[-1] = [a + b for a, b in zip(pools[-1], last, strict=True)]
+    return [one[0] / one[1] for one in pools for _ in range(int(one[2]))]
+
+
+def _crossing(distances: Sequence[float], shares: Sequence[float]) -> float | None:
+    """Where a falling line through the shares passes one half; None where it does not."""
+    for near, far, before, after in zip(distances, distances[1:], shares, shares[1:], strict=False):
+        if before >= HALF > after:
+            part = (before - HALF) / (before - after)
+            return math.exp((1.0 - part) * math.log(near) + part * math.log(far))
+    return None
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"

@@ -1,0 +1,212 @@
+"""What a person is shown of an answer: said once, and set as text, as a page and in a notebook by whoever shows it.
+
+A question has `shown(result)` in its `words`; of one that has not, the fields of its result are shown as they are
+called and described.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from advsearch import rooms
+from advsearch.report import wording
+from advsearch.runs.results.base import INTERRUPTED, Fields, Formation, Result
+
+LONG = 24
+"""Rows of a table of fields above which it is folded."""
+
+_ELSEWHERE = (
+    *("run", "object", "objects", "controls", "environment", "ending", "warnings", "seconds", "command_line"),
+    *("figures", "model", "renders", "seed"),
+)
+"""Fields that stand in the heading or below, or nowhere."""
+
+Column = str | Callable[[Any], str]
+"""How a cell is made of a row, which is called `0`: ``{0.seconds:.2f}``, or a function."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture in the folder of the run, and what is said of it."""
+
+    file: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class AnswerPart:
+    """A part of an answer; what is empty is left out.
+
+    Attributes:
+        title: of the part.
+        text: paragraphs.
+        heads: of the columns.
+        rows: texts, the first of which is the row's name.
+        note: how the table is to be read, for a page.
+        figure: file of a figure of the numbers in the run's folder, for a page.
+        pictures: groups, each of which stands side by side.
+        draw: draws a chart of the numbers on matplotlib's axes, for a page; `title` and `text` say what is on it.
+        height: of the chart, CSS pixels.
+        parts: the run among the parts that each row is of.
+        shares: in [0, 1], by row and column: the larger, the stronger the colour of the cell.
+        folded: whether a page shows it only when asked to.
+        only: `page` or `text`, where nobody else is shown it.
+    """
+
+    title: str = ""
+    text: Sequence[str] = ()
+    heads: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+    note: str = ""
+    figure: str = ""
+    pictures: Sequence[Sequence[Picture]] = ()
+    draw: Callable[[Any], object] | None = None
+    height: int = 300
+    parts: Sequence[str | None] = ()
+    shares: Mapping[tuple[int, int], float] = field(default_factory=dict)
+    folded: bool = False
+    only: str = ""
+
+    @classmethod
+    def table(cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any) -> AnswerPart:
+        """Return a table, a row for each of some values.
+
+        Args:
+            rows: the values.
+            columns: head to how its cell is made.
+            more: other attributes.
+        """
+        made = [[made(row) if callable(made) else made.format(row) for made in columns.values()] for row in rows]
+        return cls(heads=tuple(columns), rows=made, **more)
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing to show."""
+        return not (any(self.text) or self.rows or self.pictures)
+
+
+@dataclass(frozen=True)
+class ShownAnswer:
+    """An answer.
+
+    Attributes:
+        said: what a reader should know first, in a sentence or two.
+        sections: what else there is.
+        facts: what it was done with, by name; beside what all questions have: environment, renders, time and seed.
+        cautions: what has to be known beside the warnings.
+        about: what it is of, in a few names; empty: the object, the controls and the model.
+    """
+
+    said: str
+    sections: Sequence[AnswerPart] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
+    about: Sequence[str] = ()
+    cautions: Sequence[str] = ()
+
+
+def shown(result: Result) -> ShownAnswer:
+    """Return what a person is shown of the result of any question."""
+    own = rooms.in_room(result.command, "words", "shown")
+    made: ShownAnswer = own(result) if own else fields_shown(result)
+    return made
+
+
+def remarks_of(result: Result, given: ShownAnswer) -> list[str]:
+    """Return what has to be known beside an answer."""
+    stopped = ["Interrupted before its end."] if getattr(result, "ending", "") == INTERRUPTED else []
+    return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
+
+
+def subject_of(result: Result, given: ShownAnswer) -> list[str]:
+    """Return what an answer is about: objects, controls, model."""
+    found = [getattr(result, name, None) or () for name in ("object", "objects", "controls", "model")]
+    return [*given.about] or [", ".join([one] if isinstance(one, str) else one) for one in found if one]
+
+
+def facts_of(result: Result, given: ShownAnswer) -> dict[str, str]:
+    """Return by what an answer came about, without what is not known."""
+    renders, seconds = getattr(result, "renders", None), getattr(result, "seconds", None)
+    spent = sum(renders.values()) if isinstance(renders, Mapping) else renders
+    own = {
+        "environment": "" if "environments" in given.facts else getattr(result, "environment", ""),
+        "renders": "" if spent is None else str(spent),
+        "workers": wording.workers_text(getattr(result, "shared", None)),
+        "time": wording.seconds_text(seconds["total"]) if seconds else "",
+        "seed": str(getattr(result, "seed", "")),
+    }
+    return {name: text for name, text in {**given.facts, **own, **given.facts}.items() if text}
+
+
+# ---- fields as they are ---------------------------------------------------------------------------------------------
+
+
+def fields_shown(result: Result) -> ShownAnswer:
+    """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
+    values = {name: getattr(result, name) for name in type(result).model_fields}
+    tables = {name: found for name, value in values.items() if (found := _rows(value))}
+    plain = {_words(name): _text(one) for name, one in values.items() if name not in (*_ELSEWHERE, *tables)}
+    sections = [
+        AnswerPart(
+            _words(name),
+            heads=[_words(one) for one in _columns(rows)],
+            rows=[[_text(getattr(row, one, None)) for one in _columns(rows)] for row in rows],
+            folded=len(rows) > LONG,
+        )
+        for name, rows in tables.items()
+    ]
+    meanings = list(_meanings(result, {name for name, text in plain.items() if text}, list(tables.values())).items())
+    sections.append(AnswerPart("What these words mean", rows=meanings, folded=True, only="page"))
+    said = result.brief or str(values.get("ending", "done"))
+    return ShownAnswer(said[:1].upper() + said[1:] + ".", sections, plain)
+
+
+def _meanings(result: Result, plain: set[str], tables: Sequence[Sequence[Fields]]) -> dict[str, str]:
+    """What the names that are shown mean, as far as the fields say it."""
+    described: list[tuple[Fields, set[str]]] = [(result, plain)]
+    described += [(rows[0], set(map(_words, _columns(rows)))) for rows in tables]
+    found: dict[str, str] = {}
+    for one, words in described:
+        for name, about in type(one).model_fields.items():
+            if about.description and _words(name) in words:
+                found.setdefault(_words(name), about.description.replace("`", ""))
+    return found
+
+
+def _rows(value: object) -> Sequence[Fields]:
+    """The rows of a table, where a value is a list of fields."""
+    rows = value if isinstance(value, (list, tuple)) else ()
+    return rows if all(isinstance(one, Fields) for one in rows) else ()
+
+
+def _columns(rows: Sequence[Fields]) -> list[str]:
+    """The fields that are not empty in every row."""
+    names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
+    return [name for name in names if any(_text(getattr(row, name, None)) for row in rows)]
+
+
+def _text(value: object) -> str:
+    """A value in a cell."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return "" if value != value else wording.number_text(value)
+    if isinstance(value, Formation):
+        return wording.formation_text(value)
+    if isinstance(value, Fields):
+        return _text({name: getattr(value, name) for name in type(value).model_fields})
+    if isinstance(value, Mapping):
+        return ", ".join(f"{_words(str(name)).lower()} {_text(one)}" for name, one in value.items() if _text(one))
+    if isinstance(value, (list, tuple)):
+        inner = " to " if len(value) == 2 and all(isinstance(one, float) for one in value) else "; "
+        return inner.join(filter(None, map(_text, value)))
+    return str(value)
+
+
+def _words(name: str) -> str:
+    """The name of a field as a heading."""
+    words = name.replace("_", " ").replace("-", " ")
+    return words[:1].upper() + words[1:]

@@ -1,0 +1,324 @@
+"""What cameras see of light on surfaces, by rays and look-ups in one recorded launch.
+
+A ray of a pixel sees a texel, or the environment; another one, in the mean direction of the surface's gloss, sees what
+is reflected. Where a pixel's rays go through it is the same for all pixels, so that nothing is random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.scene.mitsuba_backend.lobes import ANGLES, TABLES, Lobes
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.texel_rays import SHIFT, Floats, Grid, grid_place, map_place, shapes_of, to_map
+from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time, population, recorded
+
+SHARP, WIDE = 0.15, 0.4
+"""Spreads of gloss between which what one ray meets on the ground gives way to what surrounds the object."""
+CAMERA = 16
+"""Numbers of a camera."""
+PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
+"""Where the rays of a pixel go through it: a turned grid, which sees upright and level edges at four places."""
+RAYS = len(PATTERN)
+
+
+@dataclass(frozen=True, eq=False)
+class Lit:
+    """The light of one moment, as `Views` looks it up; flat arrays of Dr.Jit.
+
+    Attributes:
+        texels: radiance that leaves each texel of all grids, and in the end that of the ground far off; of a
+            photographed ground, the share of the photograph that it shows. Three numbers each.
+        sky: the environment's map, three numbers each.
+        sky_shape: its rows and columns, the copied columns at both ends among them.
+        blurred: what surrounds the object, the ground too, blurred by each of `widths`, three numbers each.
+        blurred_shape: their rows and columns.
+    """
+
+    texels: Any
+    sky: Any
+    sky_shape: tuple[int, int]
+    blurred: Any
+    blurred_shape: tuple[int, int]
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers there are."""
+        return len(self.texels) + len(self.sky) + len(self.blurred)
+
+
+def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
+    """Return light for look-ups, in memory of its own.
+
+    Args:
+        texels: (cells of all grids, 3).
+        padded: (H, W + 2, 3).
+        blurred: (widths, h, w, 3).
+    """
+    mi = mitsuba()
+    arrays = [mi.Float(one.contiguous().numpy().ravel()) for one in (texels, padded, blurred)]
+    shapes = [(one.shape[-3], one.shape[-2]) for one in (padded, blurred)]
+    return Lit(arrays[0], arrays[1], shapes[0], arrays[2], shapes[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What cameras see.
+
+    Attributes:
+        rest: (n, H, W, 3) radiance but for what the searched texture reflects diffusely.
+        covered: (n, H, W, 1) share of each pixel that shows surfaces.
+        sample: (k,) int64, the rays that see the searched texture, ascending; `samples` a pixel, row by row.
+        uv: (k, 2) where; as Mitsuba has them.
+        weight: (k,) the diffuse share over pi, and over the rays of a pixel.
+    """
+
+    rest: Tensor
+    covered: Tensor
+    sample: Tensor
+    uv: Tensor
+    weight: Tensor
+
+
+class Views:
+    """Looks through many cameras in one launch, which is recorded.
+
+    Args:
+        scene: whose cameras and shapes these are; the inputs that it is asked with have to be set in it.
+        grids: of all surfaces that take part, that of the searched texture first.
+        lobes: of each.
+        widths: root mean square angles of the blurred maps, each twice the one before, radians.
+        photographed: height of the camera of a photographed ground; None where the ground is none.
+    """
+
+    def __init__(
+        self,
+        scene: MitsubaScene,
+        grids: Sequence[Grid],
+        lobes: Sequence[Lobes],
+        widths: Sequence[float],
+        photographed: float | None,
+    ) -> None:
+        self._scene, self._grids, self._widths, self._photographed = scene, tuple(grids), tuple(widths), photographed
+        tables = [np.concatenate([getattr(one, name) for name in TABLES]) for one in lobes]
+        self._tables = np.concatenate(tables).astype(np.float32)
+        self._recorded: dict[tuple[Any, ...], Any] = {}
+        self._recorded_at = (0, 0)
+
+    def __call__(self, cameras: Sequence[Mapping[str, Tensor]], lit: Lit) -> Seen:
+        """Look at a lit scene.
+
+        Args:
+            cameras: the inputs of each: `camera.to_world` (4, 4), `camera.fov`, `camera.shift_x` and `camera.shift_y`
+                (1,).
+            lit: what it looks like.
+        """
+        with one_at_a_time:
+            mi = mitsuba()
+            import drjit as dr
+
+            height, width = self._scene.resolution
+            count = len(cameras)
+            rows = np.stack([_camera(one, height, width) for one in cameras]).astype(np.float32)
+            now = (population.changes, dr.thread_count())
+            if self._recorded_at != now:
+                self._recorded.clear()
+                self._recorded_at = now
+            key = count, lit.sky_shape, lit.blurred_shape
+            if key not in self._recorded:
+
+                def look(held: Any, lane: Any, tables: Any, given: Any, texels: Any, sky: Any, blurred: Any) -> Any:
+                    there = Lit(texels, sky, lit.sky_shape, blurred, lit.blurred_shape)
+                    return self._look(held, lane, tables, given, there)
+
+                self._recorded[key] = recorded(look, [])
+            arrays = [mi.Float(one) for one in (self._tables, rows.ravel())]
+            lane = dr.arange(mi.UInt32, count * height * width * RAYS)
+            dr.eval(lane)  # a recording takes its size from what it is given, the size of the scene's map else
+            found = self._recorded[key](self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred)
+            *rest, covered, u, v, weight = (one.numpy() for one in found)
+            size = (count, height, width)
+            (sample,) = np.nonzero(weight)
+            return Seen(
+                rest=torch.from_numpy(np.stack(rest, axis=-1)).reshape(*size, 3),
+                covered=torch.from_numpy(covered.copy()).reshape(*size, 1),
+                sample=torch.from_numpy(sample),
+                uv=torch.from_numpy(np.stack([u[sample], v[sample]], axis=1)),
+                weight=torch.from_numpy(weight[sample]),
+            )
+
+    def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lit: Lit) -> list[Any]:
+        """The kernel: radiance but for the searched texture, coverage, and where and how much each ray sees of it."""
+        mi = mitsuba()
+        import drjit as dr
+
+        height, width = self._scene.resolution
+        pixel, number = lane // RAYS, lane % RAYS
+        view, pixel = pixel // (height * width), pixel % (height * width)
+        across, down = (_chosen(number, [one[axis] for one in PATTERN]) for axis in (0, 1))
+        entry = [dr.gather(mi.Float, cameras, view * CAMERA + k) for k in range(CAMERA)]
+        x = (entry[14] - 2.0 * (mi.Float(pixel % width) + across) / width) * entry[12]
+        y = (entry[15] - 2.0 * (mi.Float(pixel // width) + down) / height) * entry[13]
+        way = dr.normalize(mi.Vector3f(*(entry[k] * x + entry[3 + k] * y + entry[6 + k] for k in range(3))))
+        ray, wanted = mi.Ray3f(mi.Point3f(*entry[9:12]), way), mi.RayFlags.UV | mi.RayFlags.ShadingFrame
+        hit = held.ray_intersect(ray, wanted, coherent=True)
+        valid, to_local = hit.is_valid(), to_map(self._scene)
+        shapes = shapes_of(held, self._grids)
+        ons = [valid & (hit.shape == mi.ShapePtr(shape)) for shape in shapes]
+        normal = dr.select(dr.dot(hit.sh_frame.n, way) > 0.0, -hit.sh_frame.n, hit.sh_frame.n)
+        cosine = -dr.dot(normal, way)
+        table = mi.UInt32(0)
+        for number_of, on in enumerate(ons):
+            table = dr.select(on, mi.UInt32(number_of * len(TABLES) * ANGLES), table)
+        diffuse, gloss, up, along, spread = self._measured(tables, table, cosine)
+        shown = self._shown(hit, ons, lit, to_local)
+        radiance = dr.select(ons[0], 0.0, shown * dr.select(valid, diffuse, 1.0))
+        # the gloss: a ray in the mean direction of the lobe says what is there, the blurred map how bright it is
+        glossy = valid & (gloss > 1e-4)
+        beside = dr.normalize(way + normal * cosine + 1e-8)
+        mirrored = dr.normalize(normal * up + beside * along)
+        second = held.ray_intersect(mi.Ray3f(hit.p + normal * SHIFT, mirrored), mi.RayFlags.UV, False, glossy)
+        seconds = [second.is_valid() & (second.shape == mi.ShapePtr(shape)) for shape in shapes]
+        blurred = _blurred(lit, mirrored, to_local, spread, self._widths)
+        texel = self._texel(second, seconds, lit)
+        shade = texel / dr.gather(mi.Color3f, lit.texels, mi.UInt32(self._grids[-1].first + self._grids[-1].count))
+        level = mi.Bool(False)
+        for grid, on in zip(self._grids, seconds, strict=True):
+            level |= on & (grid.warp is not None)
+        wide = dr.clip((spread - SHARP) / (WIDE - SHARP), 0.0, 1.0)
+        traced = self._shown(second, seconds, lit, to_local)
+        ground = traced + wide * (blurred * shade - traced)
+        reflected = dr.select(second.is_valid(), dr.select(level, ground, texel), blurred)
+        radiance += dr.select(glossy, gloss * reflected, 0.0)
+        radiance += dr.select(valid, 0.0, _sky(lit, way, to_local))
+        covered = dr.select(valid, mi.Float(1.0 / RAYS), 0.0)
+        weight = dr.select(ons[0], diffuse / (math.pi * RAYS), 0.0)
+        radiance /= RAYS
+        dr.eval(radiance, covered, hit.uv, weight)  # a sum of its own kernel each would send all rays again
+        return [*(dr.block_sum(one, RAYS) for one in (*radiance, covered)), hit.uv.x, hit.uv.y, weight]
+
+    def _measured(self, tables: Any, first: Any, cosine: Any) -> list[Any]:
+        """The entries of the tables at a cosine."""
+        mi = mitsuba()
+        import drjit as dr
+
+        place = dr.clip(cosine * ANGLES - 0.5, 0.0, ANGLES - 1.0)
+        low = dr.minimum(mi.UInt32(place), ANGLES - 2)
+        share = place - mi.Float(low)
+        found = []
+        for number in range(len(TABLES)):
+            one, other = (dr.gather(mi.Float, tables, first + (number * ANGLES + k) + low) for k in (0, 1))
+            found.append(one + share * (other - one))
+        return found
+
+    def _shown(self, hit: Any, ons: Sequence[Any], lit: Lit, to_local: Any) -> Any:
+        """Diffuse radiance of what was hit."""
+        mi = mitsuba()
+        import drjit as dr
+
+        found = self._texel(hit, ons, lit)
+        if self._photographed is not None:
+            below = dr.normalize(hit.p - mi.Point3f(0.0, 0.0, self._photographed))
+            for grid, on in zip(self._grids, ons, strict=True):
+                found = dr.select(on, found * _sky(lit, below, to_local), found) if grid.warp is not None else found
+        return found
+
+    def _texel(self, hit: Any, ons: Sequence[Any], lit: Lit) -> Any:
+        """What the texels say of what was hit; 0 where it has none."""
+        mi = mitsuba()
+        import drjit as dr
+
+        first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
+        y, x, known = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
+        for grid, on in zip(self._grids, ons, strict=True):
+            down, across = grid_place(grid, hit.p, hit.uv)
+            y, x, known = dr.select(on, down, y), dr.select(on, across, x), known | on
+            first = dr.select(on, mi.UInt32(grid.first), first)
+            rows = dr.select(on, mi.UInt32(grid.shape[0]), rows)
+            columns = dr.select(on, mi.UInt32(grid.shape[1]), columns)
+        found = _bilinear(lit.texels, first, rows, columns, y * mi.Float(rows) - 0.5, x * mi.Float(columns) - 0.5)
+        return dr.select(known, found, 0.0)
+
+
+# ---- look-ups -------------------------------------------------------------------------------------------------------
+
+
+def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
+    """The 16 numbers of a camera: its axes to the left, up and forward, its place, half its extent, its middle."""
+    matrix = inputs["camera.to_world"].detach().double().numpy()
+    half = math.tan(math.radians(float(inputs["camera.fov"])) / 2.0)
+    longer = max(height, width)
+    shift = [float(inputs[name]) if name in inputs else 0.0 for name in ("camera.shift_x", "camera.shift_y")]
+    extent = [half * width / longer, half * height / longer]
+    middle = [1.0 - 2.0 * shift[0], 1.0 - 2.0 * shift[1]]
+    return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, middle])
+
+
+def _chosen(number: Any, values: Sequence[float]) -> Any:
+    """The value with a number."""
+    mi = mitsuba()
+    import drjit as dr
+
+    found = mi.Float(values[0])
+    for index, value in enumerate(values[1:], 1):
+        found = dr.select(number == index, value, found)
+    return found
+
+
+def _bilinear(values: Any, first: Any, rows: Any, columns: Any, y: Any, x: Any, *, wraps: bool = False) -> Any:
+    """Look three numbers up in a grid of a flat array, which ends at its border or goes round in its columns."""
+    mi = mitsuba()
+    import drjit as dr
+
+    y = dr.clip(y, 0.0, mi.Float(rows) - 1.0)
+    upper, share = mi.UInt32(y), y - dr.floor(y)
+    lower = dr.minimum(upper + 1, rows - 1)
+    if wraps:
+        x = dr.select(x < 0.0, x + mi.Float(columns), x)
+    else:
+        x = dr.clip(x, 0.0, mi.Float(columns) - 1.0)
+    left, across = mi.UInt32(x), x - dr.floor(x)
+    right = (left + 1) % columns if wraps else dr.minimum(left + 1, columns - 1)
+    left = left % columns if wraps else left
+
+    def at(row: Any, column: Any) -> Any:
+        return dr.gather(mi.Color3f, values, first + row * columns + column)
+
+    above = at(upper, left) * (1.0 - across) + at(upper, right) * across
+    below = at(lower, left) * (1.0 - across) + at(lower, right) * across
+    return above * (1.0 - share) + below * share
+
+
+def _sky(lit: Lit, way: Any, to_local: Any) -> Any:
+    """The environment in a direction, as Mitsuba has it: rows from pole to pole, columns with a copy at both ends."""
+    mi = mitsuba()
+
+    rows, columns = lit.sky_shape
+    across, down = map_place(way, to_local)
+    x, y = across * (columns - 2) + 0.5, down * (rows - 1)
+    return _bilinear(lit.sky, mi.UInt32(0), mi.UInt32(rows), mi.UInt32(columns), y, x)
+
+
+def _blurred(lit: Lit, way: Any, to_local: Any, spread: Any, widths: Sequence[float]) -> Any:
+    """The environment in a direction, blurred by an angle (root mean square)."""
+    mi = mitsuba()
+    import drjit as dr
+
+    rows, columns = lit.blurred_shape
+    level = dr.clip(dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0)
+    low = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
+    share = level - mi.Float(low)
+    across, down = map_place(way, to_local)
+    y, x = down * rows - 0.5, across * columns - 0.5
+    one, other = (
+        _bilinear(lit.blurred, (low + k) * (rows * columns), mi.UInt32(rows), mi.UInt32(columns), y, x, wraps=True)
+        for k in (0, 1)
+    )
+    return one + share * (other - one)

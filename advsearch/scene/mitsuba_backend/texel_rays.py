@@ -1,0 +1,177 @@
+"""Rays from texels: what they see of each other and of the environment; and where in grids and its map things lie.
+
+A grid of texels is laid over each surface (`Grid`). Nothing here depends on the light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+Floats = npt.NDArray[np.float32]
+Ints = npt.NDArray[np.int32]
+
+SHIFT = 1e-4
+"""How far from a surface rays begin, object sizes."""
+PASS = 1 << 20
+"""Rays of one launch of `gather`."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The texels over one surface.
+
+    Attributes:
+        name: of the shape in Mitsuba's scene.
+        first: number of its first texel among those of all grids.
+        shape: rows and columns.
+        warp: None where it lies over texture coordinates; else (middle x, middle y, scale, rate) of a level plane whose
+            cells are small about its middle: coordinate = middle + scale sinh(rate s), s in [-1, 1].
+    """
+
+    name: str
+    first: int
+    shape: tuple[int, int]
+    warp: tuple[float, float, float, float] | None = None
+
+    @property
+    def count(self) -> int:
+        return self.shape[0] * self.shape[1]
+
+
+def gather(
+    scene: MitsubaScene,
+    grids: Sequence[Grid],
+    cells: tuple[int, int],
+    places: Floats,
+    normals: Floats,
+    rays: int,
+    seed: int,
+) -> Ints:
+    """Return what rays from texels see, over the cosine: (n, rays) numbers of texels; from the count of all texels on,
+    of cells of the environment; or -1, where there is no light: the back of a surface that has texels, or a shape that
+    has none.
+
+    Args:
+        scene: with its inputs set.
+        grids: of all surfaces.
+        cells: rows and columns of the cells of the environment.
+        places: (n, 3) where texels lie.
+        normals: (n, 3) unit shading normals.
+        rays: of each texel; the same well-spread points for all, shifted by chance.
+        seed: number of the shifts.
+    """
+    mi = mitsuba()
+    import drjit as dr
+
+    held, to_local = scene._scene, to_map(scene)
+    count, texels = len(places), grids[-1].first + grids[-1].count
+    steps = (np.arange(1, rays + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])) % 1.0
+    points = mi.Point2f(mi.Float(steps[:, 0].astype(np.float32)), mi.Float(steps[:, 1].astype(np.float32)))
+    shifts = np.random.default_rng(seed).random((count, 2), dtype=np.float32)
+    found = np.empty((count, rays), dtype=np.int32)
+    for begin in range(0, count, max(1, PASS // rays)):
+        some = slice(begin, min(count, begin + max(1, PASS // rays)))
+        lane = dr.arange(mi.UInt32, (some.stop - begin) * rays)
+        texel, number = lane // rays, lane % rays
+        shift = dr.gather(mi.Point2f, _points(mi.Point2f, shifts[some]), texel)
+        square = dr.gather(mi.Point2f, points, number) + shift
+        square -= dr.floor(square)
+        normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals[some]), texel)
+        place = dr.gather(mi.Point3f, _points(mi.Point3f, places[some]), texel)
+        way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
+        hit = held.ray_intersect(mi.Ray3f(place + normal * SHIFT, way))
+        column, row = map_place(way, to_local)
+        across, down = mi.UInt32(column * cells[1]) % cells[1], mi.UInt32(dr.minimum(row * cells[0], cells[0] - 1))
+        seen = dr.select(hit.is_valid(), mi.Int32(-1), mi.Int32(texels + down * cells[1] + across))
+        front = dr.dot(hit.n, way) < 0.0
+        for grid, shape in zip(grids, shapes_of(held, grids), strict=True):
+            on = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (front | (grid.warp is not None))
+            y, x = grid_place(grid, hit.p, hit.uv)
+            nearest = mi.Int32(grid.first + _cell(y, grid.shape[0]) * grid.shape[1] + _cell(x, grid.shape[1]))
+            seen = dr.select(on, nearest, seen)
+        found[some] = seen.numpy().reshape(-1, rays)
+    return found
+
+
+def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) -> Floats:
+    """Return how much of what comes from directions texels receive: (n, k) cosines; 0 where something is in between.
+
+    Args:
+        scene: with its inputs set.
+        places, normals: (n, 3), as of `gather`.
+        ways: (k, 3) unit directions, in the axes of the environment's map.
+    """
+    mi = mitsuba()
+    import drjit as dr
+
+    world = (ways @ np.array(to_map(scene))).astype(np.float32)  # the transpose turns back
+    lane = dr.arange(mi.UInt32, len(places) * len(world))
+    texel, number = lane // len(world), lane % len(world)
+    place = dr.gather(mi.Point3f, _points(mi.Point3f, places), texel)
+    normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals), texel)
+    way = dr.gather(mi.Vector3f, _points(mi.Vector3f, world), number)
+    cosine = dr.dot(normal, way)
+    above = cosine > 0.0
+    hidden = scene._scene.ray_test(mi.Ray3f(place + normal * SHIFT, way), above)
+    found: Floats = dr.select(above & ~hidden, cosine, 0.0).numpy().reshape(len(places), len(world))
+    return found
+
+
+# ---- places ---------------------------------------------------------------------------------------------------------
+
+
+def shapes_of(held: Any, grids: Sequence[Grid]) -> list[Any]:
+    """Mitsuba's shapes of grids."""
+    by_name = {one.id(): one for one in held.shapes()}
+    return [by_name[grid.name] for grid in grids]
+
+
+def to_map(scene: MitsubaScene) -> Any:
+    """The turn from the world to the axes of the environment's map, three rows."""
+    matrix = scene.parameters["environment.to_world"].matrix
+    return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3].T.tolist()
+
+
+def map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
+    """Where in the environment's map a direction lies: shares of its width and of its height."""
+    import drjit as dr
+
+    x, y, z = (row[0] * way.x + row[1] * way.y + row[2] * way.z for row in to_local)
+    across = dr.atan2(x, -z) / (2.0 * math.pi)
+    return across - dr.floor(across), dr.safe_acos(y) / math.pi
+
+
+def grid_place(grid: Grid, place: Any, uv: Any) -> tuple[Any, Any]:
+    """Where in a grid something lies: shares of its height and of its width."""
+    import drjit as dr
+
+    if grid.warp is None:
+        return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
+    middle_x, middle_y, scale, rate = grid.warp
+    shares = []
+    for along, middle in ((place.y, middle_y), (place.x, middle_x)):
+        far = (along - middle) / scale
+        shares.append(dr.clip(0.5 + dr.asinh(far) / (2.0 * rate), 0.0, 1.0))
+    return shares[0], shares[1]
+
+
+def _cell(share: Any, count: int) -> Any:
+    mi = mitsuba()
+    import drjit as dr
+
+    return mi.Int32(dr.minimum(share * count, count - 1.0))
+
+
+def _points(kind: Any, values: Floats) -> Any:
+    """Rows of numbers as Dr.Jit's points, vectors or normals."""
+    mi = mitsuba()
+    return kind(*(mi.Float(np.ascontiguousarray(values[:, k], dtype=np.float32)) for k in range(values.shape[1])))

@@ -1,0 +1,231 @@
+"""Object and surroundings as they stand, with the light that arrives on them.
+
+Where object, surroundings and lights stand still, the irradiance E of a point is the same for every camera, so that
+
+    radiance(pixel) = mean over its rays of [ share(angle) base colour E / pi + gloss(angle) x light in its lobe ]
+                      or of the environment where a ray escapes
+
+with the shares and the lobe of the surface measured by sampling its BSDF. Nothing in it is random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.description import OBJECT
+from advsearch.scene.mitsuba_backend.lobes import Lobes, measured
+from advsearch.scene.mitsuba_backend.surface import Lit, Seen, Views, lit_arrays
+from advsearch.scene.mitsuba_backend.texel_rays import gather, to_map, towards
+from advsearch.scene.photograph import irradiance as unshadowed
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.surface.light import (
+    BLURRED,
+    CELLS,
+    WIDTHS,
+    blurred,
+    directions,
+    irradiance,
+    looked_up,
+    seen_of,
+    sky_of,
+)
+from advsearch.scene.surface.texels import SIDE, Texels, between, on_ground, on_mesh, smoothed, together
+from advsearch.scene.surface.view import Product
+from advsearch.scene.surface_map import rasterised
+from advsearch.scene.transport.matrix import bilinear
+
+GATHERED = 256
+"""Rays from each texel that say what it sees."""
+BURIED = 0.3
+"""Share of a texel's rays that meet the back of a surface from which on it lies inside of something."""
+BOUNCES = 4
+"""How often light goes from texel to texel: that and the camera's and the sky's segments make a path of `MAX_DEPTH`."""
+FINE = 96
+"""Least side of the grid on which base colour and light are multiplied."""
+WHITE = 0.95
+"""Reflectance that a photographed ground has at most, where light goes from surface to surface."""
+COLOR, MAP, GROUND = f"{OBJECT}.base_color", "environment.padded", "ground"
+CAMERAS = frozenset({"camera.to_world", "camera.fov", "camera.shift_x", "camera.shift_y"})
+FREE = CAMERAS | ON_PICTURE | {MAP, COLOR, "ground.reflectance"}
+"""Inputs that may change without anything being found anew but the light."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Light on the surfaces.
+
+    Attributes:
+        on_object: (cells of the fine grid, 3) irradiance.
+        lit: the rest, for look-ups.
+    """
+
+    on_object: Tensor
+    lit: Lit
+
+    @property
+    def bytes(self) -> int:
+        """Memory."""
+        return 4 * (self.on_object.numel() + self.lit.numbers)
+
+
+class Arrangement:
+    """Object and surroundings as they stand, and what they see of each other and of the environment.
+
+    Args:
+        renderer: of the scene.
+        inputs: the scene's own, assembled, but for what may change.
+        texture: rows and columns of the base colour.
+        seed: number of the noise of the rays.
+    """
+
+    def __init__(self, renderer: Renderer, inputs: Mapping[str, Tensor], texture: tuple[int, int], seed: int) -> None:
+        scene = renderer.scene
+        self._scene, self.inputs = scene, {name: one for name, one in inputs.items() if name not in ON_PICTURE}
+        scene.held(self.inputs)
+        description = scene.made[0]
+        vertices, normals = (self._value(f"{OBJECT}.{what}").reshape(-1, 3).numpy() for what in ("vertices", "normals"))
+        mesh = description.meshes[OBJECT].mesh
+        charts = rasterised(mesh, SIDE)
+        some = [on_mesh(OBJECT, charts, vertices, normals)]
+        middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        photograph = description.photograph
+        if description.number("ground.size") > 0.0:
+            reach = math.inf if photograph is not None else description.number("ground.size") / 2.0
+            some.append(on_ground(GROUND, 0.0, reach, (float(middle[0]), float(middle[1]))))
+        self.texels: Texels = together(some)
+        factor = max(1, math.ceil(FINE / min(texture)))
+        self.fine = texture[0] * factor, texture[1] * factor
+        self._finer = None if factor == 1 else self._enlarging(texture)
+        places, facing = self.texels.places, self.texels.normals
+        seen = gather(scene, self.texels.grids, CELLS, places, facing, GATHERED, seed)
+        self._sees = seen_of(seen, self.texels.of_cell, len(places))
+        buried = np.asarray((seen[self.texels.of(0)] < 0).mean(axis=1) > BURIED)
+        self._between = between(self.texels, charts, self.fine, vertices, normals, buried)
+        if len(some) > 1:
+            above = np.asarray((seen[self.texels.of(1)] >= len(self.texels.of_cell)).any(axis=1))
+            self._smooth = smoothed(some[1], above)
+        self.lobes = [self._measured(0), *(Lobes.matt() for _ in some[1:])]
+        self._photographed = None if photograph is None else description.number("ground.height")
+        self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
+        self._below = self._seen_below(middle)
+        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed)
+
+    def _value(self, name: str) -> Tensor:
+        return self.inputs[name] if name in self.inputs else self._scene.base(name)
+
+    def _measured(self, number: int) -> Lobes:
+        here = self.texels.of(number)
+        at = here.start + (here.stop - here.start) // 2
+        return measured(
+            self._scene, self.inputs, self.texels.grids[number], self.texels.places[at], self.texels.normals[at]
+        )
+
+    def _enlarging(self, texture: tuple[int, int]) -> scipy.sparse.csr_matrix:
+        """From the texels of a small texture to the fine grid."""
+        rows, columns = self.fine
+        y, x = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+        places, shares = bilinear(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32), texture)
+        starts = np.arange(rows * columns + 1, dtype=np.int32) * 4
+        return scipy.sparse.csr_matrix(
+            (shares.ravel(), places.ravel(), starts), (rows * columns, texture[0] * texture[1])
+        )
+
+    def _seen_below(self, middle: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Which cells of the blurred maps (h, w) the ground hides, seen from the object's middle, and the directions
+        (h, w, 3) in the map's axes in which its photograph has what is seen there."""
+        ways = directions(BLURRED)
+        world = ways @ self.to_map
+        if len(self.texels.grids) == 1:
+            return torch.zeros(BLURRED, dtype=torch.bool), ways
+        far = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
+        places = torch.from_numpy(middle).float() + world * far[..., None]
+        reach = self._scene.made[0].number("ground.size") / 2.0 if self._photographed is None else math.inf
+        hidden = (world[..., 2] < -1e-3) & (places[..., :2].abs() <= reach).all(dim=-1)
+        camera = torch.tensor([0.0, 0.0, self._photographed or 0.0])
+        return hidden, (places - camera) @ self.to_map.T
+
+    @property
+    def entries(self) -> int:
+        """Of all matrices, for one colour channel."""
+        return sum(int(one.values().numel()) for one in (*self._sees, self._between))
+
+    @property
+    def bytes(self) -> int:
+        """Memory of all matrices."""
+        return 8 * self.entries
+
+    def seen(self, cameras: Sequence[Mapping[str, Tensor]], light: Light) -> Seen:
+        """Return what cameras see under a light; see `Views`."""
+        self._stand()
+        return self._views(cameras, light.lit)
+
+    def _stand(self) -> None:
+        """Put object and surroundings back where they stand, if something has moved them since."""
+        self._scene.stand(self.inputs)
+
+    def finer(self, color: Tensor) -> Tensor:
+        """Return a base colour (h, w, 3) on the fine grid, (cells, 3); differentiable."""
+        flat = color.reshape(-1, 3)
+        if self._finer is None:
+            return flat
+        found: Tensor = Product.apply(self._finer, flat)  # type: ignore[no-untyped-call]
+        return found
+
+    def light(self, padded: Tensor, color: Tensor) -> Light:
+        """Return the light of an environment (H, W + 2, 3) where the object has a base colour (h, w, 3)."""
+        with torch.no_grad():
+            sky = sky_of(padded)
+            direct = None
+            if len(sky.hot[0]):
+                self._stand()
+                found = towards(self._scene, self.texels.places, self.texels.normals, sky.hot[0].numpy())
+                direct = torch.from_numpy(found)
+            reflectance = self._reflectance(color, padded)
+            arriving = irradiance(self._sees, sky, direct, reflectance, BOUNCES)
+            leaving = reflectance * arriving / math.pi
+            shown, unhidden = sky.map, torch.ones(1, 3)
+            if len(self.texels.grids) > 1:
+                ground, (hidden, below) = self.texels.of(1), self._below
+                if self._photographed is not None:
+                    leaving[ground] = arriving[ground] / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+                leaving[ground] = self._smooth @ leaving[ground]
+                unhidden = self._border(leaving[ground])
+                seen = unhidden
+                if self._photographed is not None:
+                    seen = unhidden * looked_up(padded, below.reshape(-1, 3)).reshape(*BLURRED, 3)
+                shown = torch.where(hidden[..., None], seen, shown)
+            on_object = self._between @ arriving[self.texels.of(0)]
+            cells = torch.cat([leaving[torch.from_numpy(self.texels.of_cell)], unhidden])
+            return Light(on_object, lit_arrays(cells, padded, blurred(shown)))
+
+    def _border(self, ground: Tensor) -> Tensor:
+        """The mean (1, 3) of a ground's light at its border, where the object hides little of it."""
+        cells = ground.reshape(*self.texels.grids[1].shape, 3)
+        return torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]]).mean(dim=0, keepdim=True).clamp_min(1e-9)
+
+    def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
+        """(n, 3) of each texel, the gloss counted as if it were diffuse."""
+        rows, columns = self.texels.grids[0].shape
+        fine = self.finer(color).reshape(*self.fine, 3).permute(2, 0, 1)[None]
+        pooled = functional.adaptive_avg_pool2d(fine, (rows, columns))[0].permute(1, 2, 0).reshape(-1, 3)
+        found = [pooled[torch.from_numpy(self.texels.cells[self.texels.of(0)])]]
+        if len(self.texels.grids) > 1:
+            ground = self.texels.places[self.texels.of(1)]
+            if self._photographed is None:
+                found.append(srgb_to_linear(torch.tensor(self._scene.made[0].ground_color)).expand(len(ground), 3))
+            else:
+                below = torch.from_numpy(ground) - torch.tensor([0.0, 0.0, self._photographed])
+                shown = looked_up(padded, below @ self.to_map.T)
+                found.append((shown * math.pi / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)).clamp_max(WHITE))
+        shares = [torch.tensor(one.mean_shares) for one in self.lobes]
+        return torch.cat([one * share[0] + share[1] for one, share in zip(found, shares, strict=True)])

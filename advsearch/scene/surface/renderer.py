@@ -1,0 +1,110 @@
+"""A renderer of pictures from many cameras and under many environments: light is kept on surfaces."""
+
+from __future__ import annotations
+
+import copy
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from advsearch.files import scaled
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light
+from advsearch.scene.surface.view import View
+from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
+
+
+class SurfaceRenderer(PredictingRenderer):
+    """A renderer whose pictures come from light on surfaces; for spaces that `plan.why_not` says nothing against.
+
+    A picture is linear in the base colour of the object. Light that goes from the object to itself, or to the ground
+    and back, is that of the base colour `there`.
+
+    Args:
+        renderer: the one that traces paths.
+        u: everything but cameras, environment and base colour stays as it is there.
+        seed: number of the noise of the rays that say what texels see.
+
+    Attributes:
+        arrangement: object and surroundings.
+        there: (h, w, 3) the base colour whose light between surfaces is kept; see `renew`.
+        dropped: lights that made room for others.
+    """
+
+    def __init__(self, renderer: Renderer, u: Tensor, seed: int) -> None:
+        vars(self).update(vars(copy.copy(renderer)))
+        self.products = self.dropped = 0
+        self._lights: OrderedDict[bytes, Light] = OrderedDict()
+        self._base = {name: self.scene.base(name) for name in (*CAMERAS, MAP, COLOR)}
+        with torch.no_grad():
+            inputs = self.scene.assembly(self.space.inputs(u))
+            self.there = self.color(inputs)
+            standing = {name: inputs[name] for name in inputs if name not in FREE}
+            texture = self.there.shape[0], self.there.shape[1]
+            self.arrangement = Arrangement(renderer, standing, texture, seed)
+
+    def renew(self, u: Tensor) -> None:
+        """Take the light between surfaces from the base colour at u from now on."""
+        with torch.no_grad():
+            self.there = self.color(self.scene.assembly(self.space.inputs(u)))
+        self._lights.clear()
+
+    @property
+    def entries(self) -> int:
+        return self.arrangement.entries
+
+    @property
+    def bytes(self) -> int:
+        return self.arrangement.bytes + sum(one.bytes for one in self._lights.values())
+
+    def light(self, inputs: Mapping[str, Tensor]) -> Light:
+        """Return the light under the environment of scene inputs, made on first use; `MOST_BYTES` of them are kept."""
+        padded = inputs.get(MAP, self._base[MAP]).detach()
+        flat = padded.reshape(-1)
+        key = torch.cat([flat[:: max(1, flat.numel() // 997)], flat.sum()[None]]).numpy().tobytes()
+        if key not in self._lights:
+            self._lights[key] = self.arrangement.light(padded, self.there)
+            while len(self._lights) > 1 and self.bytes > scaled(MOST_BYTES):
+                self._lights.popitem(last=False)
+                self.dropped += 1
+        return self._lights[key]
+
+    def pictures(self, inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]) -> Tensor:
+        """Return the pictures (n, H, W, 3) sRGB of a base colour for several cameras and environments; those under one
+        environment in one launch. Differentiable in the base colour.
+
+        Args:
+            inputs: of the scene, for each; their base colour does not count.
+            color: (h, w, 3) base colour.
+            wholes: (d,) configurations of the space, for what controls do to the finished picture.
+        """
+        lights = [self.light(one) for one in inputs]
+        views: dict[int, View] = {}
+        for light in dict.fromkeys(lights):
+            numbers = [number for number, one in enumerate(lights) if one is light]
+            cameras = [self._camera(inputs[number]) for number in numbers]
+            seen = self.arrangement.seen(cameras, light)
+            views |= {number: View(seen, place, self.arrangement.fine) for place, number in enumerate(numbers)}
+        fine = self.arrangement.finer(color)
+        self.products += len(inputs)
+        return torch.stack(
+            [
+                self._shown(views[number].radiance(fine * light.on_object), one, wholes[number])
+                for number, (one, light) in enumerate(zip(inputs, lights, strict=True))
+            ]
+        )
+
+    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
+        light = self.light(inputs)
+        view = View(self.arrangement.seen([self._camera(inputs)], light), 0, self.arrangement.fine)
+        self.products += 1
+        return view.radiance(self.arrangement.finer(self.color(inputs)) * light.on_object)
+
+    def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {name: inputs.get(name, self._base[name]) for name in CAMERAS}
+
+    def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """The base colour (h, w, 3) of scene inputs."""
+        return inputs.get(COLOR, self._base[COLOR])

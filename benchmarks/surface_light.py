@@ -1,0 +1,125 @@
+"""Light on surfaces: what a picture from a new viewpoint takes, and how far it is off, beside a rendered one.
+
+    python benchmarks/surface_light.py [SCENE ...] [--views 5] [--truth 1024] [--repeats 5] [--sizes 128,224]
+
+A SCENE is OBJECT@ENVIRONMENT, each a bundled name or a file; the default is the bundled mug, bottle and bowl. The model
+is the reference model, for scenes whose object has a class of it. For each scene and size, over random cameras within
+their whole ranges:
+
+- ms: processor time of one picture, predicted and rendered (8 samples, denoised), medians of turns one after the other;
+- levels: root mean square difference of 255 from a picture of `--truth` samples, without the noise that it has itself
+  (two of them are traced), predicted and rendered;
+- margin: mean absolute difference of the model's margin from that of the traced pictures, predicted and rendered;
+- light: seconds of processor time until the first picture can be predicted, and ms for another environment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from advsearch import threads
+
+threads.configure()
+
+from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.models import Model, load_model  # noqa: E402
+from advsearch.scene.renderer import Renderer  # noqa: E402
+from advsearch.scene.surface.plan import why_not  # noqa: E402
+from advsearch.scene.surface.renderer import SurfaceRenderer  # noqa: E402
+
+SCENES = ("mug@studio", "bottle@studio", "bowl@kitchen")
+SPP = 8
+
+
+def main() -> None:
+    """Print a row for each scene and size."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("scenes", nargs="*", default=SCENES)
+    parser.add_argument("--views", type=int, default=5)
+    parser.add_argument("--truth", type=int, default=1024)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--sizes", default="128,224")
+    parser.add_argument("--label", help="what the object is, for a file")
+    args = parser.parse_args()
+    model = load_model("reference")
+    print("predicted | rendered          ms a picture       levels off         margin off     light: s   ms")
+    for scene in args.scenes:
+        thing, _, environment = scene.partition("@")
+        loaded = load_scene(thing, environment or None)
+        label = args.label or loaded.description.object.label
+        for size in map(int, args.sizes.split(",")):
+            with torch.no_grad():
+                row(Path(thing).stem, loaded.renderer(["camera", "environment"], resolution=size), model, label, args)
+
+
+def row(name: str, renderer: Renderer, model: Model, label: str | None, args: argparse.Namespace) -> None:
+    """Print what one scene at one size comes to."""
+    height = renderer.formation.resolution[0]
+    reason = why_not(renderer, ["camera", "environment"])
+    if reason is not None:
+        print(f"{name:20s} {height:4d} not predicted: {reason}")
+        return
+    begun = time.process_time()
+    light = SurfaceRenderer(renderer, renderer.start, seed=0)
+    light(renderer.start)
+    first = time.process_time() - begun
+    wholes = views(renderer, args.views)
+    inputs = [renderer.scene.assembly(renderer.space.inputs(one)) for one in wholes]
+    others = [milliseconds(lambda one=one: light.light(one)) for one in inputs]  # type: ignore[misc]
+    color = light.color(inputs[0])
+    taken: tuple[list[float], list[float]] = ([], [])
+    for number in range(args.repeats + 1):
+        which = number % len(wholes)
+        turns: tuple[Callable[[], object], ...] = (
+            lambda which=which: light.pictures([inputs[which]], color, [wholes[which]]),  # type: ignore[misc]
+            lambda which=which: renderer(wholes[which], seed=which, spp=SPP),  # type: ignore[misc]
+        )
+        for kept, turn in zip(taken, turns, strict=True):
+            kept.append(milliseconds(turn))
+    off: list[list[float]] = [[], []]
+    margins: list[list[float]] = [[], []]
+    for number, whole in enumerate(wholes):
+        traced = [renderer(whole, seed=100 + 2 * number + half, spp=args.truth) for half in range(2)]
+        for kind, picture in enumerate((light(whole), renderer(whole, seed=number, spp=SPP))):
+            square = ((picture - traced[0]) * (picture - traced[1])).mean()
+            off[kind].append(255.0 * float(square.clamp_min(0.0).sqrt()))
+            if label in model.labels:
+                right = sum(margin(model, one, label) for one in traced) / 2.0
+                margins[kind].append(abs(margin(model, picture, label) - right))
+    shown = "       -         " if not margins[0] else " | ".join(f"{statistics.fmean(one):6.2f}" for one in margins)
+    ms = " | ".join(f"{statistics.median(one[1:]):6.1f}" for one in taken)
+    levels = " | ".join(f"{statistics.fmean(one):6.2f}" for one in off)
+    print(f"{name:20s} {height:4d}  {ms}   {levels}   {shown}   {first:6.1f} {statistics.median(others):6.0f}")
+
+
+def views(renderer: Renderer, count: int) -> list[Tensor]:
+    """Configurations over the whole ranges of camera and environment."""
+    generator = torch.Generator().manual_seed(0)
+    return [torch.rand(len(renderer.start), generator=generator) for _ in range(count)]
+
+
+def milliseconds(work: Callable[[], object]) -> float:
+    """Processor time that something takes."""
+    begun = time.process_time()
+    work()
+    return 1e3 * (time.process_time() - begun)
+
+
+def margin(model: Model, picture: Tensor, label: str | None) -> float:
+    """By how much the right class is ahead of all others, logits."""
+    scores = model(picture)[0].clone()
+    right = model.labels.index(str(label))
+    own = float(scores[right])
+    scores[right] = -torch.inf
+    return own - float(scores.max())
+
+
+if __name__ == "__main__":
+    main()

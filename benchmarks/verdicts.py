@@ -1,0 +1,300 @@
+"""Whether verdicts that cost less are as good: the rule of trials, the choice of the sample count, and close calls.
+
+    python benchmarks/verdicts.py [--runs 400] [--epsilons .01 .02 .03 .04] [--object FILE] [--environment FILE] ...
+
+*Before* is how verdicts were taken at first: samples until the margin moves by less than half of itself, and then 20
+trials of which 19 have to succeed. *Now* samples stop where more of them leave the margin on its side, and trials
+stop with the verdict. Four tables:
+
+- trials: how often a rate is found, exactly, and how many trials it takes; how often intervals cover the rate;
+- sample counts: how often a margin passes for settled on the wrong side, where noise lifts it over zero;
+- close calls, drawn: how often what is `found` before and now, and the samples that both take;
+- close calls, rendered: searches at several epsilons; for each both verdicts, pictures x samples, and CPU seconds.
+
+Exits with 1 where an interval covers too seldom, a rate of 75 % is found more often than before, a margin passes on the
+wrong side in more than 5 % of all cases, or noise aside (two standard errors) more is found at a limit that is none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import product
+
+import numpy as np
+import torch
+from scipy import stats
+from scipy.special import stdtrit
+from torch import Tensor
+
+from advsearch import threads
+from advsearch.api.attack import problem_from_config
+from advsearch.attacks import (
+    Block,
+    Domain,
+    Ending,
+    Evaluation,
+    Query,
+    Verification,
+    choose_spp,
+    make_policy,
+    search,
+    verify,
+)
+from advsearch.attacks.evaluation import Evaluate
+from advsearch.attacks.sample_count import LADDER, MarginsOf, margins_of
+from advsearch.attacks.trials import clopper_pearson
+from advsearch.attacks.verification import TRIAL_LOOKS, WORST_CASE
+from advsearch.config import AttackConfig
+from advsearch.seeds import stream
+from advsearch.tasks import Answer, Judgement
+
+RATES = (0.5, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 0.97, 0.99, 1.0)
+WEAK = 0.75
+"""The rate at which the interval of 19 of 20 begins."""
+CALLS = (-0.5, -0.1, 0.0, 0.1, 0.25, 0.5, 1.0, 3.0)
+"""Margins of the answer without noise; over 0 is a success."""
+
+
+# ---- the rule, exactly
+
+
+def outcomes(rate: float) -> dict[tuple[int, int], float]:
+    """Return how often trials that nobody counted end with (successes, trials), for a rate of successes."""
+    last, allowed = TRIAL_LOOKS[-1], WORST_CASE.allowed(TRIAL_LOOKS[-1])
+    failing, ended = {0: 1.0}, dict[tuple[int, int], float]()
+    for n in range(1, last + 1):
+        went = {
+            failures: failing.get(failures, 0.0) * rate + failing.get(failures - 1, 0.0) * (1.0 - rate)
+            for failures in range(max(failing) + 2)
+        }
+        failing = {}
+        for failures, chance in went.items():
+            found = n in TRIAL_LOOKS and failures <= WORST_CASE.allowed(n)
+            lost = failures > allowed and n >= WORST_CASE.fewest
+            if found or lost or n == last:
+                ended[n - failures, n] = ended.get((n - failures, n), 0.0) + chance
+            else:
+                failing[failures] = chance
+        if not failing:
+            break
+    return ended
+
+
+def found(rate: float) -> float:
+    """Return how often a rate is found."""
+    return sum(chance for (k, n), chance in outcomes(rate).items() if k >= WORST_CASE.needed(n))
+
+
+def found_before(rate: float) -> float:
+    """Return how often a rate was found by 19 of 20."""
+    return float(stats.binom.sf(WORST_CASE.needed(20) - 1, 20, rate))
+
+
+def coverage(rate: float) -> float:
+    """Return how often the interval that is printed covers the rate."""
+    intervals = {(k, n): clopper_pearson(k, n) for k, n in outcomes(rate)}
+    return sum(chance for at, chance in outcomes(rate).items() if intervals[at][0] <= rate <= intervals[at][1])
+
+
+def rule_table() -> int:
+    """Print how the rule does; return how many things are wrong with it."""
+    print("| rate | found before, % | now, % | trials before | now |\n| --- | --- | --- | --- | --- |")
+    for rate in RATES:
+        trials = sum(chance * n for (_, n), chance in outcomes(rate).items())
+        print(f"| {rate:.2f} | {100 * found_before(rate):.2f} | {100 * found(rate):.2f} | 20 | {trials:.1f} |")
+    least = min(coverage(rate) for rate in np.linspace(0.005, 0.995, 199))
+    print(f"intervals cover the rate in {100 * least:.1f} % of all cases at least\n")
+    return int(least < 0.95) + int(found(WEAK) > found_before(WEAK))
+
+
+# ---- the sample count
+
+
+def settled_before(here: Sequence[float], below: Sequence[float]) -> bool:
+    """Whether the margin moved by less than half of itself, as it was asked before."""
+    means = [math.fsum(one) / len(one) for one in (here, below)]
+    half = [stdtrit(len(one) - 1, 0.9875) * np.std(one, ddof=1) / math.sqrt(len(one)) for one in (here, below)]
+    return bool(abs(means[0] - means[1]) + math.hypot(*half) <= 0.5 * abs(means[0]))
+
+
+def may_have_settled(values: Sequence[Sequence[float]], level: int, count: int) -> bool:
+    """Whether so many renders might have shown that, by those so far; else they were left out."""
+    known = [one for one in range(level + 1) if values[one]]
+    if not known:
+        return True
+    means = {one: float(np.mean(values[one])) for one in known}
+    best = values[known[-1]]
+    largest = abs(means[known[-1]]) + abs(means[known[-1]] - means[known[-2]]) + np.std(best, ddof=1) / len(best) ** 0.5
+    spread = [
+        np.std(values[one], ddof=1) if values[one] else np.std(best, ddof=1) * (LADDER[known[-1]] / LADDER[one]) ** 0.5
+        for one in (level - 1, level)
+    ]
+    return bool(math.hypot(*spread) * stdtrit(count - 1, 0.9875) / count**0.5 <= 0.5 * largest)
+
+
+def choose_before(margins: Sequence[MarginsOf], seed: int) -> int:
+    """Return the sample count that was chosen before."""
+    reached, looks = 1, list(product(range(1, len(LADDER)), (4, 8)))
+    for render in margins:
+        values: list[list[float]] = [[] for _ in LADDER]
+        for place, (level, count) in enumerate(looks):
+            if not any(may_have_settled(values, *later) for later in looks[place:]):
+                return LADDER[-1]
+            if not may_have_settled(values, level, count):
+                continue
+            for one in (level - 1, level):
+                new = [stream(seed, "sample count", 8 * one + number) for number in range(len(values[one]), count)]
+                values[one] += render(LADDER[one], new) if new else []
+            if settled_before(values[level], values[level - 1]):
+                break
+        else:
+            return LADDER[-1]
+        reached = max(reached, level)
+    return LADDER[reached]
+
+
+def lifted(noise: float) -> MarginsOf:
+    """Margins of a limit of zero that noise lifts over it, as slowly as is allowed for."""
+
+    def margins(spp: int, seeds: Sequence[int]) -> list[float]:
+        drawn = [float(np.random.default_rng([spp, seed]).normal()) for seed in seeds]
+        return [math.sqrt(16 / spp) * (1.0 + noise * one) for one in drawn]
+
+    return margins
+
+
+def sample_table(runs: int) -> int:
+    """Print how often the wrong side passes; return in how many cases that is too often."""
+    print("| noise over lift | wrong side, % |\n| --- | --- |")
+    shares = [
+        (
+            noise,
+            np.mean([choose_spp({"": lifted(noise)}, seed=k, trials=TRIAL_LOOKS[0]).converged for k in range(runs)]),
+        )
+        for noise in (0.03, 0.1, 0.3, 1.0)
+    ]
+    for noise, share in shares:
+        print(f"| {noise} | {100 * share:.2f} |")
+    print()
+    return sum(share > 0.05 + 2.0 * math.sqrt(0.05 * 0.95 / runs) for _, share in shares)
+
+
+# ---- verdicts
+
+
+class Counted:
+    """Answers queries and counts samples; the same picture is made once."""
+
+    def __init__(self, answer: Callable[[Query], Evaluation]) -> None:
+        self.answer, self.samples, self.pictures, self.seconds = answer, 0, 0, 0.0
+        self._known: dict[tuple[bytes, int, int], Evaluation] = {}
+
+    def __call__(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        for query in queries:
+            key = query.u.numpy().tobytes(), query.seed, query.spp
+            if key not in self._known:
+                begun = time.process_time()
+                self._known[key] = self.answer(query)
+                self.seconds += time.process_time() - begun
+                self.samples, self.pictures = self.samples + query.spp, self.pictures + 1
+            yield self._known[key]
+
+
+def verdict(evaluate: Evaluate, domain: Domain, u: Tensor, seed: int, *, before: bool) -> Verification:
+    """Return the verdict on an answer, with what is asked of `evaluate`, as it was before or as it is."""
+    at = {"adversarial": domain.project(u), "clean": domain.start}
+    margins = {name: margins_of(evaluate, name, place) for name, place in at.items()}
+    if before:
+        spp, trials = choose_before(list(margins.values()), seed), (20,)
+    else:
+        spp, trials = choose_spp(margins, seed=seed, trials=TRIAL_LOOKS[0]).spp, TRIAL_LOOKS
+    return verify(evaluate, domain, u, claim=Ending.NOT_VERIFIED, spp=spp, seed=seed, trials=trials)
+
+
+def drawn(clean: float, answer: float, lift: float) -> tuple[Counted, Domain, Tensor]:
+    """Return margins of a clean scene and an answer: noise of a deviation of 0.4 at 16 samples, which also moves them
+    by `lift` there; both are half as much at four times the samples."""
+    domain = Domain(torch.zeros(1), (Block(1, "linf", 1.0),))
+
+    def asked(query: Query) -> Evaluation:
+        place = clean if float(query.u[0]) == 0.0 else answer
+        noise = float(np.random.default_rng([query.seed, query.spp, int(query.u[0])]).normal())
+        margin = place + math.sqrt(16 / query.spp) * (lift + 0.4 * noise)
+        judged = Judgement(margin, margin, margin <= 0.0, Answer(""))
+        return Evaluation(margin, None, margin > 0.0, judgement=judged)
+
+    return Counted(asked), domain, torch.ones(1)
+
+
+def drawn_table(runs: int) -> int:
+    """Print how often close calls are found; return where more is found that is none."""
+    print("| clean | answer | moved at 16 | found before, % | now, % | the same, % | samples before | now |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    wrong = 0
+    for clean, answer, lift in [*((-3.0, one, lift) for one in CALLS for lift in (0.0, 0.3)), (-0.46, 30.0, -0.1)]:
+        shares, same, samples = [0, 0], 0, [0, 0]
+        for seed in range(runs):
+            endings = []
+            for k, before in enumerate((True, False)):
+                evaluate, domain, u = drawn(clean, answer, lift)
+                endings.append(verdict(evaluate, domain, u, seed, before=before).ending is Ending.FOUND)
+                shares[k], samples[k] = shares[k] + endings[-1], samples[k] + evaluate.samples
+            same += endings[0] == endings[1]
+        error = 2.0 * math.sqrt(sum(k * (runs - k) for k in shares) / runs) / runs
+        wrong += answer <= 0.0 and (shares[1] - shares[0]) / runs > error + 1.0 / runs
+        percent = " | ".join(f"{100 * one / runs:.1f}" for one in (*shares, same))
+        print(
+            f"| {clean} | {answer} | {lift} | {percent} | {samples[0] / runs:.0f} | {samples[1] / runs:.0f} |",
+            flush=True,
+        )
+    print()
+    return wrong
+
+
+def rendered_table(config: AttackConfig, epsilons: Sequence[float]) -> None:
+    """Print both verdicts on what searches find."""
+    print(
+        "| epsilon | ending before | now | wrong before | now | pictures x samples before | now | CPU s before | now |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for epsilon in epsilons:
+        problem = problem_from_config(config.model_copy(update={"epsilon": epsilon}))[0]
+        answer = search(partial(map, problem.evaluate), problem.domain, make_policy("auto"), steps=8, seed=0)
+        told: list[list[str]] = [[], [], [], []]
+        for before in (True, False):
+            evaluate = Counted(problem.evaluate)
+            said = verdict(evaluate, problem.domain, answer.best_u, 0, before=before)
+            rate = said.adversarial
+            what = said.ending.value, f"{rate.successes}/{rate.trials} at {rate.spp}"
+            for column, text in zip(told, (*what, str(evaluate.samples), f"{evaluate.seconds:.1f}"), strict=True):
+                column.append(text)
+        print(f"| {epsilon} | {' | '.join(text for column in told for text in column)} |", flush=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--runs", type=int, default=400)
+    parser.add_argument("--epsilons", type=float, nargs="*", default=[0.01, 0.02, 0.03, 0.04])
+    parser.add_argument("--resolution", type=int, default=64)
+    parser.add_argument("--object", default="mug")
+    parser.add_argument("--environment")
+    parser.add_argument("--model", default="reference")
+    parser.add_argument("--labels")
+    parser.add_argument("--label")
+    args = parser.parse_args()
+    threads.configure(None)
+    wrong = rule_table() + sample_table(args.runs) + drawn_table(args.runs)
+    given = {name: getattr(args, name) for name in ("object", "environment", "model", "labels", "label")}
+    given = {name: value for name, value in given.items() if value is not None}
+    size = (args.resolution, args.resolution)
+    rendered_table(AttackConfig(**given, controls={"texture": {}}, resolution=size, measure="no"), args.epsilons)
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,95 @@
+"""Searches under cameras and lights that vary by chance, by light on surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stand_ins import Impatient, rows
+
+import advsearch
+from advsearch.engine import surface_light
+from advsearch.engine.attack_result import AttackResult
+from advsearch.engine.surface_light import SurfaceLight
+from advsearch.engine.transport import Deviation
+from advsearch.scene.surface import arrangement, texels
+
+SMALL: dict[str, Any] = {
+    "resolution": 32,
+    "controls": {"texture": {"resolution": 8}},
+    "over": ["camera", "environment"],
+    "draws": 2,
+    "steps": 18,
+    "trials": 6,
+    "verify_spp": 4,
+    "baseline": False,
+    "deterministic": True,
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def coarse() -> Iterator[None]:
+    """Few texels, rays and lights, and a comparison every six evaluations."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(texels, "GROUND", 32)
+        for name, value in {"SIDE": 48, "GATHERED": 64}.items():
+            patched.setattr(arrangement, name, value)
+        for name, value in {"LIGHTS": 3, "EVERY": 6, "CHECK_SPP": 4, "BOUND": 50.0}.items():
+            patched.setattr(surface_light, name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AttackResult]:
+    """A run that nobody disturbed, and its result."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    return run, advsearch.attack("mug", run=run, **SMALL)
+
+
+def off(monkeypatch: pytest.MonkeyPatch, *levels: float) -> None:
+    """Let comparisons find that predictions are so far off, one after the other, where 3 would do."""
+    coming = iter(levels)
+    compare = SurfaceLight._compare
+
+    def found(self: SurfaceLight, *arguments: Any) -> Deviation:
+        compare(self, *arguments)
+        self.deviations[-1] = replace(self.deviations[-1], levels=next(coming), most=3.0)
+        return self.deviations[-1]
+
+    monkeypatch.setattr(SurfaceLight, "_compare", found)
+
+
+def test_a_search_says_that_light_on_surfaces_predicted_it(whole: tuple[Path, AttackResult]) -> None:
+    """All of its pictures, under three lights; a comparison before it, and two within, of two pictures each."""
+    told, renders = whole[1].summary.transport, whole[1].summary.renders
+    assert told is not None and told.conditions is not None and told.error is not None
+    assert (told.way, told.reason, told.renewed, told.conditions.made) == ("surface light", None, 0, 3)
+    assert told.bytes and told.entries and 0.0 < told.error.levels < 50.0
+    assert (renders["products"], renders["gradient"]) == (18 * 2, 0)
+
+
+def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, AttackResult], tmp_path: Path) -> None:
+    """Light and comparisons are found again."""
+    stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(9), **SMALL)
+    assert stopped.summary.ending == "interrupted"
+    advsearch.attack("mug", run=tmp_path / "parts", resume=True, **SMALL)
+    assert rows(tmp_path / "parts") == rows(whole[0])
+
+
+def test_light_is_renewed_and_then_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two comparisons in a row are too far off: the first finds light anew, after the second pictures are traced."""
+    off(monkeypatch, 1.0, 9.0, 9.0)
+    summary = advsearch.attack("mug", **SMALL).summary
+    assert summary.transport is not None and summary.transport.renewed == 1
+    assert "from evaluation 12 on" in str(summary.transport.reason)
+    assert summary.renders["products"] == 12 * 2
+
+
+def test_matrices_predict_what_light_on_surfaces_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is too far off before the search."""
+    off(monkeypatch, 9.0)
+    told = advsearch.attack("mug", **{**SMALL, "steps": 16}).summary.transport
+    assert told is not None and told.way == "matrix" and "9.0 levels of 255 off" in str(told.reason)

@@ -1,0 +1,165 @@
+"""`check` keeps what it has measured: stopped in any way, it goes on to the same rows."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from advsearch.cli.main import main
+from advsearch.engine.measuring import OutOfTime, Results
+from advsearch.progress import Progress
+from advsearch.questions.check import carry_out as checking
+from advsearch.questions.check import words
+from advsearch.questions.check.answer import CheckedRow, CheckResult
+from advsearch.questions.check.carry_out import check_from_config
+from advsearch.questions.check.settings import CheckConfig
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.listing import finished, listed_runs
+from advsearch.runs.results.base import Result
+from advsearch.runs.summary import read_result
+
+FLAGS = "check --object mug --control camera.azimuth,environment.rotation --loss linear --resolution 16 --spp 1"
+SMALL: dict[str, Any] = {
+    "object": "mug",
+    "controls": {"camera.azimuth": {}, "environment.rotation": {}},
+    "loss": "linear",
+    "resolution": 16,
+    "spp": 1,
+    "threads": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> CheckResult:
+    """The summary of a check that nobody disturbed."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    return check_from_config(CheckConfig(**SMALL, run=str(run)))
+
+
+def values(result: Result) -> list[dict[str, Any]]:
+    """The rows without their times."""
+    found: Any = result.to_dict()
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in found["rows"]]
+
+
+def kept(folder: Path) -> CheckResult:
+    """What a run keeps."""
+    result = read_result(folder)
+    assert isinstance(result, CheckResult)
+    return result
+
+
+def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
+    tmp_path: Path, whole: CheckResult, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    words = [sys.executable, "-m", "advsearch", *FLAGS.split(), "--threads", "1", "--run", str(folder)]
+    child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert child.stderr is not None
+    for line in child.stderr:
+        if "camera.azimuth by" in line:  # the first row
+            os.kill(child.pid, signal.SIGINT)
+            break
+    said, _ = child.communicate(timeout=120)
+    assert child.returncode == 130
+    assert "Stopped after 0 of 1 parts" in said and said.endswith(f"Go on with: advsearch resume {folder}\n")
+    stopped = kept(folder)
+    assert stopped.ending == "interrupted" and 1 <= len(stopped.rows) < len(whole.rows)
+    assert values(stopped) == values(whole)[: len(stopped.rows)]
+    assert listed_runs(tmp_path)[0].state == "stopped"
+    main(["resume", str(folder), "--json"])
+    answer = CheckResult.of(json.loads(capfd.readouterr().out))
+    assert answer.ending == "done" and values(answer) == values(whole)
+    assert finished(folder) and kept(folder).to_dict() == answer.to_dict()
+
+
+@pytest.mark.slow
+def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path, whole: CheckResult) -> None:
+    folder = tmp_path / "run"
+    words = [sys.executable, "-m", "advsearch", *FLAGS.split(), "--threads", "1", "--run", str(folder)]
+    child = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert child.stderr is not None
+    for line in child.stderr:
+        if "camera.azimuth by" in line:  # the first row
+            child.kill()
+            break
+    child.communicate(timeout=120)
+    killed = kept(folder)
+    assert killed.ending == "interrupted" and (killed.measured, killed.planned) == (0, 1)
+    assert 1 <= len(killed.rows) < len(whole.rows) and values(killed) == values(whole)[: len(killed.rows)]
+
+
+def test_a_summary_never_forgets_what_an_earlier_one_had(
+    tmp_path: Path, whole: CheckResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = [checking.CheckedPart(number, CheckConfig(**SMALL), "linear") for number in (1, 2)]
+    told: list[int] = []
+
+    def measured(part: checking.CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
+        for number, row in enumerate(whole.rows):
+            results.get(f"{part.key} {number}", row.to_dict)
+            yield row
+
+    monkeypatch.setattr(checking, "parts_of", lambda *_: both)
+    monkeypatch.setattr(checking, "_linear", measured)
+    write = RunDirectory.write_summary
+
+    def written(run: RunDirectory, answer: CheckResult) -> Path:
+        told.append(len(answer.rows))
+        return write(run, answer)
+
+    monkeypatch.setattr(RunDirectory, "write_summary", written)
+    config, count = CheckConfig(**SMALL, run=str(tmp_path / "run")), len(whole.rows)
+    check_from_config(config)
+    assert told == [*range(1, 2 * count + 1), 2 * count]
+    told.clear()
+    check_from_config(config, resumed=tmp_path / "run")
+    assert told == [2 * count]
+
+
+def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
+    tmp_path: Path, whole: CheckResult, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    config = CheckConfig(**SMALL, seconds=0.001, run=str(folder))
+    summary = check_from_config(config)
+    assert summary.ending == "out of time" and not finished(folder)
+    monkeypatch.setattr(checking, "Results", lambda run, seconds=None: Results(run))  # a sitting that is longer
+    assert values(check_from_config(config, resumed=folder)) == values(whole) and finished(folder)
+    assert main(["show", str(folder)]) == 0
+    assert words.READING in capsys.readouterr().out
+
+
+def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        results = Results(run)
+        assert results.get("a", lambda: {"x": (0.1 + 0.2, float("inf"))}) == {"x": [0.1 + 0.2, float("inf")]}
+        assert results.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
+    with RunDirectory.resume(tmp_path / "run") as run:
+        late = Results(run, seconds=0.0)
+        assert late.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
+        assert late.get("b", lambda: 1) == 1  # a sitting always gets on
+        with pytest.raises(OutOfTime):
+            late.get("c", lambda: 1)
+
+
+def test_a_finished_part_is_not_even_loaded(whole: CheckResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checking, "problem_from_config", lambda *_, **__: pytest.fail("loaded"))
+    begun = time.perf_counter()
+    again = check_from_config(CheckConfig(**SMALL, run=whole.run), resumed=Path(str(whole.run)))
+    assert values(again) == values(whole) and time.perf_counter() - begun < 20.0
+
+
+def test_all_goes_through_every_control_on_three_scenes() -> None:
+    parts = checking.parts_of(CheckConfig(all=True))
+    assert [part.number for part in parts] == list(range(1, len(parts) + 1))
+    assert {part.config.object for part in parts} == {"mug", "bowl", "bottle"} and len(parts) > 80

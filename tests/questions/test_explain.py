@@ -1,0 +1,283 @@
+"""`explain` on stored sweeps, without a renderer: what it reads, what it would render, what it answers and prints."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from samples import sweep
+from stored_sweeps import described, make_sweep
+
+import advsearch
+from advsearch.cli.main import main
+from advsearch.config import SweepConfig
+from advsearch.errors import FileFormatError, InputError
+from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Factor, Observations
+from advsearch.explanations.rules import CountedRule, RuleCondition
+from advsearch.questions.explain import renders as explaining
+from advsearch.questions.explain.answer import ExplainResult
+from advsearch.questions.explain.renders import along, lies_inside, sweep_inside
+from advsearch.questions.explain.words import pairs_text
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import NAME, Row, Store
+from advsearch.runs.summary import read_result
+
+HIGH = 60.0
+
+
+@pytest.fixture
+def swept(tmp_path: Path) -> Path:
+    """A sweep whose model is wrong from high above."""
+    return stored(tmp_path / "swept", lambda elevation: elevation > HIGH)
+
+
+def stored(path: Path, wrong: Any, rows: int = 600, model: str = "reference") -> Path:
+    config = SweepConfig(object="mug", controls="camera,light", samples=rows, run=str(path), model=model)
+    generator = np.random.default_rng(1)
+    with RunDirectory.create_for(config) as run:
+        made = []
+        for step in range(rows):
+            elevation, power = generator.uniform(5.0, 85.0), generator.uniform(0.0, 2.0)
+            is_wrong = bool(wrong(elevation)) ^ (generator.random() < 0.03)
+            values = {
+                "camera.elevation": described(elevation, "degrees"),
+                "light.power": described(power, "1"),
+                "model": described("reference"),
+            }
+            label = "bowl" if is_wrong else "mug"
+            made.append(Row("sweep", step, correct=not is_wrong, margin=0.5, label=label, values=values))
+        run.record(*made, *(Row("verification", step, correct=False, label="bowl") for step in range(20)))
+        right = sum(bool(one.correct) for one in made)
+        counts = {"configurations": rows, "correct": right, "accuracy": right / rows, "interval": (0.0, 1.0)}
+        run.write_summary(sweep(**counts, planned=rows, run=str(path)))
+    return path
+
+
+def test_a_rule_is_found_in_stored_rows(swept: Path, tmp_path: Path) -> None:
+    result = advsearch.explain(swept, confirm=0, pairs=0, clusters=0, accuracy=0.9, run=tmp_path / "run")
+    (rule,) = result.rules
+    assert [one.parameter for one in rule.conditions] == ["camera.elevation"]
+    over = rule.conditions[0].over
+    assert over is not None and abs(over - HIGH) < 3.0 and rule.conditions[0].at_most is None
+    assert rule.right < 0.15 * rule.total and rule.elsewhere.right > 0.9 * rule.elsewhere.total and not rule.confirmed
+    assert result.importance[0].parameters == ["camera.elevation"] and result.envelope is not None
+    assert result.parameters == ["camera.elevation", "light.power"] and result.renders == 0
+    kept = read_result(tmp_path / "run")
+    assert isinstance(kept, ExplainResult) and kept.rules == result.rules
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert f"camera.elevation over {over:g} degrees" in page and "<script" not in page.split("<main")[1]
+
+
+def test_json_says_right_of_and_interval(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = [
+        "explain",
+        str(swept),
+        "--confirm",
+        "0",
+        "--pairs",
+        "0",
+        "--clusters",
+        "0",
+        "--accuracy",
+        "0.9",
+        "--run",
+        str(tmp_path / "run"),
+    ]
+    assert main([*asked, "--json"]) == 0
+    rule = json.loads(capsys.readouterr().out)["rules"][0]
+    assert rule["right"] < rule["of"] and rule["interval"][0] < rule["interval"][1] and rule["confirmed"] is None
+    assert rule["conditions"][0]["text"].startswith("camera.elevation over 6")
+    assert main([*asked, "--overwrite"]) == 0
+    text = capsys.readouterr().out
+    assert "1. camera.elevation over 6" in text and "Where it can be relied on\nAt least" in text
+
+
+def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[SweepConfig] = []
+
+    def rendered(self: Any, name: str, config: SweepConfig) -> list[Answered]:
+        asked.append(config)
+        own = [Answered("", {"camera.elevation": 70.0, "light.power": 1.0}, {}, "bowl", False)] * 9
+        outside = Answered("", {"camera.elevation": 10.0, "light.power": 1.0}, {}, "mug", True)
+        return [*own, outside]
+
+    monkeypatch.setattr(explaining.Renders, "_rows", rendered)
+    result = advsearch.explain(swept, confirm=10, pairs=0, clusters=0, run=tmp_path / "run")
+    confirmed = result.rules[0].confirmed
+    assert confirmed is not None and (confirmed.right, confirmed.total) == (0, 9)  # what lies outside is not counted
+    low, high = np.asarray(asked[0].controls["camera"]["elevation"], dtype=float)
+    assert 57.0 < low < 63.0 and 84.0 < high <= 85.0 and asked[0].controls["light"] == {}
+    assert asked[0].samples == 10 and asked[0].seed != 0 and asked[0].trials == 0
+
+
+def test_the_nearest_right_answer_differs_in_one_value(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rendered(self: Any, name: str, config: SweepConfig) -> list[Answered]:
+        high, power = config.grid["camera.elevation"], config.grid["light.power"]
+        assert isinstance(high, list) and isinstance(power, list) and min(len(high), len(power)) == 1
+        return [
+            Answered("", {"camera.elevation": a, "light.power": b}, {}, "bowl" if a > HIGH else "mug", a <= HIGH)
+            for a in high
+            for b in power
+        ]
+
+    monkeypatch.setattr(explaining.Renders, "_rows", rendered)
+    result = advsearch.explain(swept, confirm=0, pairs=1, clusters=0, run=tmp_path / "run")
+    (pair,) = result.pairs
+    assert pair.parameter == "camera.elevation" and float(pair.wrong_at) > HIGH >= float(pair.right_at) > 50.0
+    assert (pair.answered, pair.answered_there) == ("bowl", "mug") and result.pairs_sought == 1
+    several = advsearch.explain(swept, confirm=0, pairs=12, clusters=0, run=tmp_path / "several")
+    assert several.pairs_sought == 12 and several.pairs[0] == pair and len(several.pairs) >= 6
+    assert len({str(one.values) for one in several.pairs}) == len(several.pairs)
+    left = several.total - several.right - 12
+    assert f"Of the 12 most typical of {left + 12} failures, {len(several.pairs)} are right" in pairs_text(several)
+    assert f"The other {left} were not tried" in pairs_text(several)
+
+
+def test_typical_failures_take_turns_between_rules_and_those_under_none() -> None:
+    """Failures at 1, 2 and 3 are under the rule, of which 2 is in the middle; one at 9 is not."""
+    values = np.array([[1.0], [2.0], [3.0], [9.0], [10.0]])
+    found = Observations((Factor("yaw"),), values, np.array([False, False, False, False, True]))
+    rule = CountedRule((RuleCondition(0, high=5.0),), 0, 3, 1, 2)
+    order = explaining.typical_failures(found, [rule], 12)
+    assert [index for index, _ in order[:2]] == [1, 3] and {index for index, _ in order[2:]} == {0, 2}
+    assert order[0][1] == rule.conditions and order[1][1] == ()
+    assert explaining.typical_failures(found, [], 2)[0][1] == () and len(explaining.typical_failures(found, [], 2)) == 2
+
+
+def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = make_sweep(tmp_path / "few")
+    with pytest.raises(InputError, match="expected at least 100 rows, got 24"):
+        advsearch.explain(few)
+    with pytest.raises(InputError, match="unknown run"):
+        advsearch.explain("nothing")
+    assert main(["explain"]) == 2 and "expected the run of a sweep" in capsys.readouterr().err
+    assert main(["explain", ","]) == 2 and "unknown run ','" in capsys.readouterr().err
+    same = stored(tmp_path / "same", lambda elevation: False, rows=120)
+    kept = advsearch.explain(same, confirm=0, pairs=0, run=tmp_path / "run")
+    assert kept.rules == []
+    with pytest.raises(FileFormatError, match="expected the run of a sweep"):
+        advsearch.explain(tmp_path / "run")
+
+
+FOUND = Observations(
+    (Factor("pose.yaw", "degrees"), Factor("environment", "", ("noon", "studio")), Factor("light.power", "1")),
+    np.array([[yaw, lit, power] for yaw in (0.0, 90.0, 180.0) for lit in (0, 1) for power in (0.5, 1.5)]),
+    np.ones(12, dtype=bool),
+)
+
+
+def test_of_answers_without_a_law_it_is_said_that_nothing_decides_and_how_many_rows_a_rule_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    faint = stored(tmp_path / "faint", lambda elevation: np.random.default_rng(int(1e6 * elevation)).random() < 0.5)
+    asked = ["explain", str(faint), "--confirm", "0", "--pairs", "0", "--clusters", "0", "--run", str(tmp_path / "run")]
+    assert main(asked) == 0
+    said = capsys.readouterr().out
+    assert "No rule is told from chance in 600 rows, of which one half chooses and the other counts" in said
+    assert "No parameter is shown to decide anything" in said
+    kept = read_result(tmp_path / "run")
+    assert isinstance(kept, ExplainResult) and kept.rules == []
+    rule = kept.not_told
+    assert rule is not None and rule.chance > rule.asked == 0.01 and f"right in {rule.right} of {rule.total}" in said
+    assert rule.rows is None or (
+        rule.rows > 600 and f"About {rule.rows:,} rows with these shares would tell it" in said
+    )
+    assert all(one.interval[0] == 0.0 < one.interval[1] < 0.05 for one in kept.importance)
+
+
+def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:
+    config = SweepConfig(
+        object="mug", environment="studio,noon", grid={"pose.yaw": [0.0, 90.0, 180.0]}, controls={"light": {}}
+    )
+    conditions = (
+        RuleCondition(0, low=45.0),
+        RuleCondition(1, options=frozenset({1})),
+        RuleCondition(2, high=1.0),
+    )
+    made = sweep_inside(config, FOUND, conditions, 20, 7)
+    assert made.grid == {"pose.yaw": [90.0, 180.0]} and made.environment == "studio" and made.samples == 10
+    assert made.controls == {"light": {"power": [0.5, 1.0]}} and made.seed == 7 and made.spp == config.spp
+    assert lies_inside(conditions, FOUND.factors, {"pose.yaw": 90.0, "environment": "studio", "light.power": 0.7})
+    assert not lies_inside(conditions, FOUND.factors, {"pose.yaw": 90.0, "environment": "noon", "light.power": 0.7})
+
+
+def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
+    config = SweepConfig(
+        object="mug,bowl", environment="studio,noon", controls={"light": {}}, set_={"light.power": 1.0}
+    )
+    row: dict[str, float | str] = {
+        "object": "bowl", "environment": "noon", "model": "reference", "pose.yaw": 90.0, "light.power": 0.5,
+    }  # fmt: skip
+    made = along(config, row, FOUND.factors[0], FOUND, 3)
+    assert made.object == "bowl" and made.environment == "noon" and made.controls == {} and made.keep_pictures == "all"
+    assert made.grid["pose.yaw"][0] == 90.0 and len(made.grid["pose.yaw"]) == 9  # type: ignore[index, arg-type]
+    assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {}
+    lit = along(config, row, FOUND.factors[1], FOUND, 3)
+    assert lit.environment == "noon,studio" and lit.grid["pose.yaw"] == [90.0]
+
+
+class Read:
+    """Features that tell the lighter pictures from the darker ones."""
+
+    source = "twelve numbers"
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        sides = (images[:, 0, 0, :1] - 0.5) * torch.linspace(-8.0, 8.0, 12)
+        return sides + torch.randn(sides.shape, generator=torch.Generator().manual_seed(0))
+
+
+def test_failures_are_grouped_by_what_the_model_decides_by(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[int] = []
+
+    def again(config: SweepConfig, numbers: Any, progress: Any) -> tuple[torch.Tensor, Read]:
+        """Dark pictures of even rows and light ones of odd rows."""
+        asked.extend(numbers)
+        shades = torch.tensor([0.2 + 0.6 * (number % 2) for number in numbers])
+        return shades[:, None, None, None].expand(-1, 4, 4, 3), Read()
+
+    monkeypatch.setattr(explaining, "pictures_again", again)
+    result = advsearch.explain(swept, confirm=0, pairs=0, clusters=50, run=tmp_path / "run")
+    found = result.clusters
+    assert found is not None and found.apart and found.failures == 50 == len(set(asked)) and result.renders == 50
+    with Store(swept / NAME, read_only=True) as store:
+        assert all(not row.correct for row in store.rows("sweep") if row.step in asked)
+    odd = sum(number % 2 for number in asked)
+    assert sorted(one.failures for one in found.listed) == sorted([odd, 50 - odd])
+    assert all(sum(one.answers.values()) == one.failures and "bowl" in one.answers for one in found.listed)
+    shades = {round(float(iio.imread(tmp_path / "run" / one.picture).mean()) / 255.0, 1) for one in found.listed}
+    assert shades == {0.2, 0.8}
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "2 kinds among the 50 failures" in page and page.count("data:image/png") == 2
+    assert main(["show", str(tmp_path / "run")]) == 0
+    assert "images/cluster-1.png" in capsys.readouterr().out
+
+
+def test_failures_of_all_sweeps_of_a_model_are_grouped_together(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    second = stored(tmp_path / "second", lambda elevation: elevation > HIGH)
+    third = stored(tmp_path / "third", lambda elevation: elevation > HIGH, model="third")
+    asked: list[str] = []
+
+    def again(config: SweepConfig, numbers: Any, progress: Any) -> tuple[torch.Tensor, Read]:
+        asked.append(config.model)
+        return torch.full((len(numbers), 4, 4, 3), 0.6 * len(asked) - 0.4), Read()
+
+    monkeypatch.setattr(explaining, "pictures_again", again)
+    result = advsearch.explain([swept, second, third], confirm=0, pairs=0, clusters=60, run=tmp_path / "run")
+    found = result.clusters
+    assert asked == ["reference"] * 2 and found is not None and found.failures == 60
+    assert found.apart and len(found.listed) == 2
+    assert any("Kinds are of the failures of model reference alone" in text for text in result.warnings)

@@ -1,0 +1,236 @@
+"""`harden` as a whole: a small network, pictures of 32 x 32, and a stand-in for the attacks of the measurement."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+import advsearch
+from advsearch.api.attack import executor_for
+from advsearch.cli.main import main
+from advsearch.cli.output import shown_text as answer
+from advsearch.config import AttackConfig
+from advsearch.engine.loading import Scene
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.models.reference import load
+from advsearch.models.trainable import Trainable
+from advsearch.progress import NullProgress
+from advsearch.questions.harden import carry_out as hardening
+from advsearch.questions.harden import scenes as harden_scenes
+from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
+from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, Drawing, SceneWork
+from advsearch.questions.harden.settings import QUICK, HardenConfig
+from advsearch.questions.harden.training import ROUNDS, Course, Score
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.summary import read_result
+
+SMALL: dict[str, Any] = {
+    "object": "ball,book", "model": "small_models:Colours", "resolution": 32, "texture_resolution": 16, "epsilon": 0.03,
+    "rounds": 2, "scenes": 1, "views": 1, "epochs": 1, "measured": 2, "threads": 1,
+}  # fmt: skip
+
+
+@pytest.fixture
+def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, int | None]]:
+    """Objects and steps of the attacks of a measurement; their stand-in finds an answer for books."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "labels.json").write_text(json.dumps(list(load().labels)))
+    done: list[tuple[str, int | None]] = []
+
+    def attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
+        done.append((config.object, config.steps))
+        return "found" if config.object == "book" else "robust"
+
+    monkeypatch.setattr(harden_scenes, "attacked", attacked)
+    monkeypatch.setattr(hardening, "CLEAN_SCENES", 1)
+    monkeypatch.setattr(hardening, "PLAIN_SCENES", 1)
+    monkeypatch.setattr(hardening, "RENDERED_SCENES", 2)
+    return done
+
+
+def test_a_run_trains_measures_and_goes_on(
+    attacks: list[tuple[str, int | None]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = {**SMALL, "labels": "labels.json", "run": "run"}
+    config = HardenConfig(**given)
+    given.pop("model")
+    taught = Course.round
+
+    def stopped(self: Any, number: int, *args: Any) -> None:
+        if number == 2:
+            raise KeyboardInterrupt
+        taught(self, number, *args)
+
+    monkeypatch.setattr(Course, "round", stopped)
+    first = hardening.harden_from_config(config)
+    assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
+    both = [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
+    assert attacks == both
+    monkeypatch.setattr(Course, "round", taught)
+    with pytest.raises(InputError, match="cannot go on: it began without `beside`, which only Python gives"):
+        advsearch.harden(SMALL["model"], beside=[], resume=True, **given)
+    result = advsearch.harden(SMALL["model"], resume=True, **given)
+    assert attacks[3:] == both
+    (row,) = result.table
+    assert row.stronger_before is not None and (row.stronger_before.right, row.stronger.right) == (1, 1)
+    assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].kept}) for k, one in
+                                 enumerate(first.rounds)]  # fmt: skip
+    assert [one.lessons for one in result.rounds] == [0, 3, 6] and sum(one.kept for one in result.rounds) == 1
+    assert result.before is not None and (result.before.right, result.before.count) == (1, 2)
+    assert result.clean_after is not None and result.clean_after.count == 4
+    assert read_result(Path("runs/run")) == result
+    held = result.split["held out"]
+    assert not set(held.environments) & set(result.split["training"].environments)
+    assert result.hardened == f"small_models:Colours@{result.weights}"
+    assert advsearch.load_model(result.hardened, input_size=32).classes == 14
+    assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 1 + 1)
+    assert "robust to texture" in answer(result)
+    page = Path("runs/run/report.html").read_text("utf-8")
+    assert "Of 2 held-out scenes the searches leave 1 right, before 1;" in page and "data:image/png" in page
+
+
+def work_of(config: HardenConfig, run: RunDirectory, course: Course) -> hardening.Hardening:
+    """What carries out a run with the reference model."""
+    scenes = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
+    return hardening.Hardening(run, course, scenes, NullProgress())
+
+
+def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int | None]]) -> None:
+    config = HardenConfig(**{**SMALL, "controls": "texture,pose,light", "labels": "labels.json"})
+    with RunDirectory.create_for(config) as run:
+        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), config)
+        work = work_of(config, run, course)
+        found = work._drawn("scenes", TRAINING, range(1), 1)
+        held_back = work._drawn("scenes", VALIDATION, range(1), 2)
+        assert work._counts[FURTHER] == 2 * work._counts[TRAINING]
+    assert [type(one) for one in held_back] == [TextureLesson] * 2 + [Lesson] + [RenderedLesson] * 2
+    rendered = [RenderedLesson, Lesson, RenderedLesson, RenderedLesson]  # one scene as it is, too
+    assert [type(one) for one in found] == [TextureLesson, Lesson, *rendered]
+    tries = [len(one.pictures) for one in [*found, *held_back] if isinstance(one, RenderedLesson)]
+    assert tries == [1] * 3 + [harden_scenes.TRIES_TO_CHOOSE] * 2
+    shutil.rmtree(run.path)
+
+
+def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
+    attacks: list[tuple[str, int | None]],
+) -> None:
+    config = HardenConfig(**{**SMALL, "controls": "texture,pose,haze", "labels": "labels.json"})
+    with RunDirectory.create_for(config) as run:
+        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), config)
+        work = work_of(config, run, course)
+        assert work.scenes.beside == ("pose",)  # no matrix says what haze does
+        drawn = [work._chance("texture", number) for number in range(400)]
+        for share, which in ((hardening.SHARED, 0), (hardening.MOVED, 1)):
+            for part in (drawn[::2], drawn[1::2]):  # objects take turns, and each has as many
+                assert abs(sum(one[which] for one in part) / 200 - share) < 0.08
+        seen = work.scenes([Drawing(TRAINING, 0, ("texture",), 1, 0, beside=beside) for beside in ((), ("pose",))])
+        one, other = (some[0] for some in seen)
+        assert isinstance(one, TextureLesson) and isinstance(other, TextureLesson)
+        assert len(other.numbers) == len(one.numbers) + 6 and not torch.equal(one.plain, other.plain)
+    shutil.rmtree(run.path)
+
+
+@pytest.mark.slow
+def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]) -> None:
+    config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
+    wanted: list[harden_scenes.Wanted] = [
+        Drawing(TRAINING, 1, ("texture",), 1, 1),
+        Drawing(TRAINING, 0, ("pose",), 1, 0),
+        harden_scenes.Looking(0),
+    ]
+    here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)
+    shared = config.model_copy(update={"workers": 1})
+    with executor_for(shared, "advsearch.questions.harden.scenes:scenes_of", NullProgress()) as pool:
+        assert pool is not None
+        there = {wanted.index(done.items[0]): done.value[0] for done in pool.results([one] for one in wanted)}
+    for place, lessons in enumerate(here):
+        assert isinstance(lessons, list) and len(lessons) == len(there[place])
+        for one, other in zip(lessons, there[place], strict=True):
+            assert type(one) is type(other) and torch.equal(one.plain, other.plain)
+            if isinstance(one, TextureLesson) and isinstance(other, TextureLesson):
+                torch.testing.assert_close(one.picture(one.texture.u), other.picture(other.texture.u))
+
+
+def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int | None]]) -> None:
+    config = HardenConfig(**SMALL, labels="labels.json")
+    rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
+    with RunDirectory.create_for(config) as run:
+        noted = [{"lessons": 1, "part": 1.0, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
+        run.store.set_note(ROUNDS, json.dumps(noted))
+        for loss, best in ((0.02, 3), (0.05, 2), (0.0, 0)):
+            course: Any = SimpleNamespace(config=config.model_copy(update={"clean_loss": loss}))
+            assert work_of(config, run, course).rounds.best == best
+    shutil.rmtree(run.path)
+
+
+def test_a_round_ends_with_the_part_of_the_way_that_is_best(
+    attacks: list[tuple[str, int | None]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = HardenConfig(**SMALL, labels="labels.json")
+    net = torch.nn.Linear(2, 3)
+    student = Trainable(net, load())
+    given = {name: one.clone() for name, one in net.state_dict().items()}
+
+    judged_at = list[float]()
+
+    def judged(model: Model, held_back: Any) -> Score:
+        part = float(net.weight.detach()[0, 0] - given["weight"][0, 0])
+        judged_at.append(part)
+        return Score(1.0 - 0.1 * part, 0.5 + 0.2 * part)
+
+    monkeypatch.setattr("advsearch.questions.harden.training.score", judged)
+    with RunDirectory.create_for(config) as run:
+        work = work_of(config, run, Course(student, load(), config))
+        work.rounds._keep(0, [], Score(1.0, 0.5), 0, 0.0)
+        for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):
+            judged_at.clear()
+            net.load_state_dict({name: one + 1.0 for name, one in given.items()})
+            work.course.config = config.model_copy(update={"clean_loss": loss})
+            found, part = work.rounds._mixed([])
+            assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
+            assert len(judged_at) == looked_at, "less than the best part is looked at once"
+            torch.testing.assert_close(net.bias.detach(), given["bias"] + part)
+    shutil.rmtree(run.path)
+
+
+def test_quick_is_less_of_what_nothing_is_said_of() -> None:
+    quick = HardenConfig(quick=True, measured=3)
+    assert quick.measured == 3 and quick.rounds == QUICK["rounds"] and quick.steps == QUICK["steps"]
+    assert HardenConfig().rounds > quick.rounds
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"object": "x.glb"}, "held_out: x.glb has no other instances"),
+        ({"environment": "noon,studio", "held_out_environment": "studio"}, "held_out_environment: studio is an env"),
+        ({"epsilon": 0.1, "controls": "pose"}, "the control has ranges and no epsilon"),
+        ({"task": "detection"}, "task: `advsearch harden` has no such setting"),
+    ],
+)
+def test_what_cannot_be_hardened_is_refused_in_words(
+    attacks: list[tuple[str, int | None]], given: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(InputError, match=text):
+        hardening.harden_from_config(HardenConfig(**{**SMALL, "labels": "labels.json", **given}))
+    assert not list(Path("runs").glob("*/*"))
+
+
+def test_the_command_asks_what_its_flags_say(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    given: list[HardenConfig] = []
+
+    def noted(config: HardenConfig, **others: Any) -> Any:
+        given.append(config)
+        raise InputError("stop here")
+
+    monkeypatch.setattr(hardening, "harden_from_config", noted)
+    flags = "harden --model reference --control texture --epsilon 0.03 --quick --held-out a.glb --json"
+    assert main(flags.split()) == 2 and "stop here" in capsys.readouterr().err
+    assert given == [HardenConfig(controls={"texture": {}}, epsilon=0.03, quick=True, held_out="a.glb")]

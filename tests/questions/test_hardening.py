@@ -1,0 +1,396 @@
+"""Hardening: the split, what is trained, the training, and the data set; without renders but for one scene."""
+
+from __future__ import annotations
+
+import gc
+import json
+import shutil
+import tarfile
+import weakref
+from importlib import resources
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from small_models import Colours
+from torch import Tensor, nn
+
+from advsearch import threads
+from advsearch.api.attack import problem_of
+from advsearch.attacks import Block, Domain
+from advsearch.config import AttackConfig
+from advsearch.engine.loading import load_scene
+from advsearch.errors import InputError, ModelError
+from advsearch.models import load_model, reference
+from advsearch.models.trainable import Trainable, trainable
+from advsearch.progress import NullProgress
+from advsearch.questions.harden.answer import TrainingRound
+from advsearch.questions.harden.lessons import (
+    Disguise,
+    Lesson,
+    RenderedLesson,
+    TextureLesson,
+    harder,
+    lessons,
+    save_pictures,
+    surprise,
+    tried,
+    write_archive,
+)
+from advsearch.questions.harden.scenes import (
+    HELD_OUT,
+    TRAINING,
+    Split,
+    check_disjoint,
+    check_unmeasured,
+    fingerprint,
+    white_light_changed,
+)
+from advsearch.questions.harden.settings import HardenConfig
+from advsearch.questions.harden.steps import Gradients
+from advsearch.questions.harden.training import Course, Score, TrainingRounds, score
+from advsearch.scene.formation import levels_of, to_8_bit
+from advsearch.scene.library import load_environment
+
+LABELS = [f"class {number}" for number in range(14)]
+
+
+def student(layers: str = "all") -> Trainable:
+    return trainable(load_model(Colours(), labels=LABELS, input_size=16), layers)
+
+
+def coloured(right: int, level: float, seed: int) -> Tensor:
+    """A noisy picture whose red is the class's own."""
+    picture = 0.3 + 0.1 * torch.rand((16, 16, 3), generator=torch.Generator().manual_seed(seed))
+    picture[..., right] += level
+    return picture
+
+
+def pupils() -> list[Lesson]:
+    """Three classes by their brightest channel, of which the worst pictures show little."""
+    worst = [coloured(n % 3, 0.2, 99 + n) for n in range(24)]
+    return [RenderedLesson.of((n % 3,), coloured(n % 3, 0.4, n), one[None]) for n, one in enumerate(worst)]
+
+
+def test_half_of_what_is_tried_has_numbers_at_the_ends_of_their_ranges() -> None:
+    blocks = (Block(2, low=0.2, high=0.6), Block(1, periodic=True), Block(1, options=3))
+    domain = Domain(torch.tensor([0.4, 0.4, 0.5, 0.5]), blocks)
+    drawn = tried(domain, torch.Generator().manual_seed(0), 800)
+    assert torch.equal(drawn, torch.stack([domain.project(row) for row in drawn]))
+    at_ends = (drawn == domain.lower) | (drawn == domain.upper)
+    assert not at_ends[:, 2:].any()
+    assert ((at_ends[:, :2].float().mean(dim=0) - 0.25).abs() < 0.05).all()
+    assert abs(float(at_ends[:, :2].any(dim=1).float().mean()) - 0.375) < 0.06  # three of four in every second one
+    assert set(drawn[:, 3].tolist()) == {float(value) for value in torch.tensor([1 / 6, 0.5, 5 / 6])}
+
+
+def test_of_several_controls_each_is_tried_alone_and_all_together() -> None:
+    blocks = (Block(2, name="pose.x"), Block(1, name="pose.scale"), Block(3, name="light.power"))
+    domain = Domain(torch.full((6,), 0.25), blocks)
+    moved = tried(domain, torch.Generator().manual_seed(0), 9) != 0.25
+    pose, light, both = [True] * 3 + [False] * 3, [False] * 3 + [True] * 3, [True] * 6
+    assert moved.tolist() == [pose, light, both] * 3
+
+
+def test_a_scene_to_train_on_is_rendered_with_one_control_moved_and_with_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = {"resolution": (16, 16), "controls": {"pose": {}, "light": {}}, "over": {"camera": {}}}
+    problem = problem_of(
+        AttackConfig(object="mug", **settings, measure="no"), load_scene("mug"), load_model("reference")
+    )
+    start, wanted = problem.domain.start, list[Tensor]()
+    pose = len(problem.searched_space.controls[0].start)
+
+    class Recorder:
+        scene = problem.renderer.scene
+
+        def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+            wanted.append(u[: len(start)])
+            return torch.zeros((16, 16, 3))
+
+    monkeypatch.setattr(type(problem.renderer), "like", lambda self, **changes: Recorder())
+    found = [one for seed in range(30) for one in lessons(problem, 1, seed)]
+    assert {len(one.pictures) for one in found if isinstance(one, RenderedLesson)} == {1} and len(wanted) == 60
+    moved = [(bool((u != start)[:pose].any()), bool((u != start)[pose:].any())) for u in wanted]
+    assert set(moved[1::2]) == {(True, True)}
+    assert min(moved[::2].count(kind) for kind in ((True, False), (False, True))) > 8 and len(set(moved[::2])) == 2
+    (one,) = lessons(problem, 1, 0, tries=4)
+    assert isinstance(one, RenderedLesson) and len(one.pictures) == 4 and torch.equal(wanted[60], start)
+
+
+def test_lessons_of_textures_let_go_of_their_scene() -> None:
+    """There are hundreds of them; what is left says the pictures, and takes no renderer."""
+    settings = {"resolution": (16, 16), "controls": {"texture": {"resolution": 4}}}
+    config = AttackConfig(object="mug", **settings, over={"camera": {}, "environment": {}}, measure="no")
+    model = load_model("reference")
+    problem = problem_of(config, load_scene("mug"), model)
+    (lesson,), plain = lessons(problem, 1, 0), [Lesson((0,), torch.zeros((16, 16, 3), dtype=torch.uint8))]
+    scene = weakref.ref(problem.renderer.scene)
+    del problem
+    gc.collect()
+    assert scene() is None and isinstance(lesson, TextureLesson)
+    harder([lesson], model, 2)
+    assert lesson.worst.shape == (16, 16, 3) and not torch.equal(lesson.worst, lesson.plain)
+    for views, steps in ((6, 2), (2, 2), (1, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and 6 / views of this
+        assert Course(student(), model, HardenConfig(epochs=2, views=views)).steps([lesson, *plain * 20]) == steps
+
+
+def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
+    looks = {views: HardenConfig(controls="texture", views=views).texture_looks for views in (1, 2, 3, 4, 6, 7)}
+    assert looks == {1: 6, 2: 3, 3: 2, 4: 1, 6: 1, 7: 1}
+
+
+# ---- the split ------------------------------------------------------------------------------------------------------
+
+
+def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
+    bundled = Path(str(resources.files("advsearch.bundled")))
+    training = Split(TRAINING, ("ball", "book"), ("noon", "studio"), 1)
+    held = Split(HELD_OUT, ("ball", "book"), ("gallery",), 2)
+    name, scene = training.scene(1)
+    assert (name, scene.description.object.label) == ("book", "book")
+    assert repr(training.scene(1)[1]) == repr(scene)
+    assert training.scene(1, {"camera.fov": 30.0})[1].description.number("camera.fov") == 30.0
+    file = shutil.copy(bundled / "data" / "objects" / "ball" / "mesh.ply", tmp_path / "tennis-ball.ply")
+    mine = Split(TRAINING, (str(file),), ("noon",), 1).scene(0)[1]
+    assert mine.description.object.label == "tennis ball"
+    check_disjoint(held, [training])
+    again = Split(TRAINING, held.objects, ("noon",), 2)
+    own, other = (one.scene(0)[1].description.object for one in (held, again))
+    assert (
+        fingerprint(next(again.assets(1)))
+        == fingerprint(other)
+        != fingerprint(own)
+        == fingerprint(next(held.assets(1)))
+    )
+    check_unmeasured(other, {fingerprint(own)})  # seeds of splits differ by name
+    with pytest.raises(InputError, match="held_out: ball is an object of the training too"):
+        check_unmeasured(own, {fingerprint(own)})
+    files = [Split(name, (str(file),), (lit,), 1) for name, lit in ((HELD_OUT, "gallery"), (TRAINING, "noon"))]
+    assert len(list(files[0].assets(5))) == 1
+    with pytest.raises(InputError, match="held_out: tennis-ball is an object of the training too"):
+        check_disjoint(files[0], files[1:])
+    with pytest.raises(InputError, match="held_out_environment: noon is an environment of the training too"):
+        check_disjoint(Split(HELD_OUT, ("ball",), ("noon",), 2), [training])
+
+
+def test_light_of_some_scenes_is_as_warm_as_a_lamp_or_as_cold_as_a_sky() -> None:
+    """Colours between those of 2,700 and 10,000 K, in half of the scenes; the rest of the map stays as it is."""
+    given, rng = load_environment("noon"), np.random.default_rng(0)
+    tints = list[float]()
+    for _ in range(200):
+        found = white_light_changed(given, rng).radiance
+        factors = (found / given.radiance)[10, 10]
+        assert np.allclose(found, given.radiance * factors, rtol=1e-4)
+        tints.append(float(np.log(factors[0] / factors[2])))
+    changed = [one for one in tints if abs(one) > 1e-6]
+    assert 75 < len(changed) < 125
+    assert -0.6 < min(changed) < -0.3 and 1.9 < max(changed) < 2.4
+
+
+# ---- what is trained ------------------------------------------------------------------------------------------------
+
+
+def test_the_model_sees_the_weights_of_a_copy_as_they_change() -> None:
+    given = Colours()
+    made = trainable(load_model(given, labels=LABELS, input_size=16))
+    image = torch.rand((1, 16, 16, 3), generator=torch.Generator().manual_seed(0))
+    before = made.model(image)
+    assert torch.allclose(made.logits(image), before, atol=0.02)  # bfloat16, where the processor has it
+    assert torch.equal(made.logits(image), made.quickly(image))
+    with torch.no_grad():
+        made.parameters()[-1].add_(1.0)
+    assert torch.allclose(made.model(image), before + 1.0)
+    assert not made.model(image).requires_grad and made.logits(image).requires_grad
+    assert torch.equal(given.last.bias, Colours().last.bias)
+
+
+def test_the_last_layer_alone_is_trained_where_that_is_asked() -> None:
+    assert [tuple(one.shape) for one in student("last").parameters()] == [(14, 24), (14,)]
+    assert len(student().parameters()) == 4
+
+
+def test_programs_and_probabilities_are_refused() -> None:
+    program = torch.fx.symbolic_trace(Colours())
+    with pytest.raises(ModelError, match="an exported program cannot be trained"):
+        trainable(load_model(program, input_size=16))
+    with pytest.warns(UserWarning, match="answers with probabilities"):
+        model = load_model(nn.Sequential(Colours(), nn.Softmax(dim=1)), input_size=16)
+    with pytest.raises(ModelError, match="only a classifier that answers with logits"):
+        trainable(model)
+
+
+def test_the_reference_model_is_loaded_with_other_weights(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    made = trainable(reference.load())
+    with torch.no_grad():
+        made.net.get_parameter("head.bias").zero_().add_(torch.arange(14.0))
+    path = tmp_path / "hardened.safetensors"
+    save_file({name: one.contiguous() for name, one in made.net.state_dict().items()}, path)
+    loaded = load_model(f"reference@{path}")
+    image = torch.rand((1, 128, 128, 3), generator=torch.Generator().manual_seed(0))
+    assert loaded.labels == made.model.labels
+    assert torch.allclose(loaded(image), made.model(image), atol=1e-3)
+    assert not torch.allclose(loaded(image), reference.load()(image), atol=1e-1)
+
+
+# ---- lessons and training -------------------------------------------------------------------------------------------
+
+
+def test_the_worst_of_what_was_rendered_is_that_of_the_model_as_it_is() -> None:
+    model = student().model
+    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)]))
+    lesson = RenderedLesson.of((1,), pictures[0], pictures)
+    other = RenderedLesson.of((2,), pictures[0], pictures[:2])
+    harder([other, lesson], model)
+    for one, right in ((lesson, (1,)), (other, (2,))):
+        loss = surprise(model(one.pictures / 255.0), [right] * len(one.pictures))
+        assert torch.equal(one.worst, pictures[int(loss.argmax())]) and one.pictures.dtype == torch.uint8
+    both = surprise(torch.tensor([[1.0, 1.0, 1.0, 1.0]]), [(0, 2)])
+    assert both.item() == pytest.approx(0.6931, abs=1e-3)
+
+
+def test_the_worst_picture_is_the_one_whose_loss_was_highest_when_a_model_last_looked() -> None:
+    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)]))
+    lesson = RenderedLesson.of((1,), pictures[0], pictures)
+    rows = [(0.2, 1.0, 0.5), (0.2, 0.1, 0.5), (0.2, 0.1, 0.3), (0.2, 0.1, 0.0)]
+    for losses, expected in zip(rows, (1, 2, 2, 0), strict=True):
+        lesson.losses = torch.tensor(losses)
+        assert torch.equal(lesson.worst, pictures[expected])
+
+
+def test_a_round_teaches_plain_and_worst_pictures() -> None:
+    made, lessons = student(), pupils()
+    before = score(made.model, lessons)
+    ticks: list[int] = []
+    course = Course(made, student().model, HardenConfig(rate=0.04, epochs=12))
+    course.round(1, lessons, lambda: ticks.append(1))
+    after = score(made.model, lessons)
+    assert len(ticks) == course.steps(lessons) == 12
+    more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
+    assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
+    assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
+
+
+def test_to_judge_a_model_leaves_the_lessons_as_they_are() -> None:
+    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3)]))
+    lesson = RenderedLesson.of((1,), pictures[0], pictures)
+    score(student().model, [lesson])
+    assert bool(lesson.losses.isinf().all())
+
+
+@pytest.mark.parametrize(("clean_loss", "best"), [(0.0, 0), (0.02, 2), (0.1, 1)])
+def test_the_weights_that_are_kept_lose_no_more_plain_pictures_than_they_may(clean_loss: float, best: int) -> None:
+    scores = ((0.9, 0.1), (0.82, 0.9), (0.89, 0.5))
+    done = [TrainingRound(lessons=1, part=1.0, clean=clean, robust=robust, kept=False) for clean, robust in scores]
+    noted = json.dumps([one.model_dump() for one in done])
+    run: Any = SimpleNamespace(store=SimpleNamespace(note=lambda key: noted))
+    course: Any = SimpleNamespace(config=SimpleNamespace(clean_loss=clean_loss))
+    assert TrainingRounds(run, course, lambda *_: [], NullProgress()).best == best
+
+
+def test_the_given_model_is_asked_about_scenes_as_they_are_alone() -> None:
+    """Where something moved it is right without being sure, and its doubts would be learned."""
+    asked = list[Tensor]()
+
+    def given(images: Tensor) -> Tensor:
+        asked.append(images)
+        return student().logits(images).detach()
+
+    plain = [Lesson((n,), levels_of(coloured(n, 0.4, n))) for n in range(3)]
+    with threads.one_each_for_torch() as pool:
+        for batch, count in (([*pupils(), *plain], 3), (pupils(), 0)):
+            Gradients(student(), cast(Any, given), pool).take(batch, None, 0)
+            assert sum(len(one) for one in asked) == count
+            asked.clear()
+
+
+def test_a_round_comes_to_the_same_whatever_the_number_of_threads() -> None:
+    before, found = torch.get_num_threads(), list[list[Tensor]]()
+    for count in (1, 2):
+        made = student()
+        torch.set_num_threads(count)
+        try:
+            Course(made, student().model, HardenConfig(rate=0.04, epochs=2)).round(1, pupils())
+            assert torch.get_num_threads() == count
+        finally:
+            torch.set_num_threads(before)
+        found.append([one.detach() for one in made.parameters()])
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+class Tinted(TextureLesson):
+    """A picture whose texture is its tint."""
+
+    def picture(self, u: Tensor) -> Tensor:
+        return (self.plain + 0.2 * (u - 0.5)).clamp(0.0, 1.0)
+
+
+def tinted(number: int) -> TextureLesson:
+    nothing: Any = None
+    domain, levels = Domain(torch.full((3,), 0.5), (Block(3),)), levels_of(coloured(number % 3, 0.3, number))
+    return Tinted((number % 3,), levels, nothing, domain, nothing, nothing, Disguise(torch.full((3,), 0.5)))
+
+
+def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An adversarial texture is adversarial for the crop, turn and colours that it was searched under."""
+    seen = list[tuple[list[int], int, bool]]()
+    textured, rendered = [tinted(number) for number in range(9)], pupils()[:15]
+    batch = [one for pair in zip(rendered, [*textured, *rendered[9:]], strict=False) for one in pair][:24]
+
+    def changed(images: Tensor, seed: int) -> Tensor:
+        owners = [
+            number
+            for image in images.detach()
+            for number, one in enumerate(textured)
+            if torch.equal(image, one.picture(one.texture.u).detach() if images.requires_grad else one.worst)
+        ]
+        if len(owners) == len(images):
+            seen.append((owners, seed, images.requires_grad))
+        return images
+
+    monkeypatch.setattr("advsearch.questions.harden.steps._changed", changed)
+    made = student()
+    with threads.one_each_for_torch() as pool:
+        Gradients(made, student().model, pool).take(batch, None, 7)
+    searched = sorted(one[:2] for one in seen if one[2])
+    trained = sorted(one[:2] for one in seen if not one[2])
+    assert sum(len(owners) for owners, _ in searched) == 9 and searched == trained
+
+
+def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
+    made, asked = student("last"), list[int]()
+
+    def optimiser(parameters: object) -> torch.optim.Optimizer:
+        asked.append(1)
+        return torch.optim.SGD(parameters, 0.5)  # type: ignore[arg-type]
+
+    further = [(torch.stack([coloured(2, 0.4, n) for n in range(8)]), torch.full((8,), 9))]
+    Course(made, student().model, HardenConfig(epochs=10), optimiser, further).round(1, pupils())
+    assert asked == [1]
+    assert (made.model(further[0][0]).argmax(dim=1) == 9).float().mean() > 0.5  # only the batches beside say 9
+
+
+# ---- the data set ---------------------------------------------------------------------------------------------------
+
+
+def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -> None:
+    save_pictures(tmp_path / "pictures", 1, pupils()[:2], ["wine glass", "mug"])
+    assert sorted(one.relative_to(tmp_path / "pictures").as_posix() for one in tmp_path.glob("pictures/*/*")) == [
+        "0000-wine-glass/001-00000-plain.png",
+        "0000-wine-glass/001-00000-worst.png",
+        "0001-mug/001-00001-plain.png",
+        "0001-mug/001-00001-worst.png",
+    ]
+    assert write_archive(tmp_path / "pictures", tmp_path / "pictures.tar") == 4
+    with tarfile.open(tmp_path / "pictures.tar") as tar:
+        names = tar.getnames()
+        assert [name.rpartition(".")[2] for name in names] == ["png", "cls", "json"] * 4
+        assert len({name.partition(".")[0] for name in names}) == 4
+        last = tar.extractfile(names[-1])
+        assert last is not None and json.loads(last.read()) == {"class": 1, "kind": "worst"}

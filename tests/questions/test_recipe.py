@@ -1,0 +1,697 @@
+"""Recipes: what a file may say, the runs that it comes to, what figures say, and one that is rendered."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import advsearch
+from advsearch.api import carry_out, subruns
+from advsearch.attacks import clopper_pearson
+from advsearch.cli.main import main
+from advsearch.config import SweepConfig
+from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.explanations.answered import Answered
+from advsearch.questions.recipe import carry_out as carrying_out
+from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult
+from advsearch.questions.recipe.description import Recipe, check_figures, read_recipe, recipe_names, titles
+from advsearch.questions.recipe.figures import FIGURES, compute, draw_figure, heat_map, read_options
+from advsearch.questions.recipe.figures.answers import fitting
+from advsearch.questions.recipe.parts import planned
+from advsearch.questions.recipe.settings import RecipeConfig
+from advsearch.questions.recipe.table import Table, count_of
+from advsearch.questions.recipe.words import figure_table, told_once
+from advsearch.runs.images import write_png
+from advsearch.runs.results.attack import AnswerDistribution, FoundValue
+from advsearch.runs.results.sweep import SurfaceMap
+from advsearch.runs.summary import read_result
+
+SCENES = Path(__file__).resolve().parents[2] / "scenes" / "data" / "environments"
+
+TINY = """
+title: Is the mug seen?
+settings: {object: [mug, bowl], environment: [studio, noon], resolution: 16, spp: 1}
+parts:
+  views:
+    command: sweep
+    settings: {controls: {camera: {}}, samples: 2, sampler: random, trials: 0}
+figures:
+  - {figure: heat map, rows: object, columns: environment}
+  - {figure: bars, by: environment}
+"""
+
+
+def rows(counts: dict[str, tuple[int, int]], **more: float | str) -> list[Answered]:
+    """Rows with so many right of so many for each environment."""
+    return [
+        answered({"environment": name, "object": "mug", **more}, number < right)
+        for name, (right, of) in counts.items()
+        for number in range(of)
+    ]
+
+
+def answered(values: dict[str, float | str], right: bool) -> Answered:
+    """A row: a mug, or a mug that is taken for a cup."""
+    return Answered("views", values, {}, "mug" if right else "cup", right)
+
+
+def figure(
+    described: dict[str, object], answered: Sequence[Answered], groups: dict[str, list[str]] | None = None
+) -> Any:
+    """The numbers of the only figure of these rows."""
+    (made,) = compute(Table(answered, groups or {}), *read_options(described, "here"))
+    return made
+
+
+# ---- what a file may say --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", recipe_names())
+@pytest.mark.parametrize("quick", [False, True])
+def test_every_bundled_recipe_is_one_that_can_be_carried_out(name: str, quick: bool) -> None:
+    described = read_recipe(name)
+    runs = planned(described, RecipeConfig(recipe=name, quick=quick))
+    assert runs and len({one.name for one in runs}) == len(runs)
+    drawn = [one.config.seed for one in runs if described.parts[one.part].drawn_as is None]
+    assert len(set(drawn)) == len(drawn) and set(drawn) == {one.config.seed for one in runs}
+    assert described.figures and all(read_options(one, name) for one in described.figures)
+    assert titles()[name] == described.title and described.title.endswith("?")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("title: a", "parts: Field required"),
+        ("title: a\nparts: {a: {command: doctor}}", "parts.a.command: expected attack or sweep, got 'doctor'"),
+        ("title: a\nparts: {a: {command: sweep, settings: {run: /x}}}", "'run' is the same for all parts"),
+        ("title: a\nparts: {../a: {command: sweep}}", "expected names of small letters, digits and hyphens"),
+        ("title: a\nparts: {a: {command: sweep}}\nsettings: {overwrite: true}", "'overwrite' is said with the command"),
+        ("title: a\nparts: {a: {command: sweep, around: b}}", "around: expected a part before it, got 'b'"),
+        ("title: a\nparts: {photographs: {command: sweep}}", "expected another name than 'photographs'"),
+        ("title: a\nparts: {a: {command: sweep, drawn_as: a}}", "drawn_as: expected a part before it, got 'a'"),
+        ("title: a\nparts: {a: {command: sweep, shell: rm}}", "parts.a.shell: Extra inputs are not permitted"),
+        ("title: !!python/object:os.system a\nparts: {}", "expected YAML"),
+        ("- a", "expected settings and values"),
+    ],
+)
+def test_a_hostile_recipe_is_refused_in_one_sentence(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(FileFormatError) as error:
+        read_recipe(str(path))
+    assert message in str(error.value) and str(error.value).isprintable() and len(str(error.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "message"),
+    [
+        ({"parts": {"a": {"command": "sweep", "settings": {"stesp": 4}}}}, UnknownNameError, "unknown setting 'stesp'"),
+        (
+            {"parts": {"a": {"command": "sweep", "settings": {"samples": "many"}}}},
+            InputError,
+            "mine: parts: a: samples: expected a whole number",
+        ),
+        ({"settings": {}}, InputError, "object: expected one, since mine names none"),
+        ({"settings": {"object": ["mug"] * 1001}}, InputError, "expected at most 1000 runs, got 1001"),
+        ({"quick": {"parts": {"b": {}}}}, UnknownNameError, "unknown part 'b'"),
+    ],
+)
+def test_what_no_command_takes_is_refused_before_anything_is_done(
+    change: dict[str, Any], kind: type[AdvsearchError], message: str
+) -> None:
+    described = {"title": "a", "settings": {"object": "mug"}, "parts": {"a": {"command": "sweep"}}, **change}
+    with pytest.raises(kind, match=message):
+        planned(Recipe(**described), RecipeConfig(recipe="mine", quick=True))
+
+
+@pytest.mark.parametrize(
+    ("described", "kind", "message"),
+    [
+        ({"figure": "pie"}, UnknownNameError, "unknown figure 'pie'"),
+        ({"figure": "bars"}, FileFormatError, "figures: bars: by: Field required"),
+        (
+            {"figure": "bars", "by": "weather"},
+            InputError,
+            "figures: expected one of environment, object, answer, part, got",
+        ),
+    ],
+)
+def test_a_figure_that_cannot_be_made_is_refused(
+    described: dict[str, object], kind: type[AdvsearchError], message: str
+) -> None:
+    with pytest.raises(kind, match=message):
+        figure(described, rows({"noon": (1, 2)}))
+
+
+def test_the_sweeps_of_a_recipe_are_explained(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(TINY)
+    assert main(["recipe", str(path), "--run", str(tmp_path / "run"), "--quiet"]) == 0
+    with pytest.raises(InputError, match="expected at least 100 rows, got 8; sweep more"):
+        advsearch.explain(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("further", "message"),
+    [
+        (["--object", "mug,nosuch"], "unknown object 'nosuch'"),
+        (["--object", "mug,bowl", "--label", "bowl=unicorn"], "unicorn"),
+        (["--environment", "studio,nowhere"], "unknown environment 'nowhere'"),
+    ],
+)
+def test_a_later_object_is_checked_before_anything_is_rendered(
+    further: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(TINY)
+    assert main(["recipe", str(path), *further, "--run", str(tmp_path / "run")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("figure", "message"),
+    [
+        (
+            "{figure: curve, along: camera.elevatoin}",
+            "unknown column 'camera.elevatoin'. Did you mean 'camera.elevation'",
+        ),
+        ("{figure: points, by: object, series: trial}", "unknown column 'trial'"),
+        ("{figure: bars, by: object, of: [vievs]}", "unknown part 'vievs'. Did you mean 'views'?"),
+    ],
+)
+def test_a_figure_of_what_no_row_will_have_is_refused_before_anything_is_rendered(
+    figure: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"{TINY}  - {figure}\n")
+    assert main(["recipe", str(path), "--run", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert message in said and f"It stands in {path}, figure 3 ({figure[9:].split(',')[0]}), as `" in said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_the_figures_of_every_bundled_recipe_name_columns_that_there_are(name: str) -> None:
+    described, config = read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug")
+    check_figures(described, carrying_out._check_runs(planned(described, config)), name)
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_every_bundled_recipe_takes_an_environment_of_ones_own(tmp_path: Path, name: str) -> None:
+    room = tmp_path / "room.exr"
+    room.write_bytes((SCENES / "loft.exr").read_bytes())
+    runs = planned(read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug", environment=str(room)))
+    assert runs and carrying_out._check_runs(runs).keys() == {one.part for one in runs}
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> None:
+    described = read_recipe(name)
+    config = RecipeConfig(recipe=name, object="mug", task="detection={overlap: 0.4}", label="cup")
+    runs = planned(described, config)
+    assert runs and all(one.config.task == {"name": "detection", "overlap": 0.4} for one in runs)
+    if name != "texture-shape":
+        carrying_out._check(described, config)
+        return
+    with pytest.raises(InputError, match="task: texture-shape asks whether answers are classes of the texture"):
+        carrying_out._check(described, config)
+
+
+def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(TINY.replace("spp: 1", "spp: 1, model: 'os.path:join'"))
+    assert main(["recipe", str(path), "--run", str(tmp_path / "run")]) == 2
+    assert "os.path:join, Python code" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "summary.json").exists()
+
+
+# ---- the runs -------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_asked_for_goes_over_the_recipe_and_labels_go_to_their_objects() -> None:
+    parts = {"a": {"command": "sweep", "settings": {"environment": "noon"}}, "b": {"command": "attack"}}
+    described = Recipe(title="a", settings={"object": "mug", "environment": "studio"}, parts=parts)
+    config = RecipeConfig(
+        recipe="mine", object="x/mug.obj,bowl", environment="kitchen,loft", model="m.pt2",
+        label={"mug": "coffee mug,cup", "*": "bowl"}, seed=3,
+    )  # fmt: skip
+    runs = planned(described, config)
+    assert [(one.part, one.config.object, one.config.environment, one.config.label) for one in runs] == [
+        ("a", "x/mug.obj", "noon", "coffee mug,cup"),
+        ("a", "bowl", "noon", "bowl"),
+        *(("b", name, place, label) for name, label in (("x/mug.obj", "coffee mug,cup"), ("bowl", "bowl"))
+          for place in ("kitchen", "loft")),
+    ]  # fmt: skip
+    assert runs[0].name == "a-00-mug" and runs[2].name == "b-00-mug-kitchen"
+    assert all(one.config.model == "m.pt2" for one in runs)
+
+
+def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, run = tmp_path / "mine.yaml", tmp_path / "run"
+    path.write_text(TINY)
+    real, done = carry_out, list[str]()
+
+    def stopping(config: Any, **named: Any) -> Any:
+        if config.object == "bowl" and not done.count("bowl"):
+            done.append("bowl")
+            raise KeyboardInterrupt
+        done.append(config.object)
+        return real(config, **named)
+
+    monkeypatch.setattr(subruns, "carry_out", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        advsearch.recipe(path, run=run)
+    path.unlink()  # it goes on as it began
+    result = carrying_out.recipe_from_config(RecipeConfig.from_yaml(run / "run.yaml"), resumed=run)
+    assert done == ["mug", "bowl", "bowl"]
+    assert result.to_dict() == read_result(run).to_dict() and isinstance(read_result(run), RecipeResult)
+    assert [one.renders for one in result.parts] == [4, 4] and result.ending == "done"
+    heat, bars = result.figures
+    assert isinstance(heat, HeatMapFigure) and isinstance(bars, BarsFigure)
+    assert heat.configurations == [[2, 2], [2, 2]] and sum(one.configurations for one in bars.bars) == 8
+    page = (run / "report.html").read_text()
+    assert all(text in page.replace("&nbsp;", " ") for text in (result.title, *heat.text, *bars.text))
+    assert page.count("data:image/png") == 2 and {"figure-1.png", "figure-2.svg"} <= {
+        one.name for one in (run / "images").iterdir()
+    }
+    assert main(["show", str(run), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["figures"][1]["by"] == "environment"
+
+
+def test_photographs_come_from_a_folder_and_their_figure_is_made_anew(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, run, folder = tmp_path / "mine.yaml", tmp_path / "run", tmp_path / "photographs"
+    controls = "controls: {camera: {}}, samples: 2, sampler: random, trials: 0, keep_pictures: all"
+    path.write_text(f"""
+title: Is the mug seen?
+settings: {{object: mug, resolution: 16, spp: 1}}
+parts:
+  renderings: {{command: sweep, settings: {{{controls}}}}}
+  finer: {{command: sweep, drawn_as: renderings, settings: {{{controls}, spp: 2}}}}
+figures: [{{figure: agreement, of: [renderings, finer]}}]
+""")
+    with pytest.raises(InputError, match="photographs: expected a folder"):
+        advsearch.recipe(path, run=run, photographs=folder)
+    (folder / "mug").mkdir(parents=True)
+    advsearch.recipe(path, run=run)
+    assert main(["resume", str(run), f"photographs={folder}"]) == 2
+    assert "expected some in a folder for each object (mug)" in capsys.readouterr().err
+    for name in ("rendering-1", "rendering-1-again", "any"):
+        write_png(folder / "mug" / f"{name}.png", np.full((20, 30, 3), 0.5))
+    for _ in range(2):  # those that it has are not taken again
+        assert main(["resume", str(run), f"photographs={folder}", "--json"]) == 0
+        printed = json.loads(capsys.readouterr().out)
+        ((photographs, finer),) = (one["series"] for one in printed["figures"])
+        assert (photographs["total"]["agreeing"]["configurations"], photographs["alone"]) == (2, 1)
+        assert finer["total"]["agreeing"]["configurations"] == 2
+    write_png(folder / "mug" / "rendering-9.png", np.full((20, 30, 3), 0.5))
+    assert main(["resume", str(run), f"photographs={folder}"]) == 2
+    assert "rendering-9.png: rendering: " in capsys.readouterr().err
+
+
+def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with() -> None:
+    searched = {
+        "camera.elevation": {"value": 30.0, "unit": "degrees", "low": 0.0, "high": 80.0},
+        "camera.azimuth": {"value": 350.0, "unit": "degrees", "low": 0.0, "high": 360.0},
+        "camera.roll": {"value": 0.0, "unit": "degrees", "low": -30.0, "high": 30.0},
+        "camera.distance": {"value": 2.0, "unit": "object sizes", "low": 1.0, "high": 4.0},
+    }
+    found = AnswerDistribution.of({"mean": searched, "deviation": [0.1, 0.05, 2.0, 0.1]})
+    ranges = {name: FoundValue.of(value) for name, value in searched.items()}
+    drawn = carrying_out._around(SweepConfig(object="mug"), found, ranges)
+    assert isinstance(drawn, SweepConfig) and drawn.sampler == "random"
+    camera: Any = drawn.controls["camera"]
+    low, high = camera["elevation"]
+    assert ((low + high) / 2, (high - low) / 12**0.5) == pytest.approx((30.0, 8.0))
+    assert camera["azimuth"][1] > 360.0 and sum(camera["azimuth"]) / 2 == pytest.approx(350.0)
+    assert camera["roll"] == pytest.approx([-30.0, 30.0])
+    low, high = np.log2(camera["distance"])  # evenly along the logarithm, as it is searched
+    assert ((low + high) / 2, (high - low) / 12**0.5) == pytest.approx((1.0, 0.2))
+
+
+# ---- what figures say -----------------------------------------------------------------------------------------------
+
+
+def test_of_few_answers_it_is_not_said_that_none_is_right() -> None:
+    def told(counts: dict[str, tuple[int, int]]) -> list[str]:
+        cells = [count_of(name, *one) for name, one in counts.items()]
+        return heat_map._said(cells, "objects", "environments")
+
+    few = told({"mug with noon": (0, 4), "bowl with noon": (3, 4)})
+    assert few[-1] == "1 of the pairs without a right answer has under 20 configurations: too few to say."
+    assert not any("No answer is right" in one for one in few)
+    many = told({"mug with noon": (0, 40), "bowl with noon": (0, 4), "bowl with loft": (30, 40)})
+    assert (
+        many[-2] == "No answer is right in 1 of 3 pairs: mug with noon (right in 0 of 40 (0 %, 95 % interval 0-9 %))."
+    )
+    assert not any("never" in one for one in many)
+
+
+def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_overlap() -> None:
+    shown = figure(
+        {"figure": "bars", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
+    )
+    assert shown.text[0].startswith(
+        "Hardest is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); easiest is studio"
+    )
+    assert shown.text[1].startswith("The difference is shown")
+    assert [one.name for one in shown.bars] == ["studio", "loft", "noon"]
+    hidden = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))
+    assert hidden.text[1].startswith("No difference between the environments is shown")
+    same = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (8, 20)}))
+    assert same.text == ["All 2 environments have the same share, 40 %: no difference is shown."]
+
+
+def test_sentences_call_values_what_they_are() -> None:
+    """Numbers by their parameter, named things by what they are, and lines by the names that a recipe gives."""
+    fogs = [
+        answered({"object": "mug", "fog.which": kind, "fog.severity": level, "yaw": level, "trial": kind}, right)
+        for kind, level, right in [
+            ("thin", 1.0, True),
+            ("thin", 2.0, True),
+            ("thick", 1.0, True),
+            ("thick", 2.0, False),
+        ]
+    ]
+    pairs = figure({"figure": "heat map", "rows": "fog.which", "columns": "fog.severity"}, fogs)
+    assert pairs.text[0].startswith("The lowest pair is thick with severity 2: right in 0 of 1")
+    assert pairs.text[1].startswith("No difference between the pairs of fogs and values of fog.severity is shown")
+    names = {"thin": "the object as it is", "thick": "the object in fog"}
+    curve = figure({"figure": "curve", "along": "yaw", "by": "trial", "bins": 2, "names": names}, fogs)
+    assert curve.text[1].startswith("For the object in fog, accuracy is lowest")
+    assert "No difference between the kinds of trials is shown" in curve.text[-1]
+
+
+def test_two_of_many_have_to_be_further_apart_than_two_of_two() -> None:
+    two = {"noon": (6, 20), "studio": (18, 20)}
+    many = {**two, **{f"room {number}": (14, 20) for number in range(18)}}
+    pair, several = (figure({"figure": "bars", "by": "environment"}, rows(one)).text[1] for one in (two, many))
+    assert pair.startswith("The difference is shown") and several.startswith("No difference")
+
+
+def test_shape_and_texture_are_told_apart() -> None:
+    """A model that answers by shape, one that answers by texture, and one that answers by neither."""
+    pairs = [(shape, texture) for shape in ("mug", "bowl", "vase") for texture in ("zebra", "brick") for _ in range(20)]
+    said = {
+        "more by shape than by texture": [shape for shape, _ in pairs],
+        "more by texture than by shape": [texture for _, texture in pairs],
+        "no difference is shown": ["cup"] * len(pairs),
+    }
+    for text, answers in said.items():
+        answered = [
+            Answered("a", {"object": shape, "material.which": texture}, {}, answer, shape == answer)
+            for (shape, texture), answer in zip(pairs, answers, strict=True)
+        ]
+        made = figure({"figure": "cues", "classes": {"zebra": ["zebra"]}}, answered)
+        assert any(text in one for one in made.text)
+        assert any(row.textured for row in made.rows) == (answers[0] == "zebra")
+
+
+def told_by(answer: Any, shapes: int, textures: int, seed: int) -> str:
+    """Which cue the figure names, of a model that answers by a function of shape, texture and chance."""
+    generator = np.random.default_rng(seed)
+    answered = [
+        Answered("a", {"object": f"s{s}", "material.which": f"t{t}"}, {}, str(answer(s, t, generator)), False)
+        for s in range(shapes)
+        for t in range(textures)
+        for _ in range(8)
+    ]
+    made = figure({"figure": "cues"}, answered)
+    assert made.difference_interval[0] <= made.difference <= made.difference_interval[1]
+    assert sum(one.configurations for one in made.predicted) == 2 * len(answered)
+    (text,) = [one for one in made.text if "most frequent answer about the same object" in one]
+    return next(
+        kind for kind in ("by shape than by texture", "by texture than by shape", "no difference") if kind in text
+    )
+
+
+@pytest.mark.parametrize(("shapes", "textures"), [(2, 13), (13, 2), (6, 13)])
+def test_many_textures_of_few_objects_favour_neither_cue(shapes: int, textures: int) -> None:
+    """Models that answer by one cue in 6 of 10 pictures and else by chance, and models that answer by chance alone."""
+    by_shape = lambda s, t, g: s if g.random() < 0.6 else g.integers(5)  # noqa: E731
+    by_texture = lambda s, t, g: t if g.random() < 0.6 else g.integers(5)  # noqa: E731
+    assert {told_by(by_shape, shapes, textures, seed) for seed in range(5)} == {"by shape than by texture"}
+    assert {told_by(by_texture, shapes, textures, seed) for seed in range(5)} == {"by texture than by shape"}
+    at_chance = [
+        told_by(lambda s, t, g: min(g.geometric(0.4), 6), shapes, textures, seed) == "no difference"
+        for seed in range(40)
+    ]
+    assert sum(at_chance) >= 34  # 95 % intervals: 38 of 40 on average
+
+
+def test_one_object_does_not_tell_shape_from_texture() -> None:
+    answered = [Answered("a", {"object": "mug", "material.which": t}, {}, "mug", True) for t in ("own", "zebra")]
+    made = figure({"figure": "cues"}, answered)
+    assert made.difference is None and any("takes at least two objects and two textures" in one for one in made.text)
+
+
+def test_a_mixture_is_counted_in_the_triangle_that_it_lies_in() -> None:
+    """An answer that is given where most is milk, and nowhere else."""
+    shares = [(a / 9, b / 9, (9 - a - b) / 9) for a in range(10) for b in range(10 - a)]
+    answered = [
+        Answered("a", {"object": "mug", "w": w, "m": m, "c": c}, {}, "bowl" if m > 0.5 else "mug", m <= 0.5)
+        for w, m, c in shares
+    ]
+    made = figure({"figure": "ternary", "shares": ["w", "m", "c"], "side": 3}, answered)
+    bowl = next(one for one in made.answers if one.answer == "bowl")
+    assert sum(cell.configurations for cell in bowl.cells) == len(shares) and len(bowl.cells) == 9
+    assert sum(cell.given for cell in bowl.cells) == bowl.given == 15
+    assert all(corner[1] >= 1 / 3 for cell in bowl.cells if cell.given for corner in cell.corners)
+    assert made.leads == [] and not any("things" in text for text in made.text)
+    assert [one.accuracy for one in bowl.by_most] == [0.0, pytest.approx(15 / bowl.by_most[1].configurations), 0.0]
+
+
+def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None:
+    """A lead of 1 where most is milk and of 5 elsewhere, a little more or less; no picture with much coffee."""
+    shares = [(a / 20, b / 20, (20 - a - b) / 20) for a in range(21) for b in range(21 - a) if a + b > 7]
+    answered = [
+        Answered(
+            "a", {"object": "mug", "w": w, "m": m, "c": c}, {}, "mug", True, 0.0, -(1.0 if m > 0.5 else 5.0) - c / 9
+        )
+        for w, m, c in shares
+    ]
+    made = figure({"figure": "ternary", "shares": ["w", "m", "c"], "side": 4}, answered)
+    assert [one.name for one in made.leads] == ["w", "m", "c"] and made.leads[1].mean < 2.5 < 4.0 < made.leads[0].mean
+    assert (
+        made.text[0].startswith("The answer is mug in every picture, so that shares")
+        and "most of the mixture is m: 2." in made.text[1]
+    )
+    assert "The difference is shown" in made.text[1]
+    cells = made.answers[0].cells
+    empty = sum(cell.lead is None for cell in cells)
+    assert empty == sum(not cell.configurations for cell in cells) == 1
+    assert made.text[2] == "No picture was drawn in 1 of 16 parts of the diagram, which are hatched."
+    assert draw_figure(made, Path())["png"] and figure_table(made)[1][1][0] == "m"
+    same = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=-3.0) for one in answered])
+    assert "No difference is shown" in same.text[1]
+    unknown = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=None) for one in answered])
+    assert unknown.text[0] == (
+        "mug, 100 % of all answers, is given as often whatever most of the mixture is: no difference is shown."
+    )
+
+
+def test_two_figures_that_say_the_same_say_it_once() -> None:
+    one, two = (figure({"figure": "bars", "by": "environment"}, rows({"noon": (at, 20)})) for at in (8, 9))
+    same = ["It says the same as the figure before it."]
+    before = ["It says what figures before it say."]
+    assert told_once([one, one, two, one]) == [one.text, same, two.text, before] and told_once([]) == []
+
+
+def test_curves_along_two_parameters_say_once_what_holds_for_both() -> None:
+    answered_ = [
+        answered({"object": "ball" if n % 2 else "mug", "yaw": float(n % 7), "zoom": float(n % 5)}, n % 4 == 0)
+        for n in range(70)
+    ]
+    one, two = (
+        figure({"figure": "curve", "along": along, "by": "object", "bins": 2}, answered_) for along in ("yaw", "zoom")
+    )
+    assert one.text[-1] == two.text[-1] and one.text[-1].startswith("Over the whole range, the lowest accuracy is that")
+    assert one.text[-1] in told_once([one, two])[0] and one.text[-1] not in told_once([one, two])[1]
+
+
+def test_a_fall_is_told_of_the_group_that_has_one() -> None:
+    """Mugs are right near 0 and wrong behind, balls as often everywhere; 350 degrees are near 0."""
+    made = figure(
+        {"figure": "curve", "along": "yaw", "by": "group", "range": (0, 360), "away_from": 0, "turn": 360},
+        [
+            answered({"object": name, "yaw": yaw}, (yaw < 90 or yaw > 270) if name == "mug" else n % 2 == 0)
+            for name in ("mug", "ball")
+            for yaw in (10.0, 60.0, 120.0, 200.0, 300.0, 350.0)
+            for n in range(20)
+        ],
+        {"round objects": ["ball"]},
+    )
+    mug, ball, both = made.text[-3:]
+    assert mug.startswith("other objects: right in 80 of 80") and mug.endswith("it falls.")
+    assert "where yaw is within 90 of 0, right in 0 of 40" in mug and "accuracy falls by 100 points" in mug
+    assert ball.endswith("accuracy falls by 0 points (95 % interval -20 to 20): no fall is shown.")
+    assert both.startswith("Accuracy falls by 100 points") and both.endswith(
+        "more for other objects than for round objects: the difference is shown."
+    )
+
+
+def test_photographs_agree_with_the_renderings_whose_configurations_they_show() -> None:
+    made = figure(EXAMPLES["agreement"], PICTURED)
+    photographs, again = made.series
+    total = photographs.total
+    assert (total.right_right, total.right_wrong, total.wrong_right, total.wrong_wrong) == (5, 1, 0, 2)
+    assert (photographs.alone, total.same_answer, again.total.agreeing.correct) == (1, 7, 10)
+    assert total.agreeing.interval == clopper_pearson(7, 8)
+    assert "right about both or wrong about both in 7 of 8 (88 %, 95 % interval 47-99.7 %)" in made.text[0]
+    assert "it is right in 5 of 6" in made.text[0] and "wrong in 2 of 2" in made.text[0]
+    assert made.text[2].startswith("1 of the photographs belongs to no rendering")
+
+
+def test_the_rate_of_workers_is_that_after_the_first_quarter_and_their_gain_is_over_the_same_object() -> None:
+    one, two = figure(EXAMPLES["scaling"], TIMED).points
+    assert one.rates == pytest.approx([4.0, 8.0]) and two.rates == pytest.approx([8.0, 16.0])
+    assert two.gains == pytest.approx([2.0, 2.0])
+    said = figure(EXAMPLES["scaling"], TIMED).text
+    assert "2 workers: 12 (8 to 16) pictures a second, 2 (2 to 2) times as many as 1 worker (100 % of linear)." in said
+    assert "with a confidence of 50 %" in said[2]
+    at_once = [replace(row, time=1.0) for row in TIMED]
+    for few, message in ((at_once, "expected runs of several batches"), (PICTURED, "expected sweeps with `workers`")):
+        with pytest.raises(InputError, match=message):
+            figure(EXAMPLES["scaling"], few)
+
+
+def test_a_quick_recipe_is_without_the_parts_that_it_leaves_out() -> None:
+    described = read_recipe("scaling")
+    runs = planned(described, RecipeConfig(recipe="scaling", quick=True, object="mug"))
+    assert [one.part for one in runs] == ["workers-1", "workers-2"] and runs[0].config.seed == runs[1].config.seed
+    assert len(planned(described, RecipeConfig(recipe="scaling", object="mug"))) == 4
+    with pytest.raises(UnknownNameError, match="unknown part 'b'"):
+        Recipe(title="a", parts={"a": {"command": "sweep"}}, quick={"without": ["b"]}).made_quick()
+
+
+def test_without_photographs_nothing_is_said_of_reality_and_they_are_in_no_figure_that_does_not_ask_for_them() -> None:
+    rendered = [row for row in PICTURED if row.part != "photographs"]
+    made = figure(EXAMPLES["agreement"], rendered)
+    assert (
+        made.text[0].startswith("There are no photographs yet: nothing is said about reality") and len(made.text) == 2
+    )
+    bars: dict[str, object] = {"figure": "bars", "by": "object"}
+    assert figure(bars, PICTURED) == figure(bars, rendered)
+    with pytest.raises(InputError, match="expected again to have the configurations of renderings"):
+        figure(EXAMPLES["agreement"], rendered[1:])
+
+
+def test_the_mean_corruption_error_is_relative_to_the_first_model() -> None:
+    errors = {"one": {"fog": 4, "jpeg": 2}, "two": {"fog": 8, "jpeg": 1}}
+    answered = [
+        Answered("corrupted", {"object": "mug", "model": model, "corruption.which": which}, {}, "mug", number >= wrong)
+        for model, wrongs in errors.items()
+        for which, wrong in wrongs.items()
+        for number in range(10)
+    ]
+    one, two = figure({"figure": "corruption error"}, answered).models
+    assert one.relative is None and two.relative == pytest.approx((8 / 4 + 1 / 2) / 2 * 100)
+    assert (one.error.correct, one.error.configurations) == (6, 20)
+
+
+def test_each_model_has_a_figure_unless_it_tells_them_apart() -> None:
+    answered = [*rows({"noon": (2, 6)}, model="one"), *rows({"noon": (5, 6)}, model="two")]
+    described = {"figure": "bars", "by": "environment", "title": "Hard"}
+    found = compute(Table(answered, {}), *read_options(described, "here"))
+    assert [made.title for made in found] == ["Hard: one", "Hard: two"]
+    assert [made.text[0][:29] for made in found] == ["noon: right in 2 of 6 (33 %, ", "noon: right in 5 of 6 (83 %, "]
+    for told in ({"figure": "bars", "by": "model"}, {"figure": "points", "by": "environment", "series": "model"}):
+        assert len(compute(Table(answered, {}), *read_options(told, "here"))) == 1
+
+
+def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
+    answered = [
+        Answered("a", {"object": "mug", "yaw": float(yaw)}, {"yaw": "degrees"}, "mug", yaw < 180) for yaw in range(361)
+    ]
+    made = figure({"figure": "curve", "along": "yaw", "bins": 4, "range": [0, 360]}, answered)
+    (line,) = made.lines
+    assert [(one.correct, one.configurations) for one in line.bins] == [(90, 90), (90, 90), (0, 90), (0, 91)]
+    assert made.text[0].startswith("Accuracy is lowest where yaw is 180 to 270 degrees (as 1 other): right in 0 of 90")
+
+
+@pytest.mark.parametrize("kind", FIGURES)
+def test_every_figure_is_drawn_and_is_a_table(kind: str, tmp_path: Path) -> None:
+    write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))
+    own = {"agreement": PICTURED, "scaling": TIMED}
+    table = Table(own.get(kind, EXAMPLE_ROWS), {"round": ["mug"]}, {"views-00-mug": SURFACE})
+    made: Any = compute(table, *read_options(EXAMPLES[kind], "here"))[0]
+    assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
+    heads, lines = figure_table(made)
+    assert lines and all(len(one) == len(heads) for one in lines)
+    assert draw_figure(made, tmp_path)["png"].startswith(b"\x89PNG")
+
+
+EXAMPLE_ROWS = [
+    replace(
+        row,
+        values={**row.values, "model": "m", "yaw": 10.0 * at, "water": at / 22, "milk": 0.5 - at / 22, "coffee": 0.5},
+    )
+    for at, row in enumerate(rows({"noon": (2, 6), "studio": (5, 6)}))
+]
+COUNTED = {"configurations": 20, "correct": 2, "accuracy": 0.1, "interval": (0.0, 0.3)}
+SURFACE = SurfaceMap.of(
+    {
+        "file": "artifacts/surface.npz", "cells": 8, "least": 5,
+        "tables": [
+            {
+                "object": "mug", "model": "m", "part": "cell", "unwrapped": False, "seen": 9, "compared": 7, "worse": 1,
+                "better": 0,
+                "strongest": [
+                    {"face": 3, "u": 0.25, "v": 0.5, "place": (0.0, 0.0, 1.0), "seen": COUNTED, "hidden": COUNTED,
+                     "difference": 0.4, "interval": (0.2, 0.6), "p": 0.01}
+                ],
+            }
+        ],
+    }
+)  # fmt: skip
+TIMED = [
+    Answered(f"workers-{workers}", {"object": name, "workers": workers}, {}, "mug", True, 100.0 + at / (rate * workers))
+    for workers in (1, 2)
+    for name, rate in (("mug", 4), ("bowl", 8))
+    for at in (*(0,) * 5, *range(16))
+]
+"""Five rows at once, then some at an even rate, in runs of two objects: two workers are twice as fast as one."""
+
+MIXTURE = ("water", "milk", "coffee")
+PICTURED = [
+    Answered(part, {"object": "mug", "model": "m", **values}, {}, "mug" if right else "cup", right)
+    for part, values, right in [
+        *(("renderings", {"yaw": float(at)}, at < 6) for at in range(10)),
+        *(("again", {"yaw": float(at), "sensor.shot": 0.1}, at < 6) for at in range(10)),
+        *(("photographs", {"yaw": float(at)}, at < 5) for at in range(8)),
+        ("photographs", {}, True),
+    ]
+]
+"""Ten renderings, the same ones through a sensor, photographs of eight of them, and one of none."""
+
+EXAMPLES: dict[str, dict[str, object]] = {
+    "curve": {"figure": "curve", "along": "yaw", "by": "environment", "bins": 3},
+    "points": {"figure": "points", "by": "object", "series": "environment", "names": {"noon": "at noon"}},
+    "answers": {"figure": "answers", "by": "environment"},
+    "cues": {"figure": "cues", "texture": "environment", "classes": {"noon": ["cup"]}},
+    "ternary": {"figure": "ternary", "shares": list(MIXTURE), "normalised": True},
+    "surface": {"figure": "surface"},
+    "scaling": {"figure": "scaling"},
+    "corruption error": {"figure": "corruption error", "which": "environment"},
+    "bars": {"figure": "bars", "by": "group"},
+    "heat map": {"figure": "heat map", "rows": "object", "columns": "environment"},
+    "agreement": {"figure": "agreement", "of": ["renderings", "again"], "names": {"again": "through a sensor"}},
+}
+
+
+@pytest.mark.parametrize(
+    ("share", "shown"),
+    [(0.35, "piggy bank, penny bank"), (0.2, "piggy bank"), (0.1, "piggy b…"), (0.06, "pigg…"), (0.04, "")],
+)
+def test_a_bar_shows_as_much_of_a_name_as_there_is_room_for(share: float, shown: str) -> None:
+    assert fitting("piggy bank, penny bank", share) == shown

@@ -1,0 +1,185 @@
+"""The answer of a run under other conditions: what holds, what does not, and beside what clean scene."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import advsearch
+from advsearch.api.attack import attack_once, problem_from_config
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
+from advsearch.engine.problem import Problem
+from advsearch.engine.retrial import RetrialCondition, Retrials
+from advsearch.errors import FileFormatError, InputError
+from advsearch.progress import NullProgress
+from advsearch.questions.replay import carry_out as replaying
+from advsearch.questions.replay.settings import ReplayConfig
+from advsearch.runs.answer import read_answer, write_answer
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Store
+from advsearch.runs.summary import read_result
+from advsearch.scene.formation import ImageFormation
+
+EASY = "small_models:easy"
+SHORT: dict[str, Any] = {
+    "object": "mug", "model": EASY, "controls": {"texture": {"epsilon": 0.3}}, "steps": 6, "trials": 6,
+    "verify_spp": 4, "spp": 2, "denoise": "none", "baseline": False, "measure": "no",
+    "resolution": 32,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose answer was found."""
+    run = tmp_path_factory.mktemp("replay") / "found"
+    assert attack_once(AttackConfig(**SHORT, run=str(run))).found
+    return run
+
+
+def test_an_answer_is_rendered_again_under_every_condition(
+    attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    monkeypatch.setattr("advsearch.scene.importing.blender.shutil.which", lambda name: None)
+    assert main(["replay", str(attacked), "--trials", "6", "--model", "small_models:hard", "--code", EASY, "--run",
+                 str(run), "--json", "--quiet"]) == 0  # fmt: skip
+    said = json.loads(capsys.readouterr().out)
+    rows = {(row["way"], row["condition"]): row for row in said["table"]}
+    assert {way for way, _ in rows} == {
+        "as verified", "samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor",
+        "blender", "model",
+    }  # fmt: skip
+    without = rows.pop(("blender", "Cycles, Blender's renderer"))
+    assert without["ending"] == "not done" and "none is installed" in without["reason"] and "clean" not in without
+    said["table"].remove(without)
+    assert all(row["clean"]["trials"] == row["verified"]["trials"] == 6 for row in said["table"])
+    assert rows["as verified", "as verified"]["ending"] == "found", "what was verified holds in fresh pictures too"
+    assert rows["samples", "16 a pixel"]["verified"]["spp"] == 16 and ("samples", "1 a pixel") in rows
+    assert ("resolution", "16 x 16 pixels") in rows and ("resolution", "64 x 64 pixels") in rows
+    assert rows["integrator", "Mitsuba's path in place of prb"]["ending"] == "found"
+    assert read_result(run).to_dict() == {**said, "table": [*said["table"][:-1], without, said["table"][-1]]}
+    with Store(run / "results.sqlite", read_only=True) as store:
+        seeds = {tuple(row.seed for row in store.rows(kind)) for kind in store.counts()}
+    assert len(seeds) == 1, "the same seeds under every condition"
+    assert main(["show", str(run)]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("As verified, the answer holds; changed, it holds under ") and "quality 50" in text
+    assert "quality 50" in (run / "report.html").read_text("utf-8")
+
+
+def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = ReplayConfig(answer=attacked, ways="jpeg", trials=6, run=str(tmp_path / "run"))
+    real, done = Problem.judge, 0
+
+    def stopped(*given: Any) -> Any:
+        nonlocal done
+        done += 1
+        if done == 32:  # 4 conditions x 6 of the clean scene, 6 of the answer, and one more
+            raise KeyboardInterrupt
+        return real(*given)
+
+    monkeypatch.setattr(Problem, "judge", stopped)
+    first = replaying.replay_from_config(config)
+    assert first.goes_on and len(first.table) == 1
+    again = replaying.replay_from_config(config, resumed=tmp_path / "run")
+    assert again.ending == "done" and len(again.table) == 4 and done == 32 + 4 * 12 - 31
+    assert again.table[0] == first.table[0]
+
+
+def test_a_file_that_has_changed_since_is_said(tmp_path: Path) -> None:
+    names = tmp_path / "names.json"
+    names.write_text('["mug", "vase"]')
+    attack_once(AttackConfig(**SHORT, labels=str(names), label="mug", run=str(tmp_path / "found")))
+    same = advsearch.replay(tmp_path / "found", ways="sampler", trials=6, run=tmp_path / "same")
+    assert not any("names.json" in one for one in same.warnings)
+    names.write_text('["mug", "bowl"]')
+    other = advsearch.replay(tmp_path / "found", ways="sampler", trials=6, run=tmp_path / "other")
+    assert any("names.json is not what it was when the run was made" in one for one in other.warnings)
+
+
+def test_what_changes_only_after_rendering_renders_nothing(attacked: Path, tmp_path: Path) -> None:
+    together = advsearch.replay(
+        attacked, ways="curve,jpeg,sensor,sampler", model="small_models:hard", trials=6, run=tmp_path / "together"
+    )
+    assert together.renders == 2 * 6 * 2, "as verified and the other sampler; each of the clean scene and the answer"
+    assert len(together.table) == 10 and together.table[-1].condition == "small_models:hard"
+    (_, alone) = advsearch.replay(attacked, ways="sampler", trials=6, run=tmp_path / "sampler").table
+    assert alone == together.table[1], "rows are in the order of the conditions"
+
+
+@pytest.mark.parametrize("curve", ["srgb", "gamma", "reinhard"])
+def test_a_shared_radiance_gives_the_same_picture(attacked: Path, tmp_path: Path, curve: str) -> None:
+    problem, _ = problem_from_config(AttackConfig.from_yaml(attacked / "run.yaml"))
+    changed = replace(problem, renderer=problem.renderer.like(transfer=curve))
+    pair = [RetrialCondition(name, one, 4, name, light="own") for name, one in (("a", problem), ("b", changed))]
+    u = torch.from_numpy(read_answer(attacked))
+    with RunDirectory.create(tmp_path / "run") as run:
+        retrials = Retrials(pair, run, NullProgress(), trials=6, seed=0)
+        first, second = (retrials._rendered(one, u, 7) for one in pair)
+    assert torch.equal(first, problem.picture(u, 7, 4)) and torch.equal(second, changed.picture(u, 7, 4))
+
+
+def test_a_model_that_cannot_be_loaded_is_refused_before_anything_is_rendered(attacked: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unknown model"):
+        advsearch.replay(attacked, model="nonesuch", run=tmp_path / "never")
+    assert not (tmp_path / "never").exists()
+
+
+def test_a_run_without_an_answer_is_refused(attacked: Path, tmp_path: Path) -> None:
+    with pytest.raises(advsearch.errors.UnknownNameError, match="unknown run"):
+        advsearch.replay(tmp_path / "none")
+    for name, break_it, message in (
+        ("gone", lambda path: path.unlink(), "did the run end"),
+        ("short", lambda path: write_answer(path.parents[1], torch.zeros(3).numpy()), "has 3 numbers, and its scene"),
+        ("torn", lambda path: path.write_bytes(b"\x93NUMPY"), "expected the answer of a run"),
+    ):
+        copy = tmp_path / name
+        with RunDirectory.create(copy):
+            pass
+        for file in ("run.yaml", "summary.json", "artifacts/answer.npy"):
+            (copy / file).parent.mkdir(exist_ok=True)
+            (copy / file).write_bytes((attacked / file).read_bytes())
+        break_it(copy / "artifacts" / "answer.npy")
+        with pytest.raises((InputError, FileFormatError), match=message):
+            advsearch.replay(copy, run=tmp_path / "never")
+    assert not (tmp_path / "never").exists()
+
+
+@pytest.mark.parametrize(
+    "header", [b"{'descr': '<f4', 'fortran_order': False, 'shape': (10%b,), }", b"{'shape': '''%b"]
+)
+def test_a_hostile_header_of_an_answer_is_refused(header: bytes, tmp_path: Path) -> None:
+    text = header % (b"0" * 11) + b"\n"
+    path = write_answer(tmp_path, torch.zeros(3).numpy())
+    path.write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
+    with pytest.raises(FileFormatError, match=r"answer\.npy: expected numbers"):
+        read_answer(tmp_path)
+
+
+@pytest.mark.parametrize("data", [[[0.5]], [2.0], [float("nan")]], ids=["two axes", "out of range", "nan"])
+def test_an_answer_is_a_point_of_the_box(data: Any, tmp_path: Path) -> None:
+    write_answer(tmp_path, torch.tensor(data).numpy())
+    with pytest.raises(FileFormatError, match=r"expected numbers \(d,\) float32 in \[0, 1\]"):
+        read_answer(tmp_path)
+    write_answer(tmp_path, torch.tensor([0.25, 1.0]).numpy())
+    assert read_answer(tmp_path).tolist() == [0.25, 1.0]
+
+
+def test_an_unknown_way_is_refused() -> None:
+    with pytest.raises(InputError, match="ways: expected some of samples, resolution, depth"):
+        ReplayConfig(answer="run", ways="jpeg,fog")
+
+
+@pytest.mark.parametrize(("curve", "middle"), [("srgb", 0.4613561), ("gamma", 0.4586564), ("reinhard", 0.4268)])
+def test_other_tone_curves(curve: str, middle: float) -> None:
+    """Grey of 0.18; all of them rise, begin at black and stay within [0, 1]."""
+    light = torch.linspace(0.0, 4.0, 401)
+    shown = ImageFormation(transfer=curve).display(light)
+    assert float(shown[18]) == pytest.approx(middle, abs=1e-3)
+    assert bool((shown.diff() >= 0).all()) and float(shown[0]) < 0.002 and float(shown.max()) <= 1.0

@@ -1,0 +1,190 @@
+"""What runs stand for: no ending, count or command makes a claim that says more than the run does."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
+import pytest
+import samples
+
+from advsearch.questions.explain.answer import ExplainResult
+from advsearch.questions.harden.answer import HardenResult
+from advsearch.questions.recipe.answer import RecipeResult
+from advsearch.questions.replay.answer import ReplayResult
+from advsearch.questions.report.answer import Evidence
+from advsearch.questions.report.claims import RULES, claims_of, photo_claims, warnings_over
+from advsearch.questions.report.page import evidence_page
+from advsearch.questions.report.runs import evidence_of, markdown
+from advsearch.report.claims import ENDED, NO_PROOF, NOTHING, Claim
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.photos import PhotoAgreement
+from advsearch.runs.summary import to_json
+
+ENDINGS = (
+    *("found", "budget spent", "stalled", "not verified", "already wrong", "non-finite objective", "interrupted"),
+    *("out of time", "done", "finished", "an ending of a later version"),
+)
+RATES: tuple[dict[str, Any] | None, ...] = (None, samples.rated(0, 0.0, 0.1684), samples.rated(20))
+TOO_MUCH = re.compile(
+    r"\brobust\b|\bsafe|guarantee|\bprove|\balways\b|\bnever\b|\bsecure|\bevery|\bno failures?\b(?! was)"
+)
+"""What no sample of anything shows."""
+
+
+def everything() -> Iterator[tuple[str, dict[str, Any] | None, Result]]:
+    """Results of every command that carries claims, with every ending and rate."""
+    for ending, rate, baseline in product(ENDINGS, RATES, (True, False)):
+        own = {} if baseline else {"baseline": None}
+        for goal in ({}, samples.TARGET, samples.EASIER):
+            yield ending, rate, samples.attack(ending=ending, verified=rate, **own, **goal)
+    for ending, rate in product(ENDINGS, RATES):
+        row = {**samples.GAP["table"][0], "ending": ending, "worst": rate}
+        yield ending, rate, samples.gap(table=[row])
+        cell = {**samples.REPLAY["table"][0], "ending": ending, "verified": rate}
+        yield ending, rate, ReplayResult.of({**samples.REPLAY, "table": [cell]})
+        if rate is not None:
+            tested = [{"model": "reference", "ending": ending, "verified": rate}]
+            row = {**samples.MATRIX["table"][0], "tested": tested}
+            yield ending, rate, samples.matrix(table=[row])
+
+
+def nothing(claim: Claim) -> bool:
+    """Whether a claim is none, in its kind, its words and its numbers at once."""
+    said = claim.kind == "nothing claimed"
+    assert said == claim.statement.startswith(NOTHING) and said == (claim.extent is None)
+    return said
+
+
+def test_no_ending_makes_a_claim_that_the_trials_do_not_carry() -> None:
+    kinds = set()
+    for ending, rate, result in everything():
+        claims = claims_of(result)
+        assert claims, "a run that claims nothing says so"
+        for claim in claims:
+            kinds.add((claim.kind, ending))
+            assert not TOO_MUCH.search(claim.statement), claim.statement
+            if nothing(claim):
+                continue
+            assert claim.extent is not None and not result.goes_on
+            if claim.kind == "found":
+                assert ending == "found" and rate and rate["successes"] == claim.extent.count == 20
+            if claim.kind == "not found":
+                assert ending in ENDED and rate is not None and NO_PROOF in claim.statement
+                assert re.search(r"Searched were \d+ renders by the policy \w+", claim.statement)
+            assert (
+                f"{claim.extent.count} of {claim.extent.total}" in claim.statement
+                and "95 % interval" in claim.statement
+            )
+    assert {("found", "found"), ("not found", "stalled"), ("nothing claimed", "already wrong")} <= kinds
+    assert not [kind for kind in kinds if kind[0] == "not found" and kind[1] not in ENDED]
+
+
+@pytest.mark.parametrize("ending", ["interrupted", "out of time"])
+def test_what_was_stopped_claims_nothing_whatever_it_has_counted(ending: str) -> None:
+    stopped = [
+        samples.attack(ending=ending), samples.sweep(ending=ending), samples.curve(ending=ending),
+        samples.gap(ending=ending), samples.region(ending=ending), samples.matrix(ending=ending),
+        HardenResult.of({**samples.HARDEN, "ending": ending}), ExplainResult.of({**samples.EXPLAIN, "ending": ending}),
+        ReplayResult.of({**samples.REPLAY, "ending": ending}),
+    ]  # fmt: skip
+    for result in stopped:
+        (claim,) = claims_of(result)
+        assert nothing(claim) and "stopped" in claim.statement
+
+
+def test_a_sweep_says_how_its_configurations_were_chosen() -> None:
+    drawn = claims_of(samples.sweep(sampler="random", samples=8))[0].statement
+    sobol = claims_of(samples.sweep(sampler="sobol", samples=8))[0].statement
+    grid = claims_of(samples.sweep(grid={"pose.yaw": 8}))[0].statement
+    foreign = claims_of(samples.sweep())[0].statement
+    assert "drawn by chance" in drawn and not [text for text in (sobol, grid, foreign) if "by chance" in text]
+    assert "which these are not" in sobol and "between or beside these points" in grid and "not known" in foreign
+    assert nothing(claims_of(samples.sweep(accuracy=None, interval=None, configurations=0, correct=0))[0])
+
+
+def test_envelopes_regions_curves_and_hardening_are_claims_as_far_as_they_were_counted() -> None:
+    (region,) = claims_of(samples.region())
+    assert "pose.yaw 10 to 55.5 degrees" in region.statement and "by sampling" in region.statement
+    assert nothing(claims_of(samples.region(samples=None, same=None))[0])
+    (held,) = claims_of(ExplainResult.of(samples.EXPLAIN))
+    assert "camera.elevation over 60 degrees" in held.statement and not nothing(held)
+    for box in (None, {**samples.EXPLAIN["envelope"], "held": False}):
+        assert nothing(claims_of(ExplainResult.of({**samples.EXPLAIN, "envelope": box}))[0])
+    assert [NO_PROOF in one.statement for one in claims_of(samples.curve())] == [True]
+    table = [{**row, "renders": {"search": 40, "baseline": 30}} for row in samples.CURVE["table"]]
+    (counted,) = claims_of(samples.curve(table=table))
+    assert "no failure of" in counted.statement
+    assert (
+        f"together, {40 * len(table)} renders by the policy auto and {30 * len(table)} by random" in counted.statement
+    )
+    assert [NO_PROOF in one.statement for one in claims_of(HardenResult.of(samples.HARDEN))] == [True, True]
+    assert nothing(claims_of(RecipeResult.of(samples.RECIPE))[0]), "its parts are runs of their own"
+
+
+def test_photographs_say_how_far_they_agree() -> None:
+    counted = {"photos": 4, "right_right": 3, "right_wrong": 1, "wrong_right": 0, "wrong_wrong": 0, "agreement": 0.75,
+               "interval": (0.19, 0.99), "renderings": []}  # fmt: skip
+    (claim,) = photo_claims(PhotoAgreement.of(counted))
+    assert "3 of 4 (75 %, 95 % interval 19-99 %)" in claim.statement
+    assert not photo_claims(PhotoAgreement.of({**counted, "photos": 0, "interval": None}))
+
+
+def test_runs_of_other_models_or_of_a_file_that_changed_are_told() -> None:
+    assert not warnings_over(["reference", "reference"], ["", ""])
+    assert "different models: a.pt2, reference" in warnings_over(["reference", "a.pt2"], ["", "00"])[0]
+    assert "not the same in all runs" in warnings_over(["a.pt2", "a.pt2"], ["00", "11"])[0]
+
+
+def test_page_and_markdown_have_every_claim_and_exclusion_and_no_markup_of_others() -> None:
+    result = samples.attack(object="<b>mug</b>", warnings=["*loud* <script>"], ending="budget spent")
+    run = evidence_of("mug-001", result, claims_of(result), {"controls": {"texture": {}}}, {"torch": "2"})
+    evidence = Evidence(runs=[run], warnings=["Two models."], rules=list(RULES), version="0")
+    page, text = evidence_page(evidence), markdown(evidence)
+    assert "<script>" not in page.replace("&lt;script&gt;", "") and "&lt;script&gt;" in page
+    assert "\\*loud\\* \\<script\\>" in text and "<b>" not in text
+    for one in ("not found", "Two models.", "torch: 2", "texture within 0.1", NO_PROOF):
+        assert one in page and one in text
+    assert json.loads(to_json(evidence))["runs"][0]["claims"][0]["extent"]["of"] == 20
+
+
+def test_a_run_without_what_it_was_made_with_says_so() -> None:
+    result = samples.attack()
+    assert "not noted" in str(evidence_of("a", result, claims_of(result), {}, {}).made_with)
+
+
+def test_evidence_says_what_varied_how_far_and_what_judged() -> None:
+    drawn = {"camera.distance": {"unit": "object sizes", "low": 1.5, "high": 30.0}}
+    counted = {"configurations": 60, "correct": 30, "accuracy": 0.5, "interval": (0.3, 0.6)}
+    rows = [{**counted, "axis": "environment", "unit": "", "value": name} for name in ("cafe", "canteen")]
+    part = {**counted, "axis": "camera.distance", "unit": "object sizes", "value": (1.5, 8.0)}
+    swept = samples.sweep(axes=[*rows, part], drawn=drawn, controls=["camera"], sampler="random", grid={})
+    found = evidence_of("a", swept, claims_of(swept), {"trials": 20}, {}, {"iou": 0.5, "confidence": 0.25, "unit": ""})
+    assert "camera.distance: 1.5 to 30 object sizes, drawn by chance" in found.searched
+    assert "environment: cafe, canteen" in found.searched and not any("by default" in line for line in found.searched)
+    assert found.measured["Judged with"] == "iou 0.5, confidence 0.25"
+    assert found.measured["Trials of the worst configuration"] == "20" and "Trials" not in found.measured
+    assert "as many in each of the 2 environments" in found.claims[0].statement
+    azimuth = {"unit": "degrees", "low": 0.0, "high": 360.0}
+    over = {"camera.azimuth": azimuth, "environment.which": {"unit": "name", "names": ["noon", "studio"]}}
+    many = samples.attack(over=["camera", "environment"], conditions=over, verified=samples.rated(18, trials=18))
+    found = evidence_of("b", many, claims_of(many), {"labels": "mug,cup", "prompt": "a {}"}, {})
+    assert (found.about["Names of its classes"], found.about["Prompt"]) == ("mug,cup", "a {}")
+    assert "camera.azimuth: 0 to 360 degrees, by chance" in found.searched
+    assert "environment.which: noon or studio, by chance" in found.searched
+    assert found.about["Environment"] == "varied, see below; the clean scene has studio"
+    assert found.measured["Verification"].startswith("18 renders with fresh seeds that count, those of 20 in which")
+    assert found.excluded[0] == "Nothing varied but what stands under What varied, and the noise of the renders."
+
+
+def test_answers_of_several_models_to_the_same_pictures_are_not_counted_together() -> None:
+    one = {"configurations": 20, "correct": 5, "accuracy": 0.25, "interval": (0.1, 0.5), "axis": "model", "unit": ""}
+    rows = [{**one, "value": name} for name in ("first", "second")]
+    counts = {"configurations": 40, "correct": 10, "accuracy": 0.25}
+    swept = samples.sweep(**counts, model="first,second", axes=rows, ending="finished")
+    said = [claim for claim in claims_of(swept) if "is right in" in claim.statement]
+    assert [claim.extent and claim.extent.total for claim in said] == [20, 20]
+    assert [claim.statement.split()[2] for claim in said] == ["first", "second"]

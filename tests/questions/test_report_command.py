@@ -1,0 +1,111 @@
+"""`advsearch report`: runs as evidence, from their folders."""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+from samples import attack, make_run
+
+import advsearch
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
+from advsearch.questions.recipe.settings import RecipeConfig
+from advsearch.questions.report.claims import QUICK
+from advsearch.runs.directory import PARTS, RunDirectory
+from advsearch.runs.images import write_png
+from advsearch.runs.made_with import NOTE, file_digests
+
+
+def test_runs_become_a_page_markdown_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = make_run(tmp_path / "good", pictures=False, rows=False)
+    with RunDirectory.create_for(AttackConfig(object="bowl", run=str(tmp_path / "killed"))):
+        pass
+    out = tmp_path / "card"
+    asked = ["report", str(good), str(tmp_path / "killed"), str(good), "--evidence", "--out", str(out)]
+    assert main([*asked, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [run["claims"][0]["kind"] for run in told["runs"]] == ["found", "nothing claimed"], "each run once"
+    assert {"advsearch", "torch", "mitsuba"} <= set(told["runs"][0]["made_with"])
+    assert json.loads((out / "evidence.json").read_text()) == told
+    assert all("a vase in 20 of 20" in (out / f"evidence.{kind}").read_text() for kind in ("md", "json"))
+    assert main(asked) == 2 and "--overwrite" in capsys.readouterr().err
+    assert main([*asked, "--overwrite"]) == 0 and "nothing claimed" in capsys.readouterr().out
+    assert main(["report", str(good)]) == 2 and "--evidence" in capsys.readouterr().err
+
+
+def test_a_model_file_that_changed_between_runs_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "model.pt2"
+    runs = []
+    for number in range(2):
+        model.write_bytes(bytes([number]))
+        folder = tmp_path / str(number)
+        with RunDirectory.create_for(AttackConfig(object="mug", model=str(model), run=str(folder))) as run:
+            run.write_summary(attack(model=str(model)))
+        runs.append(str(folder))
+    assert main(["report", *runs, "--evidence", "--out", str(tmp_path / "card"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["runs"][1]["made_with"][str(model)] == sha256(b"\1").hexdigest()
+    assert "not the same in all runs" in told["warnings"][0]
+
+
+def test_every_file_that_was_read_is_digested(tmp_path: Path) -> None:
+    """The .mtl, the paint and the buffer too, which decide what the picture is."""
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    write_png(tmp_path / "a" / "paint.png", np.full((4, 4, 3), 0.5, np.float32))
+    (tmp_path / "a" / "cube.mtl").write_text("newmtl one\nKd 1 1 1\nmap_Kd paint.png\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    faces = "usemtl one\nf 1/1 3/2 2/3\nf 1/1 2/2 4/3\nf 1/1 4/2 3/3\nf 2/1 3/2 4/3\n"
+    (tmp_path / "a" / "cube.obj").write_text(f"mtllib cube.mtl\n{corners}{faces}")
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    triangles = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint16)
+    (tmp_path / "b" / "part.bin").write_bytes(points.tobytes() + triangles.tobytes())
+    views = [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 24}]
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 1]},
+        {"bufferView": 1, "componentType": 5123, "count": 12, "type": "SCALAR"},
+    ]
+    scene = {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "name": "thing"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "buffers": [{"uri": "part.bin", "byteLength": 72}], "bufferViews": views, "accessors": accessors,
+    }  # fmt: skip
+    (tmp_path / "b" / "scene.gltf").write_text(json.dumps(scene))
+    cube, whole = str(tmp_path / "a" / "cube.obj"), f"{tmp_path / 'b' / 'scene.gltf'}#thing"
+    for spec in (cube, whole):
+        advsearch.load_scene(spec)
+    found = file_digests({"object": f"{cube},{whole}", "environment": "studio"})
+    read = [tmp_path / "a" / one for one in ("cube.obj", "cube.mtl", "paint.png")]
+    read += [tmp_path / "b" / one for one in ("scene.gltf", "part.bin")]
+    assert found == {str(one): sha256(one.read_bytes()).hexdigest() for one in read}
+    (tmp_path / "a" / "paint.png").write_bytes(b"another")
+    assert file_digests({"object": cube})[str(read[2])] != found[str(read[2])]
+
+
+def test_each_sitting_that_differs_is_noted_once(tmp_path: Path) -> None:
+    config = AttackConfig(object="mug", run=str(tmp_path / "run"))
+    with RunDirectory.create_for(config) as run:
+        first = run.store.noted(NOTE)
+        run.store.set_note(NOTE, json.dumps([{**first[0], "torch": "0.1"}]))
+    for _ in range(2):
+        with RunDirectory.resume(tmp_path / "run", config) as run:
+            noted = run.store.noted(NOTE)
+    assert [one["torch"] for one in noted] == ["0.1", first[0]["torch"]]
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_parts_of_a_quick_recipe_say_that_they_are_no_result(
+    quick: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "recipe"
+    with RunDirectory.create_for(RecipeConfig(recipe="pose-space", quick=quick, run=str(recipe))):
+        pass
+    make_run(recipe / PARTS / "0-mug", pictures=False, rows=False)
+    assert main(["report", str(recipe), "--evidence", "--out", str(tmp_path / "card"), "--json"]) == 0
+    (part,) = json.loads(capsys.readouterr().out)["runs"]
+    assert (QUICK in part["excluded"]) == quick
+    assert (QUICK in (tmp_path / "card" / "evidence.md").read_text()) == quick

@@ -1,0 +1,276 @@
+"""The stability suite: every extreme has a case, the cheap ones hold, and the command reports honestly."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from covering import only
+
+from advsearch.attacks import Query
+from advsearch.cli.main import main
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.stability import suite
+from advsearch.questions.stability.answer import StabilityResult
+from advsearch.questions.stability.case import Toy, box_domain, condition_number, hessian, holds, quadratic
+from advsearch.questions.stability.cases_noise import clipped_mean, median_of_means
+from advsearch.questions.stability.settings import StabilityConfig
+from advsearch.questions.stability.suite import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Outcome, chosen, run_case
+from advsearch.runs.directory import RunDirectory, find_run
+from advsearch.runs.summary import read_result
+
+WANTED = {
+    "radiometric": "hdri black lamp negative infinite nan camera-exposure environment-exposure saturated",
+    "materials": "roughness metallic perfect-mirror clear-glass texels",
+    "geometry": "degenerate sliver coincident one-triangle million scale file translation grazing near-plane object "
+    "gimbal full-turn",
+    "objective": "logits ties probabilities nan constant-model random-model",
+    "stiff": "rescaled curvatures scaled-derivative curved-valley badly-scaled light-rotation-texel",
+    "precision": "verdicts bytes ball ten-thousand-steps ten-thousand-turns one-and-two-threads threads-change",
+    "noise": "one-sample heavy-tails heavy-tailed",
+    "transport": "predicted-4-texels predicted-4096 predicted-epsilon-1 predicted-black predicted-mirror "
+    "predicted-behind-glass predicted-out-of-sight predicted-without-light predicted-light-out",
+}
+"""How the names of the extremes begin that the suite has to have."""
+
+CHEAP = [case for case in CASES if case.cheap]
+FEW = [case for group in GROUPS for case in [one for one in CHEAP if one.group == group][::3]]
+"""Of each group the first, and of every three more one; the other cheap ones are among the slow tests."""
+
+
+# ---- the registry ---------------------------------------------------------------------------------------------------
+
+
+def test_every_extreme_has_a_case() -> None:
+    assert list(WANTED) == list(GROUPS)
+    for group, beginnings in WANTED.items():
+        names = [case.name for case in CASES if case.group == group]
+        for one in beginnings.split():
+            assert any(name.startswith(one) for name in names), f"{group}: {one}"
+
+
+def test_cases_are_complete_and_have_names_of_their_own() -> None:
+    assert len({case.name for case in CASES}) == len(CASES)
+    for case in CASES:
+        assert case.group in GROUPS and case.holds.endswith(".") and case.rule, case.name
+
+
+def test_the_cheap_cases_cover_every_group() -> None:
+    assert {case.group for case in CHEAP} == set(GROUPS)
+
+
+# ---- the cases ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", only(FEW, CHEAP), ids=lambda case: case.name)
+def test_a_cheap_case_holds(case: Case) -> None:
+    row = run_case(case)
+    assert row.status == OK, row.decides
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [case for case in CASES if not case.cheap], ids=lambda case: case.name)
+def test_a_case_holds(case: Case) -> None:
+    row = run_case(case)
+    assert row.status == OK, row.decides
+
+
+# ---- rows -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("check", "ok", "text"),
+    [
+        (Check("x", 1.0, most=2.0), True, "x: 1 (expected at most 2)"),
+        (Check("x", 3.0, most=2.0), False, "x: 3 (expected at most 2)"),
+        (Check("x", 3.0, 1.0, 2.0), False, "x: 3 (expected at least 1 and at most 2)"),
+        (Check("x", math.nan, most=2.0), False, "x: nan (expected at most 2)"),
+        (Check("x", math.nan), False, "x: nan"),
+        (holds("x", False), False, "x: 0 (expected exactly 1)"),
+    ],
+)
+def test_a_check_says_what_it_wanted(check: Check, ok: bool, text: str) -> None:
+    assert check.ok is ok and str(check) == text
+
+
+def made(outcome: Outcome | Exception, name: str = "made") -> Case:
+    def find() -> Outcome:
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    return Case(name, "noise", "It holds.", "a rule", "pose", True, find)
+
+
+def test_a_row_has_what_the_design_lists() -> None:
+    outcome = Outcome((Check("a", 1.0, most=2.0), Check("b", 5.0, most=2.0)), True, 0.25, "stalled", {"c": 3.0})
+    row: Any = run_case(made(outcome)).to_dict()
+    wanted = {"case": "made", "control": "pose", "finite": True, "relative_error": 0.25, "ending": "stalled"}
+    assert {**row, **wanted} == row
+    assert (row["status"], row["rule"], row["decides"]) == (FELL_SHORT, "a rule", "b: 5 (expected at most 2)")
+    assert row["seconds"] >= 0.0 and row["measured"] == {"c": 3.0}
+
+
+def test_what_is_not_finite_falls_short_whatever_the_checks_say() -> None:
+    row = run_case(made(Outcome((Check("a", 1.0, most=2.0),), finite=False)))
+    assert (row.status, row.decides) == (FELL_SHORT, "NaN or infinite values")
+
+
+@pytest.mark.parametrize(
+    ("error", "ending", "text"),
+    [(InputError("no such light"), "refused", "no such light"), (ZeroDivisionError("by 0"), "raised", "by 0")],
+)
+def test_an_exception_is_a_finding(error: Exception, ending: str, text: str) -> None:
+    row = run_case(made(error))
+    assert row.status == FELL_SHORT and row.ending == ending and text in row.decides
+
+
+# ---- the command ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where runs are kept."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    good = made(Outcome((Check("a", 1.0, most=2.0),), relative_error=0.02, ending="found"), "good")
+    bad = replace(made(Outcome((Check("a", 3.0, most=2.0),)), "bad"), group="stiff")
+    monkeypatch.setattr(suite, "CASES", (good, bad))
+    yield
+
+
+@pytest.mark.usefixtures("two_cases")
+def test_the_command_prints_a_table_and_the_number_that_decides(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stability", "--quiet"]) == 3
+    out = capsys.readouterr().out
+    assert "bad fell short: a: 3 (expected at most 2)" in out and "1 of 2 cases hold" in out
+    assert main(["stability", "--quiet", "--case", "good"]) == 0
+    assert main(["stability", "--quiet", "--group", "stiff"]) == 3
+
+
+@pytest.mark.usefixtures("two_cases")
+def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stability", "--quiet", "--json"]) == 3
+    said = json.loads(capsys.readouterr().out)
+    assert (said["schema"], said["command"]) == (1, "stability")
+    assert [(row["case"], row["status"]) for row in said["rows"]] == [("good", OK), ("bad", FELL_SHORT)]
+
+
+def test_the_command_lists_its_cases_without_running_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stability", "--list", "--json", "--quiet"]) == 0
+    assert [one["case"] for one in json.loads(capsys.readouterr().out)["cases"]] == [case.name for case in CASES]
+
+
+def test_unknown_cases_and_groups_are_refused() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown case 'tie'\. Did you mean 'ties'"):
+        chosen(["tie"])
+    with pytest.raises(UnknownNameError, match=r"unknown group 'stif'\. Did you mean 'stiff'"):
+        chosen([], ["stif"])
+    assert {case.group for case in chosen(["ties"], ["stiff"])} == {"objective", "stiff"}
+
+
+def uncalled() -> Outcome:
+    pytest.fail("tried again")
+
+
+@pytest.mark.usefixtures("two_cases")
+def test_a_stopped_suite_goes_on_with_the_case_that_it_was_at(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`show` and `runs` know it, and the rows end up those of a suite that nobody stopped."""
+    good, bad = suite.CASES
+    assert main(["stability", "--quiet", "--json", "--run", "whole"]) == 3
+    whole = json.loads(capsys.readouterr().out)["rows"]
+    assert main(["stability", "--quiet", "--seconds", "1e-9", "--run", "short"]) == 0
+    first = kept("short")
+    assert (first.ending, [row.case for row in first.rows], first.not_run) == ("out of time", ["good"], ["bad"])
+    capsys.readouterr()
+    assert main(["show", "short"]) == 0 and "Go on with: advsearch resume short" in capsys.readouterr().out
+    monkeypatch.setattr(suite, "CASES", (replace(good, find=uncalled), bad))
+    assert main(["resume", "short", "--quiet"]) == 3
+    last = kept("short")
+    assert (last.ending, last.not_run) == ("done", [])
+    again: Any = last.to_dict()
+    assert [{**row, "seconds": 0.0} for row in again["rows"]] == [{**row, "seconds": 0.0} for row in whole]
+    capsys.readouterr()
+    assert main(["runs", "--json"]) == 0
+    listed = {one["name"]: one for one in json.loads(capsys.readouterr().out)["runs"]}
+    assert (listed["short"]["command"], listed["short"]["state"]) == ("stability", "done")
+    assert (listed["short"]["object"], listed["short"]["answer"]) == ("", "1 of 2 hold")
+
+
+def kept(name: str) -> StabilityResult:
+    """What a run keeps."""
+    result = read_result(find_run(name))
+    assert isinstance(result, StabilityResult)
+    return result
+
+
+def test_a_suite_that_was_killed_in_its_first_case_says_what_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = StabilityConfig(case="good")
+    with RunDirectory.create("killed") as run:
+        run.write_config(config)
+    assert main(["show", "killed"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("killed: stability.\n") and "Go on with: advsearch resume killed" in said
+
+
+@pytest.mark.usefixtures("two_cases")
+def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["stability", "--seconds", "1e-9", "--quiet"]) == 0
+    said = capsys.readouterr().out
+    assert "Not run\nbad" in said and said.endswith("Go on with: advsearch resume stability-001\n")
+
+    def interrupted() -> Outcome:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(suite, "CASES", (suite.CASES[0], replace(suite.CASES[1], find=interrupted)))
+    assert main(["stability", "--json"]) == 130
+    told = capsys.readouterr()
+    assert json.loads(told.out)["not_run"] == ["bad"] and len(json.loads(told.out)["rows"]) == 1
+    assert "good: ok" in told.err
+    assert main(["stability", "--seconds", "0"]) == 2
+    assert "--seconds: expected a number greater than 0 and at most 1e9, got 0" in capsys.readouterr().err
+
+
+# ---- the tools ------------------------------------------------------------------------------------------------------
+
+
+def test_the_condition_number_of_a_quadratic_is_estimated() -> None:
+    value = quadratic([0.5, 0.5], [1e6, 1.0])
+    second = hessian(lambda u: float(value(u)), torch.full((2,), 0.3).double(), torch.eye(2).double(), [0.01, 0.01])
+    assert condition_number(second) == pytest.approx(1e6, rel=1e-3)
+    assert condition_number(torch.diag(torch.tensor([1.0, 0.0]))) == math.inf
+
+
+def test_mixed_second_derivatives_are_estimated() -> None:
+    second = hessian(lambda u: float(u[0] * u[1]), torch.full((2,), 0.3).double(), torch.eye(2).double(), [0.1, 0.2])
+    assert torch.allclose(second, torch.tensor([[0.0, 1.0], [1.0, 0.0]]).double(), atol=1e-12)
+
+
+def test_median_of_means_and_clipping_ignore_one_huge_sample() -> None:
+    samples = torch.ones(24, 3)
+    samples[5] = 1e9
+    assert torch.equal(median_of_means(samples), torch.ones(3))
+    assert float((clipped_mean(samples) - 1.0).abs().max()) < 0.1
+    assert torch.equal(median_of_means(samples.expand(2, 24, 3)), torch.ones(2, 3))
+
+
+def test_a_toy_counts_its_cost_and_breaks_where_it_is_told_to() -> None:
+    toy = Toy(quadratic([0.5], [1.0]), box_domain([0.0]), broken=frozenset({3}))
+    u = torch.zeros(1)
+    assert toy(Query(u, 0, number=2, gradient=True)).finite and not toy(Query(u, 0, number=3, gradient=True)).finite
+    assert toy(Query(u, 0, number=2, samples=4)).cost == 4

@@ -1,0 +1,83 @@
+"""The distance at which a detector first sees an object."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import sweep
+from stored_sweeps import make_sweep
+
+from advsearch.attacks.trials import clopper_pearson
+from advsearch.errors import InputError
+from advsearch.report.distance import distance_of, distance_sentence, seen_from
+from advsearch.runs.results.sweep import AxisRow
+from advsearch.viewer.sweep_page import SweepSource, sweep_page_html
+
+DISTANCES = (5.0, 10.0, 20.0, 40.0, 80.0)
+
+
+def rows(correct: list[int], of: int = 20, unit: str = "metres") -> list[AxisRow]:
+    return [
+        AxisRow(axis="camera.distance", unit=unit, value=at, configurations=of, correct=k, accuracy=k / of,
+                interval=clopper_pearson(k, of))
+        for at, k in zip(DISTANCES, correct, strict=True)
+    ]  # fmt: skip
+
+
+def test_the_distance_lies_where_half_of_the_pictures_show_it() -> None:
+    found = seen_from(rows([20, 20, 15, 5, 0])[::-1])
+    assert found.distances == DISTANCES
+    assert found.distance == pytest.approx(math.sqrt(20.0 * 40.0))
+    assert (found.low, found.high) == (10.0, 80.0)
+    assert distance_sentence(found) == "Seen from 28.3 m in half of the pictures, 10 to 80 m with 95 % confidence."
+
+
+def test_a_share_that_rises_with_the_distance_is_pooled() -> None:
+    found = seen_from(rows([20, 10, 18, 2, 0]))
+    pooled = 28 / 40
+    part = (pooled - 0.5) / (pooled - 0.1)
+    assert found.distance == pytest.approx(20.0 * 2.0**part)
+
+
+@pytest.mark.parametrize(
+    ("correct", "of", "said"),
+    [
+        ([20] * 5, 20, "Seen as far as the sweep goes, 80 m, in half of the pictures; at least 80 m"),
+        ([0] * 5, 20, "Not seen in half of the pictures, even from 5 m; at most 5 m"),
+        ([1, 1, 1, 0, 0], 1, "Seen from 28.3 m in half of the pictures, no bound with"),
+    ],
+)
+def test_what_the_pictures_do_not_bound_is_left_open(correct: list[int], of: int, said: str) -> None:
+    assert distance_sentence(seen_from(rows(correct, of))).startswith(said)
+
+
+def test_the_interval_holds_as_often_as_it_says() -> None:
+    rng, true = np.random.default_rng(3), 28.0
+    held = 0
+    for _ in range(200):
+        shares = [1.0 / (1.0 + (at / true) ** 4) for at in DISTANCES]
+        found = seen_from(rows([int(rng.binomial(20, share)) for share in shares]))
+        held += (found.low or 0.0) <= true <= (found.high or math.inf)
+    assert held >= 190
+
+
+def test_only_a_detector_and_several_distances_tell() -> None:
+    told: dict[str, Any] = {"task": "detection", "axes": rows([20, 20, 15, 5, 0])}
+    assert distance_of(sweep(**told)) is not None
+    assert distance_of(sweep(**{**told, "task": "classification"})) is None
+    assert distance_of(sweep(**{**told, "model": "a.pt2, b.pt2"})) is None
+    assert distance_of(sweep(**{**told, "axes": rows([20, 20, 15, 5, 0])[:1]})) is None
+    with pytest.raises(InputError, match="expected at least two distances, got 1"):
+        seen_from(rows([20, 20, 15, 5, 0])[:1])
+
+
+def test_the_page_of_a_sweep_has_the_curve(tmp_path: Any) -> None:
+    run = make_sweep(tmp_path / "s")
+    told = sweep(task="detection", axes=rows([20, 20, 15, 5, 0]))
+    page = sweep_page_html([(run, told)], [SweepSource("s", None)])
+    assert re.search(r"<h2>How far away it is seen</h2>\s*<p>Seen from 28.3 m", page)
+    assert page.count("<svg") >= 2

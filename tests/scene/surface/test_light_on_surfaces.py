@@ -1,0 +1,236 @@
+"""Pictures from light that is kept on surfaces, beside traced ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.engine.loading import Scene, load_scene
+from advsearch.scene.mitsuba_backend.lobes import measured
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.surface import arrangement, renderer, texels
+from advsearch.scene.surface.plan import why_not
+from advsearch.scene.surface.renderer import SurfaceRenderer
+
+SIDE = 32
+VARYING = ["camera", "environment"]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def coarse() -> Iterator[None]:
+    """Few texels and rays, which are quick."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(texels, "GROUND", 32)
+        for name, value in {"SIDE": 48, "GATHERED": 100}.items():
+            patched.setattr(arrangement, name, value)
+        yield
+
+
+def renderer_of(scene: Scene, side: int | tuple[int, int] = SIDE, texture: int = 16) -> Renderer:
+    """Render its texture, camera and environment."""
+    controls: Mapping[str, object] = {"texture": {"resolution": texture}, "camera": {}, "environment": {}}
+    return scene.renderer(controls, resolution=side)
+
+
+@pytest.fixture(scope="module")
+def traced() -> Renderer:
+    """The bundled mug."""
+    return renderer_of(load_scene("mug"))
+
+
+@pytest.fixture(scope="module")
+def light(traced: Renderer) -> SurfaceRenderer:
+    """Its light."""
+    return SurfaceRenderer(traced, traced.start, seed=0)
+
+
+def drawn(of: Renderer, number: int) -> Tensor:
+    """A configuration with another camera and another light."""
+    u = of.start.clone()
+    noise = torch.rand(len(u), generator=torch.Generator().manual_seed(number))
+    for group in of.space.groups:
+        if group.control in VARYING:
+            u[group.coordinates] = noise[group.coordinates]
+    return u
+
+
+def set_to(of: Renderer, value: float, **numbers: float) -> Tensor:
+    """The start with an even texture, and some numbers of the camera's range."""
+    u = of.start.clone()
+    for group in of.space.groups:
+        if group.control == "texture":
+            u[group.coordinates] = value
+        elif group.name.partition(".")[2] in numbers:
+            u[group.coordinates] = numbers[group.name.partition(".")[2]]
+    return u
+
+
+def levels(one: Tensor, other: Tensor) -> float:
+    """Root mean square difference in levels of 255."""
+    return 255.0 * float(((one - other) ** 2).mean().sqrt())
+
+
+def test_pictures_are_those_that_are_traced(traced: Renderer, light: SurfaceRenderer) -> None:
+    """From other cameras and under other lights, about as near as rendered ones of 8 samples."""
+    with torch.no_grad():
+        for number in range(3):
+            u = drawn(traced, number)
+            truth = traced(u, seed=1, spp=256)
+            assert levels(light(u), truth) < 1.3 * levels(traced(u, seed=2, spp=8), truth) + 0.5
+
+
+def test_pictures_of_several_cameras_at_once_are_those_of_each(light: SurfaceRenderer) -> None:
+    """Two of them under one light, one under another."""
+    first, second = drawn(light, 0), drawn(light, 1)
+    third = second.clone()
+    for group in light.space.groups:
+        if group.control == "environment":
+            third[group.coordinates] = first[group.coordinates]
+    wholes = [first, second, third]
+    with torch.no_grad():
+        inputs = [light.scene.assembly(light.space.inputs(one)) for one in wholes]
+        together = light.pictures(inputs, light.color(inputs[0]), wholes)
+        assert torch.equal(together, torch.stack([light(one) for one in wholes]))
+
+
+def test_pictures_stay_when_the_scene_had_a_map_of_another_size(traced: Renderer, light: SurfaceRenderer) -> None:
+    """What is recorded goes on with the size of the picture."""
+    with torch.no_grad():
+        before = light(traced.start)
+        traced.scene.held({"environment.padded": torch.rand(31, 64, 3)})
+        assert torch.equal(light(traced.start), before)
+
+
+def test_the_derivative_is_that_of_differences(traced: Renderer) -> None:
+    """Of radiance in the texture, in which it is linear but for the curve between both."""
+    linear = SurfaceRenderer(traced.like(transfer="linear"), traced.start, seed=0)
+    u = set_to(traced, 0.5).requires_grad_()
+    generator = torch.Generator().manual_seed(3)
+    weights = torch.rand(SIDE, SIDE, 3, generator=generator) - 0.5
+    way = torch.zeros(len(u))
+    texture = next(group for group in traced.space.groups if group.control == "texture")
+    way[texture.coordinates] = torch.rand(texture.size, generator=generator) - 0.5
+    (found,) = torch.autograd.grad((linear(u) * weights).sum(), u)
+    with torch.no_grad():
+        ends = [(linear(u + sign * 1e-2 * way).double() * weights).sum() for sign in (1.0, -1.0)]
+    assert float(found @ way) == pytest.approx(float(ends[0] - ends[1]) / 2e-2, rel=2e-3)
+
+
+@pytest.mark.parametrize("size", [(24, 40), (40, 24)])
+def test_rays_go_where_those_of_the_camera_do(size: tuple[int, int]) -> None:
+    """Surfaces are where Mitsuba's own camera sees them, with a shifted picture of any shape and another lens."""
+    scene = load_scene("mug", settings={"ground.size": 1.0})
+    camera = {"shift_x": 0.2, "shift_y": -0.1, "fov": 50.0, "roll": 20.0, "azimuth": [0, 360]}
+    of = scene.renderer({"camera": camera}, resolution=size)
+    made = SurfaceRenderer(of, of.start, seed=0)
+    inputs = of.scene.assembly(of.space.inputs(of.start))
+    cameras = [{name: inputs.get(name, of.scene.base(name)) for name in arrangement.CAMERAS}]
+    covered = made.arrangement.seen(cameras, made.light(inputs)).covered[0, ..., 0]
+    same = (covered > 0.5) == (of.surfaces(of.start).id > 0)
+    assert 0.1 < float((covered > 0.5).float().mean()) < 0.9
+    assert float(same.float().mean()) > 0.97
+
+
+def test_what_is_seen_of_a_photographed_room_is_its_map() -> None:
+    """A photographed ground shows the photograph, and where a ray escapes there is the map."""
+    scene = load_scene("ball", "kitchen", settings={"ground.kind": "photograph"})
+    of = scene.renderer({"camera": {"azimuth": [0, 360], "elevation": [5, 60]}}, resolution=SIDE)
+    made, u = SurfaceRenderer(of, of.start, seed=0), torch.tensor([0.4, 0.1])
+    with torch.no_grad():
+        truth = of(u, seed=1, spp=256)
+        away = ~of.mask(u)
+        assert levels(made(u)[away], truth[away]) < 8.0
+
+
+STRANGE = {
+    "inside": {"distance": 0.0, "elevation": 1.0},
+    "close": {"distance": 0.02, "elevation": 0.0},
+    "far": {"distance": 1.0},
+}
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+@pytest.mark.parametrize("place", STRANGE)
+def test_strange_views_have_finite_pictures_and_derivatives(value: float, place: str) -> None:
+    """A camera inside of the mug, one at its surface and one far off, under a black and a white map of light."""
+    scene = load_scene("mug")
+    camera = {"distance": [0.05, 40.0], "elevation": [0.0, 89.0], "azimuth": [0, 360]}
+    controls = {"texture": {"resolution": 2}, "camera": camera, "environment": {"exposure": [-10, 6]}}
+    of = scene.renderer(controls, resolution=16)
+    made = SurfaceRenderer(of, of.start, seed=0)
+    u = set_to(of, value, exposure=value, **STRANGE[place]).requires_grad_()
+    picture = made(u)
+    (found,) = torch.autograd.grad(picture.sum(), u)
+    assert bool(torch.isfinite(picture).all()) and bool(torch.isfinite(found).all())
+    assert 0.0 <= float(picture.detach().min()) and float(picture.detach().max()) <= 1.0
+
+
+def test_an_object_out_of_sight_has_no_derivative() -> None:
+    """Its texels are in no picture; the environment is."""
+    of = renderer_of(load_scene("ball"))
+    made = SurfaceRenderer(of, of.start, seed=0)
+    inputs = of.scene.assembly(of.space.inputs(of.start))
+    matrix = inputs.get("camera.to_world", of.scene.base("camera.to_world")).clone()
+    matrix[:3, 0], matrix[:3, 2] = -matrix[:3, 0], -matrix[:3, 2]
+    color = torch.full((16, 16, 3), 0.5, requires_grad=True)
+    picture = made.pictures([{**inputs, "camera.to_world": matrix}], color, [of.start])
+    (found,) = torch.autograd.grad(picture.sum(), color)
+    assert not bool(found.any()) and float(picture.detach().mean()) > 0.0
+
+
+def test_lights_make_room(traced: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest one goes where there is no memory, and is found again when it is wanted."""
+    made = SurfaceRenderer(traced, traced.start, seed=0)
+    with torch.no_grad():
+        before = made(drawn(traced, 0))
+        monkeypatch.setattr(renderer, "MOST_BYTES", made.bytes + 1000)
+        made(drawn(traced, 1))
+        assert made.dropped == 1
+        assert torch.equal(made(drawn(traced, 0)), before) and made.dropped == 2
+
+
+def test_light_between_surfaces_follows_the_texture_when_it_is_renewed(traced: Renderer) -> None:
+    """A black mug sends nothing to its inside."""
+    made, black = SurfaceRenderer(traced, traced.start, seed=0), set_to(traced, 0.0)
+    white = set_to(traced, 1.0)
+    with torch.no_grad():
+        before = made(white).mean()
+        made.renew(black)
+        after = made(white).mean()
+    assert float(after) < float(before)
+
+
+def test_a_surface_is_measured() -> None:
+    """The bundled mug reflects more at grazing angles, in a lobe about the mirrored direction; a mirror all of it."""
+    shares = {}
+    for roughness, metallic in ((0.3, 0.0), (0.05, 1.0)):
+        scene = load_scene("ball", settings={"material.roughness": roughness, "material.metallic": metallic})
+        of = scene.renderer("texture", resolution=8)
+        made = SurfaceRenderer(of, of.start, seed=0).arrangement
+        lobes = measured(of.scene, {}, made.texels.grids[0], made.texels.places[9], made.texels.normals[9])
+        shares[metallic] = lobes
+    mug, mirror = shares[0.0], shares[1.0]
+    assert mug.diffuse[-1] == pytest.approx(1.0, abs=0.05)
+    assert mug.gloss[0] > 3.0 * mug.gloss[-1]
+    middle = (np.arange(len(mug.up)) + 0.5) / len(mug.up)
+    assert np.abs(mirror.up[8:] - middle[8:]).max() < 0.2
+
+
+def test_what_it_cannot_predict_has_a_reason() -> None:
+    """In words, before anything is measured."""
+    mug = load_scene("mug")
+    assert why_not(renderer_of(mug), VARYING) is None
+    assert (
+        why_not(mug.renderer({"environment": {"exposure": [0, 1]}}, resolution=8), ["environment"])
+        == "no camera varies"
+    )
+    assert "vertices" in str(why_not(mug.renderer({"pose": {"yaw": [0, 9]}}, resolution=8), ["pose"]))
+    lit = mug.renderer({"texture": {"resolution": 2}, "light": {"power": [0, 9]}}, resolution=8)
+    assert "more in the scene" in str(why_not(lit, ["light"]))
+    assert "pose.yaw" in str(why_not(mug.renderer({"pose": {"yaw": [0, 9]}}, resolution=8), []))
+    undenoised = mug.renderer({"camera": {"azimuth": [0, 9]}}, resolution=8, denoise="none")
+    assert "denoiser" in str(why_not(undenoised, ["camera"]))

@@ -1,0 +1,326 @@
+"""Cameras with a lens of their own: against OpenCV, from files, inside Mitsuba, and as part of the camera control."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import advsearch
+from advsearch.engine.loading import Scene, framed
+from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.cameras.files import read_camera
+from advsearch.scene.cameras.model import NUMBERS, CameraModel, bundled, pinhole
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.renderer import LinearRenderer
+
+HERE = Path(__file__).parent
+TABLE: dict[str, Any] = json.loads((HERE / "camera_reference.json").read_text("utf-8"))
+WIDTH, HEIGHT = TABLE["width"], TABLE["height"]
+PIXELS = torch.tensor([WIDTH, HEIGHT])
+HUNDREDTH = 0.01
+STILL: dict[str, object] = {"pose": {"yaw": [0, 1]}}
+
+FOLDING = "k1=-0.6"
+LENSES = {
+    "pinhole": pinhole(60.0, 1.0),
+    "barrel": pinhole(60.0, 1.0).with_numbers(torch.tensor([0.8, 0.9, 0.5, 0.45, 0.02, -0.28, 0.07, 0.01, *[0.0] * 9])),
+    "decentred": pinhole(60.0, 1.0).with_numbers(
+        torch.tensor([0.6, 0.8, 0.51, 0.48, 0.01, 1.2, 0.7, 0.1, 1.5, 0.9, 0.2, 0.003, 0.001, 0.01, -0.02, 0.005, 0.01])
+    ),
+    FOLDING: pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11])),
+    **bundled(),
+}
+
+
+def ros(model: str, coefficients: list[float], matrix: list[float] | None = None, width: int = WIDTH) -> str:
+    return (
+        f"image_width: {width}\nimage_height: {HEIGHT}\ncamera_name: front\ndistortion_model: {model}\n"
+        f"camera_matrix: {{rows: 3, cols: 3, data: {matrix or TABLE['matrix']}}}\n"
+        f"distortion_coefficients: {{rows: 1, cols: {len(coefficients)}, data: {coefficients}}}\n"
+    )
+
+
+def pixels(model: CameraModel, points: Tensor) -> Tensor:
+    """Where points are seen, from the centre of the first pixel, as OpenCV counts."""
+    places, seen = model.project(points)
+    assert bool(seen.all())
+    return places * PIXELS - 0.5
+
+
+def grid(side: int = 33) -> Tensor:
+    along = torch.linspace(0.0, 1.0, side, dtype=torch.float64)
+    return torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1).reshape(-1, 2)
+
+
+# ---- against OpenCV -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", list(TABLE["lenses"]))
+def test_points_are_seen_where_opencv_sees_them(model: str, tmp_path: Path) -> None:
+    lens = TABLE["lenses"][model]
+    (tmp_path / "camera.yaml").write_text(ros(model, lens["coefficients"]))
+    ours = pixels(read_camera(str(tmp_path / "camera.yaml")), torch.tensor(TABLE["points"], dtype=torch.float64))
+    assert float((ours - torch.tensor(lens["pixels"], dtype=torch.float64)).norm(dim=1).max()) < HUNDREDTH
+
+
+@pytest.fixture
+def reference() -> ModuleType:
+    path = HERE.parent.parent / "tools" / "camera_reference.py"
+    spec = importlib.util.spec_from_file_location("camera_reference", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("model", list(TABLE["lenses"]))
+def test_opencv_itself_agrees(model: str, tmp_path: Path, reference: ModuleType) -> None:
+    cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed; the table stands for it")
+    rng = np.random.default_rng(7)
+    points = np.concatenate([rng.uniform(-0.6, 0.6, (200, 2)), np.ones((200, 1))], axis=1) * rng.uniform(1, 9, (200, 1))
+    coefficients = reference.LENSES[model]
+    (tmp_path / "camera.yaml").write_text(ros(model, list(coefficients)))
+    ours = pixels(read_camera(str(tmp_path / "camera.yaml")), torch.from_numpy(points))
+    theirs = torch.from_numpy(reference.projected(cv2, model, coefficients, points))
+    assert float((ours - theirs).norm(dim=1).max()) < HUNDREDTH
+
+
+@pytest.mark.parametrize("name", [name for name in LENSES if name != "equirectangular"])
+def test_a_ray_is_seen_in_the_place_that_it_comes_from(name: str) -> None:
+    directions, inside = LENSES[name].rays(grid())
+    places, seen = LENSES[name].project(3.0 * directions)
+    assert bool(seen[inside > 0.0].all())
+    assert float((places - grid())[inside > 0.0].abs().max()) < 1e-7
+    assert bool((inside > 0.0).any())
+
+
+def test_a_panorama_has_what_is_ahead_in_its_middle_and_the_zenith_on_top() -> None:
+    places, _ = bundled()["equirectangular"].project(torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, -1, 0], [-1, 0, -1e-9]]))
+    torch.testing.assert_close(
+        places, torch.tensor([[0.5, 0.5], [0.75, 0.5], [0.5, 0.0], [0.25, 0.5]]).double(), atol=1e-6, rtol=0
+    )
+
+
+def test_a_lens_that_folds_says_at_which_angle_and_is_black_beyond() -> None:
+    lens = LENSES[FOLDING]
+    assert math.isclose(math.degrees(lens.fold), math.degrees(math.atan(math.sqrt(1.0 / 1.8))), rel_tol=1e-6)
+    (note,) = lens.notes
+    assert "folds at 36.7 degrees" in note
+    _, inside = lens.rays(torch.tensor([[0.5, 0.5], [0.0, 0.0]], dtype=torch.float64))
+    assert inside[0] > 0.0 > inside[1]
+
+
+# ---- files ----------------------------------------------------------------------------------------------------------
+
+K = [-0.28, 0.07, 0.001, -0.002]
+FILES = {
+    "opencv.yaml": (
+        "%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
+        "   dt: d\n   data: [ 9.025e+02, 0., 6.4525e+02, 0., 911.75, 352.5, 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        "   data: [ -2.8e-01, 7.0e-02, 1e-3, -2.0e-03, 0. ]\n"
+    ),
+    "camchain.yaml#cam1": (
+        "cam0:\n  camera_model: pinhole\n  intrinsics: [1, 1, 1, 1]\n  resolution: [4, 4]\n"
+        f"cam1:\n  camera_model: pinhole\n  distortion_model: radtan\n  distortion_coeffs: {K}\n"
+        "  intrinsics: [902.5, 911.75, 645.25, 352.5]\n  resolution: [1280, 720]\n"
+    ),
+    "info.yaml": ros("plumb_bob", [*K, 0.0]),
+    "echo.yaml": (
+        f"height: 720\nwidth: 1280\ndistortion_model: plumb_bob\nd: {[*K, 0.0]}\nk: {TABLE['matrix']}\n---\nheight: 1\n"
+    ),
+    "cameras.txt#3": (
+        "# Camera list with one line of data per camera:\n1 SIMPLE_PINHOLE 640 480 500 320 240\n"
+        "3 OPENCV 1280 720 902.5 911.75 645.75 353.0 -0.28 0.07 0.001 -0.002\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(FILES))
+def test_one_camera_in_each_kind_of_file_is_the_same(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.with_name(name.partition("#")[0]).write_text(FILES[name])
+    found = read_camera(str(path))
+    wanted = {"fx": 902.5 / 1280, "fy": 911.75 / 720, "cx": 645.75 / 1280, "cy": 353.0 / 720}
+    wanted |= dict(zip(("k1", "k2", "p1", "p2"), K, strict=True))
+    assert found.kind == "brown-conrady" and found.size == (720, 1280)
+    assert found.values == pytest.approx({**dict.fromkeys(NUMBERS, 0.0), **wanted})
+
+
+@pytest.mark.parametrize(
+    ("line", "kind", "numbers"),
+    [
+        ("SIMPLE_RADIAL_FISHEYE 100 50 40 50 25 0.02", "fisheye", {"fx": 0.4, "fy": 0.8, "k1": 0.02}),
+        ("OPENCV_FISHEYE 100 50 40 41 50 25 1 2 3 4", "fisheye", {"fy": 0.82, "k4": 4.0}),
+        (
+            "FULL_OPENCV 100 50 40 41 50 25 1 2 5 6 3 7 8 9",
+            "brown-conrady",
+            {"k3": 3.0, "k4": 7.0, "p1": 5.0, "k6": 9.0},
+        ),
+        ("EQUIRECTANGULAR 100 50 100 50", "equirectangular", {}),
+    ],
+)
+def test_models_of_colmap(line: str, kind: str, numbers: dict[str, float], tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text(f"1 {line}\n")
+    found = read_camera(str(tmp_path / "cameras.txt"))
+    assert found.kind == kind
+    assert {name: found.values[name] for name in numbers} == pytest.approx(numbers)
+
+
+GOOD = ros("plumb_bob", K)
+HOSTILE = {
+    "empty": ("", "an empty file"),
+    "no mapping": ("- 1\n- 2\n", "a list"),
+    "a tag": ("camera_matrix: !!python/object:os.system []\n", "tag"),
+    "bytes": ("\x00\x01", "correct the file"),
+    "no matrix": ("image_width: 4\nimage_height: 4\n", "expected camera_matrix"),
+    "no size": (GOOD.replace("image_height: 720\n", ""), "expected image_height"),
+    "nan": (ros("plumb_bob", [math.nan, 0, 0, 0]), "finite number"),
+    "infinite": (GOOD.replace("902.5", ".inf"), "finite number"),
+    "huge": (ros("plumb_bob", [1e300, 0, 0, 0]), "k1: expected a coefficient"),
+    "a huge picture": (ros("plumb_bob", K, width=10**9), "from 1 to 65536 pixels"),
+    "no focal length": (GOOD.replace("902.5", "0.0"), "fx: expected a focal length"),
+    "a point outside": (GOOD.replace("645.25", "-3.0"), "cx: expected a principal point"),
+    "three coefficients": (ros("plumb_bob", [1, 2, 3]), "numbers, got 3"),
+    "a tilt": (ros("", [0.0] * 12 + [0.1, 0.0]), "tilt"),
+    "another projection of ROS": (ros("double_sphere", K), "got 'double_sphere'"),
+    "another projection of Kalibr": ("cam0: {camera_model: omni, intrinsics: [1, 2, 3, 4, 5]}\n", "got omni"),
+    "another projection of COLMAP": ("1 THIN_PRISM_FISHEYE 9 9 1 1 1 1 0 0 0 0 0 0 0 0\n", "got THIN_PRISM_FISHEYE"),
+    "a short line": ("1 PINHOLE 9 9 1 1\n", "expected width height fx fy cx cy"),
+    "several": ("1 SIMPLE_PINHOLE 9 9 9 4 4\n2 SIMPLE_PINHOLE 9 9 9 4 4\n", "has 2 cameras, 1, 2: say which"),
+    "no numbers": (GOOD.replace("902.5", "[]"), "numbers, got"),
+}
+
+
+@pytest.mark.parametrize("what", list(HOSTILE))
+def test_a_file_that_is_no_camera_is_refused_in_a_sentence(what: str, tmp_path: Path) -> None:
+    text, words = HOSTILE[what]
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(FileFormatError) as caught:
+        read_camera(str(path))
+    said = str(caught.value)
+    assert words in said and str(path) in said and "\n" not in said and len(said) < 700
+
+
+# ---- inside Mitsuba -------------------------------------------------------------------------------------------------
+
+
+def scene_with(model: CameraModel) -> Scene:
+    """The mug through a lens that no file has."""
+    return Scene(replace(advsearch.load_scene("mug").description, camera_model=replace(model, name="test")))
+
+
+def rays_of(scene: MitsubaScene, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Directions of Mitsuba's rays in the camera's coordinates, and which of them see something."""
+    import mitsuba as mi
+
+    sensor = scene.held({}).sensors()[0]
+    columns = mi.Point2f(places.T.float().contiguous().numpy())
+    ray, weight = sensor.sample_ray(0.0, 0.5, columns, mi.Point2f(0.5))
+    local = sensor.world_transform().inverse() @ ray.d
+    directions = torch.stack([one.torch() for one in local], dim=1).cpu().double()
+    return directions * torch.tensor([-1.0, -1.0, 1.0]), weight.x.torch().cpu() > 0.0
+
+
+@pytest.mark.parametrize("name", ["barrel", "decentred", "fisheye"])
+def test_rays_inside_mitsuba_are_those_of_the_model(name: str) -> None:
+    side, model = 64, LENSES[name]
+    places = torch.rand(2000, 2, generator=torch.Generator().manual_seed(3))
+    directions, seen = rays_of(MitsubaScene(scene_with(model).description, (side, side)), places)
+    found, _ = model.project(directions)
+    off = side * (found - places.double()).norm(dim=1)[seen]
+    assert float(off.quantile(0.99)) < HUNDREDTH
+    assert torch.equal(seen, model.rays(places)[1] > 0.0)
+
+
+@pytest.fixture(scope="module")
+def through_fisheye() -> Renderer:
+    scene = advsearch.load_scene("mug", camera="fisheye")
+    return scene.renderer({"texture": {"resolution": 32}}, resolution=32)
+
+
+def test_the_object_is_seen_where_the_model_projects_it(through_fisheye: Renderer) -> None:
+    """The mask, and with it the box that a detector should find."""
+    rows, columns = torch.nonzero(through_fisheye.mask(through_fisheye.start), as_tuple=True)
+    description = through_fisheye.scene.made[0]
+    pose = torch.from_numpy(camera_to_world(description))
+    vertices = torch.from_numpy(description.base_vertices)
+    points = (vertices - pose[:3, 3]) @ pose[:3, :3] * torch.tensor([-1.0, -1.0, 1.0])
+    places, _ = bundled()["fisheye"].project(points)
+    low, high = 32 * places.amin(dim=0), 32 * places.amax(dim=0)
+    seen = torch.stack([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).double()
+    assert float((seen - torch.cat([low, high])).abs().max()) < 1.0
+
+
+def test_outside_the_circle_all_is_black_in_pictures_guides_and_predictions(through_fisheye: Renderer) -> None:
+    u, corner = through_fisheye.start, (slice(0, 4), slice(0, 4))
+    with torch.no_grad():
+        traced = through_fisheye.radiance(u, 1, 16)
+        predicted = LinearRenderer(through_fisheye, u, seed=1).radiance(u)
+    albedo, normal = through_fisheye.scene.guides({}, 0, 4)
+    for picture in (through_fisheye.scene.radiance({}, 1, 4), albedo, normal):
+        assert float(picture[corner].abs().max()) == 0.0
+    for picture in (traced, predicted):
+        assert float(picture[corner].abs().max()) < 1e-3, "the denoiser leaves a little"
+    assert float(traced[16, 16].mean()) > 0.05
+    assert not bool((through_fisheye.surfaces(u).id[corner] > 0).any())
+    off = (predicted - traced).abs().mean() / traced.abs().mean()
+    assert float(off) < 0.1, "the predicted picture is seen along the same rays"
+
+
+def test_a_searched_lens_is_the_fixed_one_and_has_a_derivative() -> None:
+    scene = advsearch.load_scene("mug")
+    searched = scene.renderer({"camera": {"k1": [-0.4, 0.4], "fov": 60}}, resolution=24, denoise="none")
+    fixed = scene.renderer({"camera": {"k1": -0.2, "fov": 60}, **STILL}, resolution=24, denoise="none")
+    with torch.no_grad():
+        bent, straight = searched([0.25], 3, 16), searched([0.5], 3, 16)
+        assert float((bent - fixed(fixed.start, 3, 16)).abs().max()) < 1e-4
+        assert float((bent - straight).abs().mean()) > 0.003
+    u = torch.tensor([0.25], requires_grad=True)
+    searched(u, 3, 16).mean().backward()
+    assert u.grad is not None and float(u.grad.abs()) > 0.0
+
+
+# ---- as users name it -----------------------------------------------------------------------------------------------
+
+
+def test_a_picture_of_another_size_is_scaled_and_said(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(GOOD)
+    notes = framed(advsearch.load_scene("mug", camera=str(path)).description, 16).notes
+    assert any("is for 1280 x 720 pixels" in one and "scaled to 16 x 16" in one for one in notes)
+
+
+@pytest.mark.parametrize(
+    ("camera", "settings", "control", "words"),
+    [
+        ("fisheye", {"camera.fov": 90.0}, {}, "camera.fov contradict"),
+        ("fisheye", {}, {"fov": [30, 60]}, "fov is not supported with the lens of `camera=fisheye`"),
+        ("fisheye", {}, {"k5": 0.1}, "has the coefficients k1, k2, k3, k4, not k5"),
+        ("equirectangular", {}, {"shift_x": 0.1}, "shift_x is not supported"),
+        (None, {}, {"k1": 0.1, "aperture": 0.1}, "aperture is not supported with a lens with distortion"),
+        ("fish", {}, {}, "unknown camera 'fish'"),
+        ("no.yaml", {}, {}, "No such file"),
+        (None, {"camera.fov": 60.0}, {"k1": -1.5}, "background: it would show where the camera's lens sees nothing"),
+    ],
+)
+def test_what_contradicts_a_lens_is_refused(
+    camera: str | None, settings: dict[str, float], control: dict[str, object], words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        advsearch.load_scene("mug", camera=camera, settings=settings).renderer(
+            {"camera": control, **({"background": {}} if "background" in words else STILL)}, resolution=16
+        )

@@ -1,0 +1,108 @@
+"""The road under things of the street, what distances mean for what has a size, and surfaces of several materials."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from advsearch.controls.background import BackgroundControl
+from advsearch.controls.camera import CameraControl
+from advsearch.controls.texture import TextureControl
+from advsearch.engine.loading import Scene, load_scene
+from advsearch.errors import InputError
+from advsearch.scene.description import describe
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.road import ROAD, paved, reflectance
+from advsearch.scene.surface_map import texels_of_faces
+
+SIZE = 16
+
+
+def picture(scene: Scene) -> torch.Tensor:
+    renderer = scene.renderer({"pose": {"yaw": [0, 90]}}, resolution=SIZE, denoise="none")
+    return renderer(renderer.start, 0, 16)
+
+
+def test_a_street_brings_its_road_and_a_table_takes_its_place() -> None:
+    street = load_scene("car", "street")
+    assert paved(street.description)
+    assert not paved(load_scene("car", "noon").description)
+    for given in ({"ground.kind": "table"}, {"ground.size": 2.0}, {"ground.size": 0.0}, {"ground.red": 0.5}):
+        assert not paved(street.with_settings(given).description), given
+        assert not paved(describe("car", "street", given=given)), given
+    assert paved(load_scene("mug", "noon", settings={"ground.kind": "road"}).description)
+    with pytest.raises(InputError, match=r"ground.kind=wet-road and `set` ground.red contradict each other"):
+        describe("car", "street", given={"ground.kind": "wet-road", "ground.red": 0.5})
+
+
+def test_another_environment_brings_its_own_ground() -> None:
+    street, wet = (load_scene("car", name) for name in ("street", "street-wet"))
+    lit = street.lit_by(wet.description.environment)
+    dry, damp = (one.description.around[ROAD] for one in (street, lit))
+    assert damp.material.roughness < dry.material.roughness
+    assert damp.base_color.mean() < dry.base_color.mean()
+    assert not paved(street.lit_by(load_scene("mug", "noon").description.environment).description)
+
+
+def test_a_road_has_its_size_in_metres_whatever_stands_on_it() -> None:
+    car, sign = (load_scene(name, "street").description for name in ("car", "stop-sign"))
+    extents = [np.ptp(one.around[ROAD].mesh.vertices, axis=0) * one.metres for one in (car, sign)]
+    np.testing.assert_allclose(extents[0], extents[1], rtol=1e-5)
+    assert extents[0][0] == pytest.approx(120.0)
+    lane, line, pavement = reflectance(np.array([4.0, 1.0, 0.3]), np.array([0.0, 1.75, -4.2]))
+    assert lane.max() < 0.12 < pavement.max() < line.max()
+
+
+def test_the_road_is_seen_and_hidden() -> None:
+    street = load_scene("car", "street", settings={"camera.elevation": 30.0})
+    with_road, without = picture(street), picture(street.with_settings({"ground.size": 0.0}))
+    assert float((with_road - without).abs().mean()) > 0.01
+    assert not paved(BackgroundControl(ground="hide").prepare(street.description))
+    assert paved(BackgroundControl(ground="keep").prepare(street.description))
+
+
+@pytest.mark.parametrize(("name", "metres"), [("car", 4.3), ("mug", 1.0)])
+def test_distances_are_in_metres_where_the_object_has_a_size(name: str, metres: float) -> None:
+    scene = describe(name, given={"camera.distance": 10.0})
+    middle = (scene.object.mesh.vertices.min(axis=0) + scene.object.mesh.vertices.max(axis=0)) / 2.0
+    away = float(np.linalg.norm(camera_to_world(scene)[:3, 3] - middle))
+    assert away == pytest.approx(10.0 / metres, rel=0.01)
+    bound = CameraControl(distance=[10.0, 30.0], azimuth=[0, 90]).bind(describe(name))
+    u = torch.tensor([0.0] * len(bound.start))
+    said = bound.describe(u)["camera.distance"]
+    assert said == {"value": pytest.approx(10.0), "unit": "metres" if name == "car" else "object sizes"}
+    place = bound.inputs(u)["camera.to_world"][:3, 3].numpy()
+    assert float(np.linalg.norm(place - middle)) == pytest.approx(10.0 / metres, rel=0.01)
+
+
+def test_what_is_not_said_of_the_distance_follows_the_object_in_its_unit() -> None:
+    control = CameraControl()
+    (distance,) = (one for one in control.own if one.name == "distance")
+    scene = describe("car")
+    fitted = control.default(scene, distance)
+    low, high = control.search_range(scene, distance) or (0.0, 0.0)
+    assert (low, high) == pytest.approx((0.8 * float(fitted), 1.5 * float(fitted)))
+    assert float(fitted) > 5.0  # metres
+
+
+def test_an_object_of_several_materials_keeps_its_finishes() -> None:
+    car = load_scene("car", "street").description
+    assert car.object.surface is not None
+    rough = car.object.surface["bsdf"]["roughness"]["bitmap"]  # type: ignore[index]
+    values = {round(float(one), 3) for one in np.unique(rough)}
+    assert values == {round(one.roughness, 3) for one in car.object.finishes.values()}
+    with pytest.raises(InputError, match=r"material.roughness: the object has several materials"):
+        describe("car", given={"material.roughness": 0.1})
+
+
+def test_only_the_paint_is_painted() -> None:
+    scene = describe("car")
+    bound = TextureControl(materials="paint", epsilon=0.3).bind(scene)
+    before, after = (bound.inputs(u)["object.base_color"] for u in (bound.start, (bound.start + 0.3).clamp(0.0, 1.0)))
+    moved = ((after - before).abs().amax(dim=2) > 0.01).numpy()
+    mesh, shape = scene.object.mesh, (moved.shape[0], moved.shape[1])
+    paint, _ = texels_of_faces(mesh, mesh.materials["paint"], shape)
+    glass, _ = texels_of_faces(mesh, mesh.materials["glass"], shape)
+    assert moved[paint].mean() > 0.99
+    assert not moved[glass].any()
