@@ -70,8 +70,13 @@ DRIVE: dict[str, Any] = {"controls": {"path": {"seconds": 4.0, "reach": 5.0}}, "
 
 @pytest.mark.parametrize(
     ("frames", "right", "gap", "flicker", "first"),
-    [("00110", 0.4, 2.0, 0.5, 3.0), ("11111", 1.0, 0.0, 0.0, 5.0), ("00000", 0.0, 5.0, 0.0, None)]
-    + [("10001", 0.4, 3.0, 0.5, 5.0), ("01010", 0.4, 1.0, 1.0, 4.0)],
+    [
+        ("00110", 0.4, 2.0, 0.5, 3.0),
+        ("11111", 1.0, 0.0, 0.0, 5.0),
+        ("00000", 0.0, 5.0, 0.0, None),
+        ("10001", 0.4, 3.0, 0.5, 5.0),
+        ("01010", 0.4, 1.0, 1.0, 4.0),
+    ],
 )
 def test_rates_of_one_drive_are_those_worked_out_by_hand(
     frames: str, right: float, gap: float, flicker: float, first: float | None, monkeypatch: pytest.MonkeyPatch
@@ -185,10 +190,10 @@ def test_an_attack_over_a_path_keeps_its_answer_along_the_drive(tmp_path: Path) 
         "draws": 1,
     }
     model = advsearch.load_model(Dark(), labels=("mug", "vase"), input_size=16, name="dark")
+    over = {"path": {"seconds": 5.0, "reach": 1.5}}
     found = advsearch.attack(
-        "mug", model, controls="texture", over={"path": {"seconds": 5.0, "reach": 1.5}}, path="approach", run=path, baseline=False,
-        denoise="none", **size,
-    ).summary  # fmt: skip
+        "mug", model, controls="texture", over=over, path="approach", run=path, baseline=False, denoise="none", **size
+    ).summary
     assert found.drive is not None and found.adversarial is not None
     assert (found.drive.frames, found.drive.seconds, found.drive.clean) == (24, 5.0, 24)
     assert found.drive.answer is not None and 0 <= found.drive.answer <= 24
