@@ -30,13 +30,13 @@ from advsearch.cluster.executor import InProcess
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
+from advsearch.questions.report.claims import claims_of
 from advsearch.questions.test import claims, machines
 from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
 from advsearch.questions.test.carry_out import test_from_config as carry_out
 from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
 from advsearch.questions.test.settings import SuiteConfig
-from advsearch.report.evidence import claims_of
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
