@@ -179,7 +179,7 @@ def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
 
 def test_an_attack_over_a_path_keeps_its_answer_along_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    size = {
+    size: dict[str, Any] = {
         "resolution": 16,
         "spp": 1,
         "verify_spp": 1,
