@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -25,7 +26,7 @@ def scene() -> SceneDescription:
     return describe("mug", given={"camera.roll": 20.0, "camera.azimuth": 70.0})
 
 
-def bound(scene: SceneDescription, **given: object) -> BoundControl:
+def bound(scene: SceneDescription, **given: Any) -> BoundControl:
     return make_space([PathControl(**given)], scene).controls[0]
 
 

@@ -45,8 +45,8 @@ class Clock(nn.Module):
         self.right = torch.tensor([float(one) for one in right])
 
     def forward(self, images: Tensor) -> Tensor:
-        frame = (images.mean(dim=(1, 2, 3)) * 255.0).round().long()
-        score = 10.0 * (2.0 * self.right[frame] - 1.0)
+        frame = (images.mean(dim=(1, 2, 3)) * 25.5).round().long().clamp(max=len(self.right) - 1)
+        score = 10.0 * (2.0 * self.right[frame] - 1.0) + 0.001 * images.mean(dim=(1, 2, 3))
         return torch.stack([score, -score], dim=1)
 
 
@@ -56,7 +56,7 @@ class Timed(FakeRenderer):
     def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
         time = float(str(self.space.describe(u)["path.time"]["value"]))
         yaw = float(str(self.space.describe(u).get("pose.yaw", {"value": 0.0})["value"]))
-        return torch.full((*self.size, 3), (round(time) + 5 * round(yaw / 90.0)) / 255.0)
+        return torch.full((*self.size, 3), (round(time) + 5 * round(yaw / 90.0)) / 25.5)
 
 
 def clocked(right: str, **given: Any) -> tuple[list[DriveRates], Any]:
@@ -98,8 +98,15 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     assert said.longest_gap.worst == 3.0 and said.longest_gap.mean == pytest.approx((0 + 3 + 1 + 1) / 4)
     with Image.open(path / "images" / "drive.webp") as kept:
         assert getattr(kept, "n_frames", 1) == 5
-    strip = np.asarray(Image.open(path / "images" / "drive.png"))
-    assert strip.shape == (160, 5 * 160, 3) and [int(strip[80, 80 + 160 * k, 0]) for k in range(5)] == [5, 6, 7, 8, 9]
+    with Image.open(path / "images" / "drive.png") as kept:
+        strip = np.asarray(kept)
+    assert strip.shape == (160, 5 * 160, 3) and [int(strip[80, 80 + 160 * k, 0]) for k in range(5)] == [
+        50,
+        60,
+        70,
+        80,
+        90,
+    ]
     text = answer(result.summary)
     assert "4 drives of 5 frames in 4 s, clock" in text and "75 %" in text and "40 %" in text and "drive.webp" in text
     assert "Whole drives" in (path / "report.html").read_text()
@@ -109,24 +116,24 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
 @pytest.mark.parametrize("samples", [1, 3])
 def test_frames_of_a_drive_share_their_draws_and_drives_do_not(grid: dict[str, Any], samples: int) -> None:
     result = advsearch.sweep(
-        "mug,bowl", grid=grid, controls={"camera.fov": {"fov": [20, 50]}, "path": {"moves": "object", "seconds": 4.0}},
+        "mug,bowl", grid=grid, controls={"sensor": {"shot": [0.0, 0.15]}, "path": {"seconds": 4.0}},
         path="approach", fps=1, samples=samples, label="mug", **SMALL,
     )  # fmt: skip
     drawn: dict[tuple[Any, ...], list[float]] = {}
     for row in result.rows():
         yaw = row.values.get("pose.yaw", {"value": 0.0})["value"]
         place = (row.values["object"]["value"], yaw, row.step % samples)
-        drawn.setdefault(place, []).append(float(str(row.values["camera.fov"]["value"])))
+        drawn.setdefault(place, []).append(float(str(row.values["sensor.shot"]["value"])))
     frames = 3 if "path.time" in grid else 5
     assert len(drawn) == 2 * samples * (2 if grid else 1) and all(len(one) == frames for one in drawn.values())
-    assert all(len(set(one)) == 1 for one in drawn.values()), "the lens is the same all along a drive"
+    assert all(len(set(one)) == 1 for one in drawn.values()), "the sensor is the same all along a drive"
     assert len({one[0] for one in drawn.values()}) == len(drawn), "and another one on every drive"
     assert result.summary.drives and result.summary.drives[0].drives == len(drawn)
 
 
 CONFIG = SweepConfig(
-    object="mug", environment="studio,noon", grid={"pose.yaw": "0:360:3"}, controls={"camera.fov": {"fov": [20, 50]},
-    "path": {"moves": "object"}}, path="pass", fps=0.2, samples=2, resolution=16, spp=1, trials=0, batch=2,
+    object="mug", environment="studio,noon", grid={"pose.yaw": "0:360:3"}, controls={"sensor": {"shot": [0.0, 0.15]},
+    "path": {}}, path="pass", fps=0.2, samples=2, resolution=16, spp=1, trials=0, batch=2,
 )  # fmt: skip
 
 
@@ -172,19 +179,29 @@ def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
 
 def test_an_attack_over_a_path_keeps_its_answer_along_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    size = {"resolution": 16, "spp": 1, "verify_spp": 1, "steps": 1, "trials": 6, "draws": 1}
+    size: dict[str, Any] = {
+        "resolution": 16,
+        "spp": 1,
+        "verify_spp": 1,
+        "steps": 3,
+        "policy": "pgd",
+        "epsilon": 0.5,
+        "trials": 6,
+        "draws": 1,
+    }
     model = advsearch.load_model(Dark(), labels=("mug", "vase"), input_size=16, name="dark")
+    over = {"path": {"seconds": 5.0, "reach": 1.5}}
     found = advsearch.attack(
-        "mug", model, controls="texture", over={"path": {"seconds": 5.0}}, path="approach", run=path, baseline=False,
-        denoise="none", **size,
-    ).summary  # fmt: skip
+        "mug", model, controls="texture", over=over, path="approach", run=path, baseline=False, denoise="none", **size
+    ).summary
     assert found.drive is not None and found.adversarial is not None
     assert (found.drive.frames, found.drive.seconds, found.drive.clean) == (24, 5.0, 24)
     assert found.drive.answer is not None and 0 <= found.drive.answer <= 24
     for name in ("drive", "drive-clean"):
         with Image.open(path / "images" / f"{name}.webp") as kept:
             assert getattr(kept, "n_frames", 1) == 24
-        assert Image.open(path / "images" / f"{name}.png").size == (8 * 160, 160)
+        with Image.open(path / "images" / f"{name}.png") as kept:
+            assert kept.size == (8 * 160, 160)
     pictures = [(path / "images" / f"{name}.png").read_bytes() for name in ("drive", "drive-clean")]
     assert pictures[0] != pictures[1]
     page = (path / "report.html").read_text()

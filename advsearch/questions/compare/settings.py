@@ -21,7 +21,7 @@ class CompareConfig(SweepConfig):
 
     command: ClassVar[str] = "compare"
     without: ClassVar[tuple[str, ...]] = (
-        *("model", "answer_of", "surface", "aov", "metrics", "log", "trials", "verify_spp"),
+        *("model", "answer_of", "surface", "aov", "metrics", "log", "trials", "verify_spp", "path", "fps"),
     )
 
     compared: str = setting(

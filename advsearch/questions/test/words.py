@@ -24,7 +24,8 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
     """Return what is claimed."""
     what = f"{short_name(config.object)}, {', '.join(config.controls)}"
     if isinstance(claim, RightClaim):
-        return f"{short_name(config.model)} is right in at least {percent(claim.at_least)} of what spans {what}"
+        spanned = "the frames that span" if "path" in config.controls else "what spans"
+        return f"{short_name(config.model)} is right in at least {percent(claim.at_least)} of {spanned} {what}"
     if isinstance(claim, NoWorseClaim):
         points = f"{number_text(claim.points)} points"
         models = f"{short_name(config.model)} is right at most {points} less often than {short_name(claim.than)}"

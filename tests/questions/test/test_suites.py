@@ -30,13 +30,13 @@ from advsearch.cluster.executor import InProcess
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
+from advsearch.questions.report.claims import claims_of
 from advsearch.questions.test import claims, machines
 from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
 from advsearch.questions.test.carry_out import test_from_config as carry_out
 from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
 from advsearch.questions.test.settings import SuiteConfig
-from advsearch.report.evidence import claims_of
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
@@ -485,6 +485,14 @@ def test_the_commands_of_the_jobs_in_the_docs_do_what_the_jobs_want(
 
 
 # ---- for pytest -----------------------------------------------------------------------------------------------------
+
+
+def test_a_share_of_the_frames_of_a_drive_is_claimed_as_one(tmp_path: Path) -> None:
+    way = {"path": {"path": "approach", "reach": 2.0}}
+    suite = written(tmp_path, {"on-the-way": claim("right", way, at_least=0.5, pictures=20)}, confidence=0.9)
+    (found,) = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "run"))).claims
+    assert "is right in at least 50 % of the frames that span mug, path" in found.statement
+    assert found.pictures and found.rate is not None and (found.rate == 1.0 or "path.time" in found.reason)
 
 
 def always() -> advsearch.Model:
