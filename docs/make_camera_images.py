@@ -1,4 +1,4 @@
-"""Draws docs/images/cameras.png: the bundled mug through each kind of camera, 300 x 300 pixels each.
+"""Draws docs/images/cameras.webp: the bundled mug through each kind of camera, 300 x 300 pixels each.
 
 python docs/make_camera_images.py
 """
@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import advsearch
 
-OUT = Path(__file__).resolve().parent / "images" / "cameras.png"
+OUT = Path(__file__).resolve().parent / "images" / "cameras.webp"
 SIDE, CAPTION = 300, 26
 BARREL = """%YAML:1.0
 ---

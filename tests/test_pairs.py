@@ -41,6 +41,7 @@ GRID = {"camera.distance": [1.6, 2.6]}
 FORMS: dict[str, dict[str, Any]] = {
     "pose": {"yaw": [0, 300], "x": [-0.2, 0.2], "scale": [0.7, 1.1]},
     "camera": {"azimuth": [0, 300], "elevation": [10, 50], "roll": [-10, 10], "exposure": [-1, 1]},
+    "path": {"time": [7, 10]},
     "texture": {"resolution": 4, "epsilon": 0.4},
     "material": {"which": ["wood", "steel"], "red": [0.3, 1.0]},
     "light": {"power": [2, 8], "x": [-2, 2], "red": [0.5, 1.0]},
@@ -57,7 +58,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "corruption": {"which": ["fog", "jpeg", "gaussian_noise"], "severity": [0, 5]},
     "mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},
 }
-EXCLUSIVE = {frozenset(("sky", "environment"))}
+EXCLUSIVE = {frozenset(("sky", "environment")), frozenset(("path", "camera"))}
 """Pairs that set the same input and are refused."""
 
 ALL = [(one,) for one in FORMS] + [

@@ -208,7 +208,7 @@ FAULTS = (
     Fault(
         "engine: answers of workers come as they are done",
         "advsearch/engine/sharing.py",
-        "number = done.numbers.start",
+        "number = numbers[id(done.items[0])]",
         "number = turn + len(early)",
         ("tests/engine/test_attack_workers.py",),
     ),

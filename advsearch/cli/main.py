@@ -141,7 +141,8 @@ def _run_and_tell(given: list[str]) -> int:
     except AdvsearchError as error:
         from advsearch.cli.flags import with_flags
 
-        in_a_file = given[0] in ("run", "resume") and not isinstance(error, UnknownNameError)
+        asks_for_flag = isinstance(error, UnknownNameError) or "`code=" in str(error)  # no file may name its own code
+        in_a_file = given[0] in ("run", "resume") and not asks_for_flag
         text = str(error) if in_a_file else with_flags(str(error))
         print(f"advsearch: error: {shortened(text)}", file=sys.stderr)
         return BAD_INPUT

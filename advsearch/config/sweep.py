@@ -104,7 +104,7 @@ class SweepConfig(SceneConfig):
         AttackConfig,
         "path",
         group="sweep",
-        description="sweep the frames of a drive: the camera travels along this path",
+        description="sweep the frames of a drive, in which the camera travels along this path",
         otherwise="no path",
     )
     fps: float = setting(

@@ -32,7 +32,7 @@ PATHS = (APPROACH, PASS, TURN)
 CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
 """Share of the time at which the scene is as it is described."""
 
-REACH, SECONDS = 8.0, 10.0
+REACH, SECONDS = 4.0, 10.0
 SHORTEST, LONGEST = 1e-3, 3600.0
 """Seconds between waypoints at least, and of a path at most."""
 COLUMNS, LOOKING = ("time", "x", "y", "z"), ("look_x", "look_y", "look_z")
@@ -127,7 +127,7 @@ class PathControl(NumberControl):
         return GEOMETRIC if self.chosen["moves"] == "object" else ORBIT
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        own = torch.from_numpy(camera_to_world(scene)).float()
+        own = torch.from_numpy(camera_to_world(scene)).float().to(values["time"])
         if self.chosen["moves"] == "camera":
             place, target = self._camera(scene, own, values["time"])
             return {"camera.to_world": looking(place, target, scene.number("camera.roll"))}
@@ -148,13 +148,13 @@ class PathControl(NumberControl):
 
     def _camera(self, scene: SceneDescription, own: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         """Where the camera is, and what it looks at."""
-        center, start, asked = _middle(scene), own[:3, 3], str(self.chosen["path"])
+        center, start, asked = _middle(scene).to(own), own[:3, 3], str(self.chosen["path"])
         if (waypoints := self._waypoints) is not None:
             targets = waypoints.targets
             target = center if targets is None else center + waypoints.at(time, targets)
             return center + waypoints.at(time, waypoints.places), target
         along, away, reach = own[:3, 2], (start - center).norm(), float(str(self.chosen["reach"]))
-        ahead = torch.stack([along[0], along[1], torch.zeros(())])  # the camera keeps its height, as a car's does
+        ahead = torch.stack([along[0], along[1], own.new_zeros(())])  # the camera keeps its height, as a car's does
         ahead = ahead / ahead.norm().clamp_min(1e-6)
         share = self._share(time)
         if asked == APPROACH:
@@ -168,14 +168,14 @@ class PathControl(NumberControl):
 
     def _object(self, scene: SceneDescription, own: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         """How far the object is shifted, and how many degrees it is turned by."""
-        asked, still = str(self.chosen["path"]), torch.zeros(())
+        asked, still = str(self.chosen["path"]), own.new_zeros(())
         if (waypoints := self._waypoints) is not None:
             heading = still if waypoints.headings is None else waypoints.at(time, waypoints.headings)
             return waypoints.at(time, waypoints.places), heading
         share, reach = self._share(time), float(str(self.chosen["reach"]))
         if asked == TURN:
-            return torch.zeros(3), 360.0 * share
-        away = (own[:3, 3] - _middle(scene)).norm()
+            return own.new_zeros(3), 360.0 * share
+        away = (own[:3, 3] - _middle(scene).to(own)).norm()
         along = own[:3, 2] if asked == APPROACH else -own[:3, 0]
         ahead = torch.stack([along[0], along[1], still])
         ahead = ahead / ahead.norm().clamp_min(1e-6)
@@ -191,18 +191,19 @@ def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
     """Return the pose (4, 4) of a camera at a place (3,) that looks at a target (3,), rolled by degrees."""
     ahead = (target - place) / (target - place).norm().clamp_min(1e-9)
     level = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
-    left = level / level.norm() if float(level.detach().norm()) > 1e-6 else torch.tensor([0.0, 1.0, 0.0])
+    aside = torch.tensor([0.0, 1.0, 0.0]).to(ahead)  # where it looks straight up or down
+    left = torch.where(level.norm() > 1e-6, level / level.norm().clamp_min(1e-6), aside)
     up, (cos, sin) = torch.linalg.cross(ahead, left), (math.cos(math.radians(roll)), math.sin(math.radians(roll)))
     return affine(torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place)
 
 
 def turned(scene: SceneDescription, shift: Tensor, heading: Tensor) -> Tensor:
     """Return what turns the object about the vertical through its middle, in degrees, and shifts it: (4, 4)."""
-    angle, center = torch.deg2rad(heading), _middle(scene)
+    angle, center = torch.deg2rad(heading), _middle(scene).to(shift)
     zero, one = torch.zeros_like(angle), torch.ones_like(angle)
     about = torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one])
     about = about.reshape(3, 3)
-    own = torch.from_numpy(object_to_world(scene)).float()
+    own = torch.from_numpy(object_to_world(scene)).float().to(shift)
     return affine(about, center - about @ center + shift) @ own
 
 

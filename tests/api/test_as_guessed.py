@@ -161,7 +161,7 @@ def test_an_answer_is_rendered_under_another_view(attacked: AttackResult, tmp_pa
     words: Any = {"environment": "noon"}
     with pytest.raises(TypeError, match="unexpected keyword argument 'environment'; it takes model, scene, camera"):
         attacked.render(**words)
-    with pytest.raises(UnknownNameError, match="camera of the scene"):
+    with pytest.raises(UnknownNameError, match="unknown camera 'none'"):
         attacked.render(camera="none")
     other = pickle.loads(pickle.dumps(attacked))
     with pytest.raises(InputError, match=r"load_run\(FOLDER\) has it"):

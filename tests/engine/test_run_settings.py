@@ -223,7 +223,7 @@ def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
             raise
 
 
-@pytest.mark.parametrize("setting", RUN_SETTINGS)
+@pytest.mark.parametrize("setting", sorted(ALL))
 def test_an_instance_says_its_own(setting: str) -> None:
     config = AttackConfig(object="mug", **{setting: ALL[setting]})
     with pytest.raises(InputError, match=rf"{setting}: control texture is an instance already; give it its own"):

@@ -72,7 +72,7 @@ def test_a_scene_is_seen_by_any_of_its_cameras() -> None:
     assert torch.equal(picture(Scene(scene.seen_by("front"))), picture(Scene(scene)))
     assert torch.equal(picture(Scene(scene.seen_by("side"))), picture(Scene(side)))
     assert scene.seen_by("side").seen_by(ORBIT_CAMERA).number("camera.fov") == 35.0
-    with pytest.raises(UnknownNameError, match=r"unknown camera of the scene 'sied'. Did you mean 'side'"):
+    with pytest.raises(UnknownNameError, match=r"unknown camera 'sied'. Did you mean 'side'"):
         scene.seen_by("sied")
     with pytest.raises(InputError, match=r"moves along an orbit .* seen by its camera 'side'; leave the control out"):
         picture(Scene(scene.seen_by("side")), "camera")
