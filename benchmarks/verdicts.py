@@ -181,7 +181,7 @@ def sample_table(runs: int) -> int:
     for noise, share in shares:
         print(f"| {noise} | {100 * share:.2f} |")
     print()
-    return sum(share > 0.05 + 2.0 * math.sqrt(0.05 * 0.95 / runs) for _, share in shares)
+    return sum(bool(share > 0.05 + 2.0 * math.sqrt(0.05 * 0.95 / runs)) for _, share in shares)
 
 
 # ---- verdicts
@@ -209,10 +209,11 @@ def verdict(evaluate: Evaluate, domain: Domain, u: Tensor, seed: int, *, before:
     """Return the verdict on an answer, with what is asked of `evaluate`, as it was before or as it is."""
     at = {"adversarial": domain.project(u), "clean": domain.start}
     margins = {name: margins_of(evaluate, name, place) for name, place in at.items()}
+    trials: tuple[int, ...] = (20,) if before else TRIAL_LOOKS
     if before:
-        spp, trials = choose_before(list(margins.values()), seed), (20,)
+        spp = choose_before(list(margins.values()), seed)
     else:
-        spp, trials = choose_spp(margins, seed=seed, trials=TRIAL_LOOKS[0]).spp, TRIAL_LOOKS
+        spp = choose_spp(margins, seed=seed, trials=TRIAL_LOOKS[0]).spp
     return verify(evaluate, domain, u, claim=Ending.NOT_VERIFIED, spp=spp, seed=seed, trials=trials)
 
 

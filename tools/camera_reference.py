@@ -44,7 +44,7 @@ def projected(cv2: Any, model: str, coefficients: tuple[float, ...], at: np.ndar
 
 def main() -> None:
     """Write the table."""
-    import cv2
+    import cv2  # type: ignore[import-not-found]
 
     at = points()
     lenses = {

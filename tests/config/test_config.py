@@ -34,8 +34,11 @@ WRONG: dict[str, tuple[Any, str]] = {
     "path": ("", "expected approach, pass, orbit, or a .csv file, got ''"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
-    "camera": ("", "expected a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, Kalibr, "
-        "ROS or COLMAP, got ''"),
+    "camera": (
+        "",
+        "expected a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, "
+        "Kalibr, ROS or COLMAP, got ''",
+    ),
     "set_": ({"camera.azimuth": math.nan}, "got camera.azimuth=nan"),
     "exposure": (99, "expected a number from -10 to 10, got 99"),
     "resolution": ("4x4", "expected SIDE or HEIGHTxWIDTH, each from 8 to 4096, got 4x4"),
