@@ -127,10 +127,7 @@ class SurfaceLight(Predictor):
         first = self.deviations[0] if self.deviations else None
         if first is None or first.levels <= first.most:
             return None
-        return (
-            f"light on surfaces is {first.levels:.1f} levels of 255 off, where {first.most:.1f} would do: the surface "
-            "mirrors, or lets light through"
-        )
+        return f"light on surfaces is {first.levels:.1f} levels of 255 off, where {first.most:.1f} would do"
 
     def passed(self, query: Query) -> None:
         self._come_to(query)

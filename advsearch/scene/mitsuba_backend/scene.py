@@ -230,7 +230,7 @@ class MitsubaScene:
 
     def guides(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> tuple[Tensor, Tensor]:
         """Render what guides the denoiser: first-hit albedo and shading normal, each (H, W, 3) float32."""
-        (both,) = self.pictures(inputs, {"guides": seed}, spp)
+        both = self.pictures(inputs, {"guides": seed}, spp)[0]
         return both[..., :3], both[..., 3:]
 
     def held(self, inputs: Mapping[str, Tensor]) -> Any:
