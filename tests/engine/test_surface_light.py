@@ -37,14 +37,9 @@ def coarse() -> Iterator[None]:
         patched.setattr(texels, "GROUND", 32)
         for name, value in {"SIDE": 48, "GATHERED": 64}.items():
             patched.setattr(arrangement, name, value)
-<<<<<<< HEAD
         kept: dict[str, float] = {"LIGHTS": 3, "EVERY": 6, "CHECK_SPP": 4, "BOUND": 50.0}
         for name, number in kept.items():
             patched.setattr(surface_light, name, number)
-=======
-        for name, value in {"LIGHTS": 3, "EVERY": 6, "CHECK_SPP": 4, "BOUND": 50}.items():
-            patched.setattr(surface_light, name, value)
->>>>>>> w-surface
         yield
 
 
