@@ -93,7 +93,7 @@ def _lens(description: SceneDescription) -> Plugin:
     """The plugin of a camera, with what is before its place and its film."""
     model = description.camera_model
     if model is not None:
-        if description.backdrop and model.black > 0.0:
+        if description.backdrop and (model.black > 0.0 or not model.name):  # a searched lens may fold
             raise InputError(
                 "background: it would show where the camera's lens sees nothing as well; leave the plain background "
                 "out, or take a lens that fills the picture"
