@@ -434,7 +434,7 @@ class Sweep:
             remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:
             remarks.append(
-                f"It is not shown that the worst margin stays on its side beyond {checked.spp} samples a pixel, the most "
+                f"It is not shown that the worst margin keeps its side beyond {checked.spp} samples a pixel, the most "
                 "that a check takes: noise may take part in it."
             )
         return remarks
