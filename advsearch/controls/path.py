@@ -127,7 +127,7 @@ class PathControl(NumberControl):
         return GEOMETRIC if self.chosen["moves"] == "object" else ORBIT
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        own = torch.from_numpy(camera_to_world(scene)).float().to(values["time"])
+        own = torch.from_numpy(camera_to_world(scene)).float().to(values["time"].device)
         if self.chosen["moves"] == "camera":
             place, target = self._camera(scene, own, values["time"])
             return {"camera.to_world": looking(place, target, scene.number("camera.roll"))}
@@ -135,11 +135,12 @@ class PathControl(NumberControl):
         return {"object.to_world": turned(scene, shift, heading)}
 
     def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        own, time = torch.from_numpy(camera_to_world(scene)).float(), values["time"]
+        time = values["time"]
+        own, center = torch.from_numpy(camera_to_world(scene)).float().to(time.device), _middle(scene).to(time.device)
         if self.chosen["moves"] == "camera":
-            away = self._camera(scene, own, time)[0] - _middle(scene)
+            away = self._camera(scene, own, time)[0] - center
         else:
-            away = own[:3, 3] - _middle(scene) - self._object(scene, own, time)[0]
+            away = own[:3, 3] - center - self._object(scene, own, time)[0]
         unit = "object sizes" if scene.object.metres is None else "metres"
         return {"distance": {"value": float(away.norm()) * scene.metres, "unit": unit}}
 
