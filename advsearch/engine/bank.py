@@ -157,15 +157,8 @@ class Bank(Predictor):
         return new + [rest[number] for number in order[: count - len(new)]]
 
     def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
-        found, total = [], None
-        for begin in range(0, len(chosen), TOGETHER):
-            some = chosen[begin : begin + TOGETHER]
-            wholes = [torch.cat([u, one.numbers]) for one in some]
-            each, derivative = self.problem.judged(partial(self._pictures, some), wholes, u, gradient)
-            found += each
-            if derivative is not None:
-                total = derivative if total is None else total + derivative
-        return self.problem.mean(found, u, None if total is None else total / len(chosen))
+        wholes = [torch.cat([u, one.numbers]) for one in chosen]
+        return self.problem.mean_under(lambda some, at: self._pictures(chosen[some], at), wholes, u, gradient, TOGETHER)
 
     def _pictures(self, chosen: Sequence[Condition], u: Tensor) -> Tensor:
         """Predicted pictures (N, H, W, 3) of u under conditions, with a graph."""

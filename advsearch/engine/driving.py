@@ -92,10 +92,11 @@ def write_drive(run: RunDirectory, name: str, pictures: Sequence[npt.NDArray[np.
     pause = max(FASTEST, round(1000.0 * seconds / len(frames)))
     frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=pause, loop=0, quality=80)
     write_bytes(run.path / IMAGES / f"{name}.webp", file.getvalue())
-    some = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), STRIP)).round().astype(int))
-    small = [frames[number].resize(_size(frames[number]), Image.Resampling.LANCZOS) for number in some]
+    size = max(1, round(frames[0].width * SIDE / frames[0].height)), SIDE
+    small = [frames[number].resize(size, Image.Resampling.LANCZOS) for number in evenly(len(frames), STRIP)]
     run.save_image(name, np.concatenate([np.asarray(one, dtype=np.float32) / 255.0 for one in small], axis=1))
 
 
-def _size(frame: Image.Image) -> tuple[int, int]:
-    return max(1, round(frame.width * SIDE / frame.height)), SIDE
+def evenly(count: int, most: int) -> npt.NDArray[np.int64]:
+    """Return the numbers of some of so many frames, evenly spaced, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

@@ -377,8 +377,8 @@ def _difference(renderer: Renderer, loss: Loss, u: Tensor, probe: Probe, step: f
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """How good an estimate is beside a reference, see `judge`; the numbers are relative to the derivative's size.
+class Agreement:
+    """How good an estimate is beside a reference, see `agreement`; the numbers are relative to the derivative's size.
 
     Attributes:
         status: in a word.
@@ -398,7 +398,7 @@ class Judgement:
         return max(0.0, self.error - self.doubt)
 
 
-def judge(estimate: Estimate, against: Reference, beside: Sequence[Reference] = ()) -> Judgement:
+def agreement(estimate: Estimate, against: Reference, beside: Sequence[Reference] = ()) -> Agreement:
     """Say how good an estimate is: "reference unusable" where the reference's noise exceeds `LOUD` and doubt covers
     the error; "biased" where the error exceeds `TOLERANCE` beyond doubt; "noisy" where the noise exceeds `LOUD`;
     otherwise "ok".
@@ -417,5 +417,5 @@ def judge(estimate: Estimate, against: Reference, beside: Sequence[Reference] = 
     else:
         status = "noisy" if estimate.noise > LOUD * size else "ok"
     if size == 0.0:
-        return Judgement(status, math.inf if difference else 0.0, 0.0, math.inf)
-    return Judgement(status, difference / size, doubt / size, estimate.noise / size)
+        return Agreement(status, math.inf if difference else 0.0, 0.0, math.inf)
+    return Agreement(status, difference / size, doubt / size, estimate.noise / size)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -363,6 +363,32 @@ class Problem:
         if gradient and derivative is None:
             derivative = torch.zeros_like(u)
         return list(zip(evaluations, each, strict=True)), derivative
+
+    def mean_under(
+        self,
+        render: Callable[[slice, Tensor], Tensor],
+        wholes: Sequence[Tensor],
+        u: Tensor,
+        gradient: WhichGradient,
+        at_once: int,
+    ) -> Evaluation:
+        """Return the mean over conditions whose pictures are predicted.
+
+        Args:
+            render: from some of the conditions and u to their pictures (N, H, W, 3), with a graph.
+            wholes: the configuration of the whole space under each.
+            u: (d,) of the searched controls.
+            gradient: whether the derivative is wanted.
+            at_once: pictures that the model is asked about at once.
+        """
+        found, total = [], None
+        for begin in range(0, len(wholes), at_once):
+            some = slice(begin, begin + at_once)
+            each, derivative = self.judged(partial(render, some), wholes[some], u, gradient)
+            found += each
+            if derivative is not None:
+                total = derivative if total is None else total + derivative
+        return self.mean(found, u, None if total is None else total / len(wholes))
 
     def mean(self, found: Sequence[tuple[Evaluation, Output]], u: Tensor, gradient: Tensor | None = None) -> Evaluation:
         """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw.

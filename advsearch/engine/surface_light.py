@@ -13,7 +13,6 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import ClassVar
 
 import torch
@@ -137,14 +136,9 @@ class SurfaceLight(Predictor):
         if self.ended is not None and query.number >= self.ended:
             return self.problem.evaluate(query)
         wholes = [torch.cat([query.u, numbers]) for numbers in self._drawn(query)]
-        found, total = [], None
-        for begin in range(0, len(wholes), TOGETHER):
-            some = wholes[begin : begin + TOGETHER]
-            each, derivative = self.problem.judged(partial(self._pictures, some), some, query.u, query.gradient)
-            found += each
-            if derivative is not None:
-                total = derivative if total is None else total + derivative
-        answer = self.problem.mean(found, query.u, None if total is None else total / len(wholes))
+        answer = self.problem.mean_under(
+            lambda some, at: self._pictures(wholes[some], at), wholes, query.u, query.gradient, TOGETHER
+        )
         if not query.keep:
             return answer
         with torch.no_grad():

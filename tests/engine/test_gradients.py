@@ -20,9 +20,9 @@ from advsearch.engine.gradients import (
     Estimate,
     Probe,
     Reference,
+    agreement,
     estimated,
     inside,
-    judge,
     probes,
     reference,
     smooth_loss,
@@ -292,25 +292,25 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
 
 def test_a_judgement_needs_more_than_noise() -> None:
     sure = Reference(1.0, 0.001, (1.0, 1.0), 8)
-    assert judge(Estimate("x", 1.01, 0.05, 9, 1.0), sure).status == "ok"
-    assert judge(Estimate("x", 1.2, 0.05, 9, 1.0), sure).status == "biased"
-    turned = judge(Estimate("x", -1.0, 0.06, 9, 1.0), sure)
+    assert agreement(Estimate("x", 1.01, 0.05, 9, 1.0), sure).status == "ok"
+    assert agreement(Estimate("x", 1.2, 0.05, 9, 1.0), sure).status == "biased"
+    turned = agreement(Estimate("x", -1.0, 0.06, 9, 1.0), sure)
     assert (turned.status, turned.error, turned.noise) == ("biased", 2.0, 0.06)
     assert turned.doubt == pytest.approx(0.05, rel=1e-2)
     assert turned.excess == 2.0 - turned.doubt
-    assert judge(Estimate("x", 1.0, 0.5, 9, 1.0), sure).status == "noisy"
+    assert agreement(Estimate("x", 1.0, 0.5, 9, 1.0), sure).status == "noisy"
     unsure = Reference(0.1, 0.5, (0.6, 0.1), 8)
-    assert judge(Estimate("x", 0.4, 0.1, 9, 1.0), unsure).status == "reference unusable"
-    assert judge(Estimate("x", 0.0, 0.0, 9, 1.0), Reference(0.0, 0.0, (0.0, 0.0), 8)).error == 0.0
+    assert agreement(Estimate("x", 0.4, 0.1, 9, 1.0), unsure).status == "reference unusable"
+    assert agreement(Estimate("x", 0.0, 0.0, 9, 1.0), Reference(0.0, 0.0, (0.0, 0.0), 8)).error == 0.0
 
 
 def test_a_derivative_near_zero_is_judged_beside_the_others_of_its_control() -> None:
     small, large = Reference(0.01, 0.0, (0.01, 0.01), 8), Reference(5.0, 0.01, (5.0, 5.0), 8)
     off = Estimate("x", 0.03, 0.0, 9, 1.0)
-    alone, beside = judge(off, small), judge(off, small, [small, large])
+    alone, beside = agreement(off, small), agreement(off, small, [small, large])
     assert (alone.status, beside.status) == ("biased", "ok")
     assert [alone.error, beside.error] == pytest.approx([2.0, 0.04])
-    assert judge(off, large, [small, large]).error == judge(off, large).error
+    assert agreement(off, large, [small, large]).error == agreement(off, large).error
 
 
 def test_a_reference_of_a_parabola_has_its_bias_taken_off() -> None:

@@ -16,7 +16,7 @@ from advsearch.config import SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.path import PathControl
 from advsearch.engine import run_settings
-from advsearch.engine.driving import write_drive
+from advsearch.engine.driving import evenly, write_drive
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import Scenes
@@ -74,10 +74,10 @@ class Drives:
         for row in rows:
             right.flat[row.step] = bool(row.correct)
             if name in row.values:
-                away[row.step // len(job.models) // job.per_scene, row.step // before % sizes[place]] = float(
-                    str(row.values[name]["value"])
-                )
-                self._unit = row.values[name]["unit"]
+                distance = row.values[name]
+                scene = row.step // len(job.models) // job.per_scene
+                away[scene, row.step // before % sizes[place]] = float(str(distance["value"]))
+                self._unit = distance["unit"]
         order = np.argsort([float(value) for value in axis.values])
         self.times = np.array([float(value) for value in axis.values])[order]
         self._numbers = np.moveaxis(np.arange(right.size).reshape(shape), place + 1, -1)[..., order]
@@ -128,8 +128,7 @@ class Drives:
         if not whole.any():
             return
         worst = numbers[whole][(right[whole] == 1).mean(axis=1).argmin()]
-        frames = worst[np.unique(np.linspace(0, len(worst) - 1, min(len(worst), ANIMATED)).round().astype(int))]
-        pictures = [picture_of(scenes, int(number)) for number in frames]
+        pictures = [picture_of(scenes, int(number)) for number in worst[evenly(len(worst), ANIMATED)]]
         write_drive(run, "drive", pictures, float(self.times[-1] - self.times[0]))
 
 
@@ -147,7 +146,7 @@ def longest(flags: npt.NDArray[np.bool_]) -> int:
     return int((ends[1::2] - ends[::2]).max(initial=0))
 
 
-def over_drives(values: npt.NDArray[np.float64], worst: Callable[..., object]) -> OverDrives:
+def over_drives(values: npt.NDArray[np.float64], worst: Callable[[list[float]], float]) -> OverDrives:
     """Return the mean of a number over drives, its 95 % interval by a bootstrap, and that of the worst drive."""
     interval = None
     if len(values) >= FEWEST:
@@ -156,5 +155,4 @@ def over_drives(values: npt.NDArray[np.float64], worst: Callable[..., object]) -
         tail = (1.0 - CONFIDENCE) / 2.0
         low, high = np.quantile(means, [tail, 1.0 - tail])
         interval = (float(low), float(high))
-    extreme = values.min() if worst is min else values.max()
-    return OverDrives(mean=float(values.mean()), interval=interval, worst=float(extreme))
+    return OverDrives(mean=float(values.mean()), interval=interval, worst=worst(values.tolist()))

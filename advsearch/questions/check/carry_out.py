@@ -19,9 +19,9 @@ from advsearch.engine.gradients import (
     Loss,
     Probe,
     Reference,
+    agreement,
     estimates,
     inside,
-    judge,
     probes,
     reference,
     smooth_loss,
@@ -384,7 +384,7 @@ def attempts(group: Group) -> list[tuple[str, float]]:
 def _row(
     part: CheckedPart, spp: int, probe: Probe, estimate: Estimate, against: Reference, beside: Sequence[Reference]
 ) -> DerivativeRow:
-    judged = judge(estimate, against, beside)
+    judged = agreement(estimate, against, beside)
     return DerivativeRow(
         **vars(_place(part)),
         control=probe.group.control,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.gradients import Estimate, Loss, Probe, estimated, judge, reference
+from advsearch.engine.gradients import Estimate, Loss, Probe, agreement, estimated, reference
 from advsearch.questions.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.questions.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
 from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
@@ -183,7 +183,7 @@ class GradientBench:
         probe = self._along(value, seed)
         against = reference(self._exact, self._loss, self._u, probe, seed=seed, spp=CHECK_SPP, repeats=(2, 4))
         own = float(value @ torch.cat([probe.direction[group.coordinates] for group in self.part.groups]))
-        if judge(Estimate(self.by, own, self.reference.error * abs(own), 1, 0.0), against).status != "biased":
+        if agreement(Estimate(self.by, own, self.reference.error * abs(own), 1, 0.0), against).status != "biased":
             return None
         return (
             f"{self.part.name}: the reference is the mean of {self.by}, and along one direction it gives {own:.3g}, "

@@ -15,7 +15,7 @@ from torch import Tensor
 from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import domains
-from advsearch.engine.gradients import Judgement, Loss, Probe, estimates, judge, probes, reference, smooth_loss
+from advsearch.engine.gradients import Agreement, Loss, Probe, agreement, estimates, probes, reference, smooth_loss
 from advsearch.questions.stability.case import Check, Outcome, holds
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
@@ -117,7 +117,7 @@ class Examined:
     finite: bool
     replaced: int
     inside: bool
-    compared: Mapping[str, Judgement]
+    compared: Mapping[str, Agreement]
     gradient: float
     mean: float
     result: SearchResult
@@ -187,20 +187,20 @@ def examine_gradient(
 
 def compared(
     renderer: Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 12), repeats: int = 24
-) -> dict[str, Judgement]:
+) -> dict[str, Agreement]:
     """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw picture, along
     each probe by its name."""
     before = renderer.formation
     renderer.formation = replace(before, transfer="linear")
     try:
         loss = smooth_loss(before.resolution)
-        found: dict[str, Judgement] = {}
+        found: dict[str, Agreement] = {}
         for along in _together(renderer, loss, u, spp):
             high = spp if along[0].group.estimator == "image" else max(spp, REFERENCE_SPP)
             against = [reference(renderer, loss, u, one, seed=1, spp=high, repeats=seeds) for one in along]
             own = estimates(renderer, loss, u, along[0].group.estimator, along, seed=2, spp=spp, repeats=repeats)
             for probe, one, estimate in zip(along, against, own, strict=True):
-                found[probe.name] = judge(estimate, one, against)
+                found[probe.name] = agreement(estimate, one, against)
         return found
     finally:
         renderer.formation = before

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.texel_rays import Floats, Grid
+from advsearch.scene.mitsuba_backend.texel_rays import Floats, TexelGrid
 from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time
 
 ANGLES = 32
@@ -53,7 +53,9 @@ class Lobes:
         return float((weight * self.diffuse).sum()), float((weight * self.gloss).sum())
 
 
-def measured(scene: MitsubaScene, inputs: Mapping[str, Tensor], grid: Grid, place: Floats, normal: Floats) -> Lobes:
+def measured(
+    scene: MitsubaScene, inputs: Mapping[str, Tensor], grid: TexelGrid, place: Floats, normal: Floats
+) -> Lobes:
     """Measure the BSDF of a shape, by sampling it, at one of its texels: a (3,) place and the unit normal there."""
     mi = mitsuba()
     import drjit as dr

@@ -17,7 +17,15 @@ from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.lobes import ANGLES, TABLES, Lobes
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.texel_rays import SHIFT, Floats, Grid, grid_place, map_place, shapes_of, to_map
+from advsearch.scene.mitsuba_backend.texel_rays import (
+    SHIFT,
+    Floats,
+    TexelGrid,
+    grid_place,
+    map_place,
+    shapes_of,
+    to_map,
+)
 from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time, population, recorded
 
 SHARP, WIDE = 0.15, 0.4
@@ -101,7 +109,7 @@ class Views:
     def __init__(
         self,
         scene: MitsubaScene,
-        grids: Sequence[Grid],
+        grids: Sequence[TexelGrid],
         lobes: Sequence[Lobes],
         widths: Sequence[float],
         photographed: float | None,

@@ -1,6 +1,6 @@
 """Rays from texels: what they see of each other and of the environment; and where in grids and its map things lie.
 
-A grid of texels is laid over each surface (`Grid`). Nothing here depends on the light.
+A grid of texels is laid over each surface (`TexelGrid`). Nothing here depends on the light.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PASS = 1 << 20
 
 
 @dataclass(frozen=True)
-class Grid:
+class TexelGrid:
     """The texels over one surface.
 
     Attributes:
@@ -49,7 +49,7 @@ class Grid:
 
 def gather(
     scene: MitsubaScene,
-    grids: Sequence[Grid],
+    grids: Sequence[TexelGrid],
     cells: tuple[int, int],
     places: Floats,
     normals: Floats,
@@ -129,7 +129,7 @@ def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) 
 # ---- places ---------------------------------------------------------------------------------------------------------
 
 
-def shapes_of(held: Any, grids: Sequence[Grid]) -> list[Any]:
+def shapes_of(held: Any, grids: Sequence[TexelGrid]) -> list[Any]:
     """Mitsuba's shapes of grids."""
     by_name = {one.id(): one for one in held.shapes()}
     return [by_name[grid.name] for grid in grids]
@@ -150,7 +150,7 @@ def map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
     return across - dr.floor(across), dr.safe_acos(y) / math.pi
 
 
-def grid_place(grid: Grid, place: Any, uv: Any) -> tuple[Any, Any]:
+def grid_place(grid: TexelGrid, place: Any, uv: Any) -> tuple[Any, Any]:
     """Where in a grid something lies: shares of its height and of its width."""
     import drjit as dr
 

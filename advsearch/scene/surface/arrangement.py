@@ -40,7 +40,7 @@ from advsearch.scene.surface.light import (
     sky_of,
 )
 from advsearch.scene.surface.texels import SIDE, Texels, between, on_ground, on_mesh, smoothed, together
-from advsearch.scene.surface.view import Product
+from advsearch.scene.surface.view import SparseProduct
 from advsearch.scene.surface_map import rasterised
 from advsearch.scene.transport.matrix import bilinear
 
@@ -178,7 +178,7 @@ class Arrangement:
         flat = color.reshape(-1, 3)
         if self._finer is None:
             return flat
-        found: Tensor = Product.apply(self._finer, flat)  # type: ignore[no-untyped-call]
+        found: Tensor = SparseProduct.apply(self._finer, flat)  # type: ignore[no-untyped-call]
         return found
 
     def light(self, padded: Tensor, color: Tensor) -> Light:

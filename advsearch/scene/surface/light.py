@@ -38,7 +38,7 @@ LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True, eq=False)
-class Sky:
+class SkyLight:
     """An environment, cut for look-ups.
 
     Attributes:
@@ -55,7 +55,7 @@ class Sky:
     hot: tuple[Tensor, Tensor]
 
 
-def sky_of(padded: Tensor) -> Sky:
+def sky_of(padded: Tensor) -> SkyLight:
     """Cut an environment (H, W + 2, 3) for look-ups."""
     radiance = padded[:, 1:-1].detach()
     rows, columns = radiance.shape[:2]
@@ -70,7 +70,7 @@ def sky_of(padded: Tensor) -> Sky:
         even = radiance * (1.0 - spare[..., None])
     else:
         hot, even = (torch.zeros(0, 3), torch.zeros(0, 3)), radiance
-    return Sky(padded, _pooled(even, sine, CELLS).reshape(-1, 3), _pooled(radiance, sine, BLURRED), hot)
+    return SkyLight(padded, _pooled(even, sine, CELLS).reshape(-1, 3), _pooled(radiance, sine, BLURRED), hot)
 
 
 def _hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,7 +124,7 @@ def directions(size: tuple[int, int]) -> Tensor:
 
 
 def irradiance(
-    seen: tuple[Tensor, Tensor], sky: Sky, direct: Tensor | None, reflectance: Tensor, bounces: int
+    seen: tuple[Tensor, Tensor], sky: SkyLight, direct: Tensor | None, reflectance: Tensor, bounces: int
 ) -> Tensor:
     """Return the irradiance (n, 3) of texels.
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from advsearch.files import scaled
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light
-from advsearch.scene.surface.view import View
+from advsearch.scene.surface.view import SurfaceView
 from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
 
 
@@ -81,12 +81,12 @@ class SurfaceRenderer(PredictingRenderer):
             wholes: (d,) configurations of the space, for what controls do to the finished picture.
         """
         lights = [self.light(one) for one in inputs]
-        views: dict[int, View] = {}
+        views: dict[int, SurfaceView] = {}
         for light in dict.fromkeys(lights):
             numbers = [number for number, one in enumerate(lights) if one is light]
             cameras = [self._camera(inputs[number]) for number in numbers]
             seen = self.arrangement.seen(cameras, light)
-            views |= {number: View(seen, place, self.arrangement.fine) for place, number in enumerate(numbers)}
+            views |= {number: SurfaceView(seen, place, self.arrangement.fine) for place, number in enumerate(numbers)}
         fine = self.arrangement.finer(color)
         self.products += len(inputs)
         return torch.stack(
@@ -98,7 +98,7 @@ class SurfaceRenderer(PredictingRenderer):
 
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
         light = self.light(inputs)
-        view = View(self.arrangement.seen([self._camera(inputs)], light), 0, self.arrangement.fine)
+        view = SurfaceView(self.arrangement.seen([self._camera(inputs)], light), 0, self.arrangement.fine)
         self.products += 1
         return view.radiance(self.arrangement.finer(self.color(inputs)) * light.on_object)
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import scipy.sparse
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.texel_rays import Grid
+from advsearch.scene.mitsuba_backend.texel_rays import TexelGrid
 from advsearch.scene.surface_map import BORDER, Charts, rasterised
 from advsearch.scene.transport.matrix import by_rows
 
@@ -49,7 +49,7 @@ class Texels:
         begin: of each grid its first texel, and the number of all.
     """
 
-    grids: tuple[Grid, ...]
+    grids: tuple[TexelGrid, ...]
     places: Floats
     normals: Floats
     cells: Ints
@@ -87,7 +87,7 @@ def on_mesh(name: str, charts: Charts, vertices: Floats, normals: Floats) -> Tex
     number = np.cumsum(charts.covered.ravel()) - 1
     rows, columns = np.nonzero(charts.covered)
     return Texels(
-        grids=(Grid(name, 0, charts.covered.shape),),
+        grids=(TexelGrid(name, 0, charts.covered.shape),),
         places=place[rows, columns],
         normals=normal[rows, columns],
         cells=np.flatnonzero(charts.covered),
@@ -113,7 +113,7 @@ def on_ground(name: str, height: float, reach: float, middle: tuple[float, float
     y, x = np.meshgrid(along + middle[1], along + middle[0], indexing="ij")
     places = np.stack([x, y, np.full_like(x, height)], axis=-1).reshape(-1, 3).astype(np.float32)
     up = np.broadcast_to(np.array([0.0, 0.0, 1.0], dtype=np.float32), places.shape).copy()
-    grid = Grid(name, 0, (GROUND, GROUND), (middle[0], middle[1], scale, rate))
+    grid = TexelGrid(name, 0, (GROUND, GROUND), (middle[0], middle[1], scale, rate))
     every = np.arange(GROUND * GROUND)
     return Texels((grid,), places, up, every, every, (0, GROUND * GROUND))
 

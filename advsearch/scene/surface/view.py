@@ -13,7 +13,7 @@ from advsearch.scene.mitsuba_backend.surface import RAYS, Seen
 from advsearch.scene.transport.matrix import bilinear
 
 
-class View:
+class SurfaceView:
     """What one camera sees: `rest`, and a sparse matrix from the fine grid to the pixels.
 
     Args:
@@ -38,11 +38,11 @@ class View:
 
     def radiance(self, reflected: Tensor) -> Tensor:
         """Return (H, W, 3) for what the fine grid reflects (cells, 3); differentiable in it."""
-        found: Tensor = Product.apply(self.matrix, reflected)  # type: ignore[no-untyped-call]
+        found: Tensor = SparseProduct.apply(self.matrix, reflected)  # type: ignore[no-untyped-call]
         return self.rest + found.reshape(self.rest.shape)
 
 
-class Product(torch.autograd.Function):
+class SparseProduct(torch.autograd.Function):
     """A sparse matrix times columns, with its transpose as the derivative."""
 
     @staticmethod
