@@ -28,16 +28,17 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 import advsearch
 from advsearch import __version__
 from advsearch.cli import list as listing
-from advsearch.cli.attack import answer
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import aligned, finish
+from advsearch.cli.output import shown_text as answer
 from advsearch.cli.progress import watch_progress
-from advsearch.config import AttackConfig, GapConfig, SweepConfig
+from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
+from advsearch.questions.gap.settings import GapConfig
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
