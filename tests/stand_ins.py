@@ -24,7 +24,7 @@ from advsearch.engine.record import Findings, Stages
 from advsearch.engine.sharing import Shared
 from advsearch.engine.stages import Attack
 from advsearch.progress import NullProgress
-from advsearch.questions.attack import carry_out as attacking
+from advsearch.engine import attack_parts as attacking
 from advsearch.questions.attack.carry_out import attack_answers
 from advsearch.runs.directory import RunDirectory
 from advsearch.tasks import Classification, Judgement

@@ -16,7 +16,7 @@ from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.patch.control import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine import attack_parts as attacking
+from advsearch.questions.attack import carry_out as attacking
 from advsearch.engine.attack_parts import with_derivatives
 from advsearch.engine.run_settings import RUN_SETTINGS, check, given_to
 from advsearch.errors import InputError, UnknownNameError

@@ -97,6 +97,7 @@ def _rate(what: str, number: int, rated: VerifiedRate | ControlGroup) -> Sequenc
 
 
 def _facts(summary: AttackSummary) -> dict[str, str]:
+    """What was asked and done; the page has environment and seed."""
     return {
         "wanted": wording.goal_text(summary),
         "changed": wording.changed_text(summary),
@@ -108,7 +109,8 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
         "failures": failures_text(summary.failures) if summary.failures else "",
         "search": f"{summary.policy}, {wording.count(summary.steps, 'step')}: {summary.ending}",
         "renders": wording.renders_text(summary),
-        "pictures": summary.run or "",
+        "environment": "",
+        "seed": "",
     }
 
 
@@ -203,7 +205,7 @@ def _shown_curve(result: CurveResult) -> ShownAnswer:
         "ending": lambda row: row.ending or "not reached",
         "epsilon": lambda row: plain_epsilon(row.epsilon),
         "wrong": lambda row: f"{row.verified.successes}/{row.verified.trials}" if row.verified else "",
-        f"margin ({margin_text(result.task)})": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
+        "margin": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
     }
     points = _points(result)
     told = "; ".join(f"{one.robust} of {one.objects} at {one.epsilon:g}" for one in points)
@@ -218,7 +220,8 @@ def _shown_curve(result: CurveResult) -> ShownAnswer:
     curve = AnswerPart.table(known, by_epsilon, title="" if len(points) > 1 else chart.title, note=CURVE_NOTE)
     runs = [row.run for row in result.table]
     objects = AnswerPart.table(result.table, by_object, title="The objects, at the last epsilon tried", parts=runs)
-    sections = [*([chart] if points else []), *([curve] if known else []), objects]
+    meaning = AnswerPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
+    sections = [*([chart] if points else []), *([curve] if known else []), objects, meaning]
     return ShownAnswer(_said_of_curve(result), sections, {"model": result.model, "policy": result.policy})
 
 

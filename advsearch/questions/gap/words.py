@@ -31,7 +31,7 @@ def shown(result: GapResult) -> ShownAnswer:
         ),
         "95 % interval": lambda row: wording.interval_text(row.average.interval),
         "worst: wrong": lambda row: f"{row.worst.successes}/{row.worst.trials}" if row.worst else "",
-        f"margin ({margin_text(result.task)})": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
+        "margin": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
         "ending": "{0.ending}",
     }
     rows = result.table
@@ -45,7 +45,8 @@ def shown(result: GapResult) -> ShownAnswer:
         note=NOTE,
         parts=[row.run for row in rows],
     )
-    return ShownAnswer(_said(result), [table] if rows else [], {"model": result.model, "policy": result.policy})
+    meaning = AnswerPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
+    return ShownAnswer(_said(result), [table, meaning] if rows else [], {"model": result.model, "policy": result.policy})
 
 
 def _said(result: GapResult) -> str:

@@ -117,11 +117,10 @@ def _facts(summary: SweepSummary) -> dict[str, str]:
     speed, worst = summary.renders_per_second, summary.worst
     return {
         "worst": _configuration(worst) if worst else "",
-        "where": _said(worst, summary.task) if worst else "",
+        "there": _said(worst, summary.task) if worst else "",
         "renders": f"{summary.renders['sweep']}" + (f", {speed:.3g} a second" if speed else ""),
         "worst drive": f"{summary.run}/images/drive.webp" if summary.drives and summary.run else "",
         "map of the surface": f"{summary.run}/images/surface.png" if summary.surface else "",
-        "kept in": summary.run or "",
     }
 
 
