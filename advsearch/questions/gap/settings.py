@@ -1,4 +1,4 @@
-"""What `gap` and `region` need to know."""
+"""What `gap` needs to know."""
 
 from __future__ import annotations
 
@@ -19,3 +19,6 @@ class GapConfig(AttackConfig):
     model: str = setting_as_in(SceneConfig, "model")
     average: int = setting_as_in(AttackConfig, "average", default=200, ge=1)
     workers: int | None = setting_as_in(AttackConfig, "workers", description="worker processes that share the attacks")
+
+
+CONFIG = GapConfig
