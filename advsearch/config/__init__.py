@@ -20,12 +20,7 @@ CONFIGS: dict[str, type[Config]]
 """What the settings of each command are, in the order in which the docs show them; those of questions that are rooms
 are read when somebody first asks, since they are made of the kinds here."""
 
-_OWN: tuple[type[Config], ...] = (
-    AttackConfig,
-    RenderConfig,
-    SweepConfig,
-    GapConfig,
-)
+_OWN: tuple[type[Config], ...] = (AttackConfig, RenderConfig, SweepConfig, GapConfig)
 
 
 def __getattr__(name: str) -> object:

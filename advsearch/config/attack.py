@@ -113,9 +113,7 @@ class AttackConfig(DerivativeConfig):
         otherwise="each by itself",
     )
     measure: Literal["no", "quick", "full"] = setting(
-        "quick",
-        "search",
-        "measure which gradient estimator is best on this scene; full also measures step and samples",
+        "quick", "search", "measure which gradient estimator is best on this scene; full also measures step and samples"
     )
     policy: str | dict[str, JsonValue] = setting(
         "auto",

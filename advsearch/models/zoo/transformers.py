@@ -244,15 +244,9 @@ NETWORKS = (
         lambda loaded: timm.of_wrapped(loaded, names_of(loaded.network.config)),
     ),
     Family(
-        _called("ForImageClassification"),
-        "AutoModelForImageClassification",
-        features.also(_with_names(_Classifier)),
+        _called("ForImageClassification"), "AutoModelForImageClassification", features.also(_with_names(_Classifier))
     ),
-    Family(
-        _called("ForSemanticSegmentation"),
-        "AutoModelForSemanticSegmentation",
-        _with_names(_Segmenter),
-    ),
+    Family(_called("ForSemanticSegmentation"), "AutoModelForSemanticSegmentation", _with_names(_Segmenter)),
     Family(
         mask_queries.is_ours,
         "AutoModelForUniversalSegmentation",
@@ -263,17 +257,9 @@ NETWORKS = (
         "AutoModelForZeroShotObjectDetection",
         open_vocabulary.source,
     ),
-    Family(
-        _called("ForObjectDetection"),
-        "AutoModelForObjectDetection",
-        _with_names(_Detector),
-    ),
+    Family(_called("ForObjectDetection"), "AutoModelForObjectDetection", _with_names(_Detector)),
     Family(language.speaks, "AutoModelForImageTextToText", language.source),
-    Family(
-        _called("ForDepthEstimation"),
-        "AutoModelForDepthEstimation",
-        depth_maps.source,
-    ),
+    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", depth_maps.source),
     Family(
         lambda architecture, network: zero_shot.compares(network),
         "AutoModel",

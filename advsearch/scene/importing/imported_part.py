@@ -51,9 +51,5 @@ def placed(part: ImportedPart, matrix: Array) -> ImportedPart:
         return replace(part, vertices=vertices, normals=normals)
     colors = None if part.colors is None else part.colors[:, ::-1]  # a mirror turns faces over, and cofactors normals
     return replace(
-        part,
-        vertices=vertices,
-        faces=part.faces[:, ::-1],
-        normals=None if normals is None else -normals,
-        colors=colors,
+        part, vertices=vertices, faces=part.faces[:, ::-1], normals=None if normals is None else -normals, colors=colors
     )
