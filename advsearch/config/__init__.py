@@ -8,9 +8,8 @@ that this package stays light.
 from __future__ import annotations
 
 from advsearch import rooms
-from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
+from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig, GapConfig
 from advsearch.config.derivative import DerivativeConfig
-from advsearch.config.questions import GapConfig
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig

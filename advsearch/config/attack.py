@@ -17,6 +17,7 @@ from advsearch.settings import Clash, setting, setting_as_in, split_names
 if TYPE_CHECKING:
     pass
 
+
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
 
@@ -302,3 +303,15 @@ def instance(asked: str) -> str:
     """A control as it is asked for, without its parameter: `light:key`, or `camera` of `camera.azimuth`."""
     kind, colon, own = asked.partition(":")
     return kind.partition(".")[0] + colon + own.partition(".")[0]
+
+
+class GapConfig(AttackConfig):
+    """Everything that decides what `gap` does: the worst case beside the average, for each object and each control."""
+
+    command: ClassVar[str] = "gap"
+    several: ClassVar[tuple[str, ...]] = ("object",)
+    without: ClassVar[tuple[str, ...]] = ("smallest", "ensemble", "printable", "aov", "metrics", "log")
+
+    model: str = setting_as_in(SceneConfig, "model")
+    average: int = setting_as_in(AttackConfig, "average", default=200, ge=1)
+    workers: int | None = setting_as_in(AttackConfig, "workers", description="worker processes that share the attacks")

@@ -17,7 +17,15 @@ from advsearch.errors import InputError
 from advsearch.runs.results.photos import PhotoAgreement
 from advsearch.viewer.align_page import align_page, table_html
 from advsearch.viewer.photos import LARGEST, photo_file, rendering_file, rendering_names
-from advsearch.viewer.refused import Refused
+
+
+class Refused(Exception):
+    """A request that is not answered as asked."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
 
 SENDING = 60.0
 """Seconds in which a photograph has to have come."""

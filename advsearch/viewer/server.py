@@ -36,8 +36,7 @@ from advsearch.viewer.certificate import https_context, reachable
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.following import START, following_page, is_under_way, progress_json
 from advsearch.viewer.list_page import list_page
-from advsearch.viewer.photographing import PhotoTaker
-from advsearch.viewer.refused import Refused
+from advsearch.viewer.photographing import PhotoTaker, Refused
 from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
 from advsearch.viewer.thumbnails import cover, kept_pictures, path_of
 

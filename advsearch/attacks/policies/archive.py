@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Domain, half_widths, wraps
 from advsearch.attacks.failures import Failures, FoundFailure, most_different
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
-from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.attacks.policies.surrogate import MOST_OWN, Observed, Surrogate
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream

@@ -15,10 +15,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Distribution, Domain, half_widths, wraps
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
-from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 

@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from typing import Any
 
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Distribution, Domain
 from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Evaluated, Policy, Proposal, affordable, seeded
 

@@ -17,7 +17,7 @@ from advsearch.api.attack import executor_for, parts_of, problem_of
 from advsearch.api.subruns import carry_out_part
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.attacks.sequential import ConfidenceSequence
+from advsearch.attacks.trials import ConfidenceSequence
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem

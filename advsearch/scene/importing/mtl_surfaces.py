@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from advsearch.scene.importing.files import shown, text_of
-from advsearch.scene.importing.left_out import Inventory
+from advsearch.scene.importing.files import Inventory, shown, text_of
 from advsearch.scene.importing.mtl import (
     MapUse,
     MtlMaterial,
