@@ -71,15 +71,12 @@ class Block:
                 f"block{where}: expected a reach over 0 and norm 'box', got {self.reach} and {self.norm!r}"
             )
         if self.options:
-            self._check_choice(where)
-
-    def _check_choice(self, where: str) -> None:
-        whole = (self.size, self.norm, self.low, self.high, self.periodic) == (1, "box", 0.0, 1.0, False)
-        if self.options < 0 or not whole:
-            raise InputError(
-                f"block{where}: expected a discrete choice to have at least one option, size 1, norm 'box' and bounds "
-                f"[0, 1], got {self}"
-            )
+            whole = (self.size, self.norm, self.low, self.high, self.periodic) == (1, "box", 0.0, 1.0, False)
+            if self.options < 0 or not whole:
+                raise InputError(
+                    f"block{where}: expected a discrete choice to have at least one option, size 1, norm 'box' and "
+                    f"bounds [0, 1], got {self}"
+                )
 
     @property
     def radius(self) -> float:

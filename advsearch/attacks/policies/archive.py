@@ -138,7 +138,10 @@ class MapElites(Policy[ArchiveState]):
         dims = [sizes[place] for place in spanned.tolist()]
         if math.prod(dims) > MOST_CELLS:
             raise InputError(f"cells: expected at most {MOST_CELLS} in all, got {math.prod(dims)}; set `cells` lower")
-        archive = _ribs().GridArchive(
+        # import the archives of ribs, which takes seconds
+        from ribs import archives
+
+        archive = archives.GridArchive(
             solution_dim=domain.dim,
             dims=dims,
             ranges=list(zip(domain.lower[spanned].tolist(), domain.upper[spanned].tolist(), strict=True)),
@@ -272,10 +275,3 @@ def _spanned(domain: Domain, over: str) -> Tensor:
     if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
         raise InputError(f"over: expected 1 to {MOST_SPANNED} different parameters, got {', '.join(names)}")
     return torch.tensor([places[name] for name in names])
-
-
-def _ribs() -> Any:
-    """Import the archives of ribs, which takes seconds."""
-    from ribs import archives
-
-    return archives

@@ -154,7 +154,11 @@ def _strategy(d: int, sigma: float, population: int, seed: int) -> Any:
         "verb_log": 0,
     }
     with _own_random(seed, 0):
-        return _pycma().CMAEvolutionStrategy(np.zeros(d), sigma, options)
+        # import pycma, which takes most of a second and complains that there is no matplotlib
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import cma
+        return cma.CMAEvolutionStrategy(np.zeros(d), sigma, options)
 
 
 def _anew(state: CMAESState, sigma: float) -> CMAESState:
@@ -230,11 +234,3 @@ def _own_random(seed: int, generation: int) -> Iterator[None]:
             yield
     finally:
         np.random.set_state(before)  # noqa: NPY002
-
-
-def _pycma() -> Any:
-    """Import pycma, which takes most of a second and complains that there is no matplotlib."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import cma
-    return cma

@@ -146,7 +146,12 @@ class PatchControl(Control):
         self.name = name or self.kind
         self.resolution, self.epsilon, self.picture = resolution, epsilon, picture
         self.norm = norm or ("box" if epsilon is None else "linf")
-        self._check_choices()
+        for choice in self.choices:
+            choice.check(self.name, getattr(self, choice.name))
+        if self.norm == "box" and self.epsilon is not None:
+            raise InputError(
+                f"{self.name}.epsilon: expected none with norm box, got {self.epsilon:g}; set norm to linf or l2"
+            )
         self._placement = _Placement(self.name, **numbers)
         self._pixels_given = pixels
         self._pixels = self._pixel_spec()
@@ -163,14 +168,6 @@ class PatchControl(Control):
             given["pixels"] = self._pixels_given
         named = {"kind": self.kind} if self.name != self.kind else {}
         return {**named, **given, **self._placement.given}
-
-    def _check_choices(self) -> None:
-        for choice in self.choices:
-            choice.check(self.name, getattr(self, choice.name))
-        if self.norm == "box" and self.epsilon is not None:
-            raise InputError(
-                f"{self.name}.epsilon: expected none with norm box, got {self.epsilon:g}; set norm to linf or l2"
-            )
 
     def _pixel_spec(self) -> Range | Fixed:
         """What the pixels are set to; where there is a picture, that takes their place.

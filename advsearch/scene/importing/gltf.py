@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.files import JsonObject, JsonValue
+from advsearch.files import JsonValue
 from advsearch.scene.importing.files import check_faces, damaged, looks_like, shown, text_of
 from advsearch.scene.importing.gltf_entries import Asset, Header, Primitive
 
@@ -45,13 +45,6 @@ def read_header(path: Path, data: bytes) -> Header:
         header = Header.model_validate(content)
     except ValidationError as error:
         raise damaged(path, *_first(error)) from None
-    header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *_extensions(content)})})
-    check_header(path, header)
-    return header
-
-
-def _extensions(content: JsonObject) -> set[str]:
-    """Return the names of the extensions that entries have, in the file's list of them or not."""
     found: set[str] = set()
     level: list[JsonValue] = [content]
     while level:
@@ -62,7 +55,9 @@ def _extensions(content: JsonObject) -> set[str]:
             held = entry.get("extensions")
             found.update(held if isinstance(held, dict) else ())
             level.extend(value for key, value in entry.items() if key != "extras")
-    return found
+    header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *found})})
+    check_header(path, header)
+    return header
 
 
 def binary_chunk(data: bytes) -> bytes | None:

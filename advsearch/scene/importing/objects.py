@@ -95,13 +95,16 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     if opacity is not None and not opacity.any():
         opacity, bakes = None, [*bakes, "it is transparent all over; it is shown opaque"]
     material, blends = _material(soup, surfaces)
+    warnings = [*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)]
+    kept = warnings[:MOST_WARNINGS]
+    more = len(warnings) - len(kept)
     return ObjectAsset(
         name=name,
         mesh=_mesh(soup, surfaces, file),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
-        warnings=_first([*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)], file.name),
+        warnings=(*kept, *([f"{file.name}: {more:,} more warnings are left out"] if more else [])),
         up=axis,
         opacity=opacity,
         normal_map=maps.normals,
@@ -129,13 +132,6 @@ def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
     columns, rows = ((np.arange(n) * m) // n for n, m in ((width, sizes[0][0]), (height, sizes[0][1])))
     found = np.asarray(emission[rows][:, columns] * share, np.float32)
     return found if found.any() else None
-
-
-def _first(warnings: list[str], name: str) -> tuple[str, ...]:
-    """Return warnings about a file, and of very many the first and how many more there are."""
-    kept = warnings[:MOST_WARNINGS]
-    more = len(warnings) - len(kept)
-    return (*kept, *([f"{name}: {more:,} more warnings are left out"] if more else []))
 
 
 def _upright(parts: list[ImportedPart], file: Path, up: str | None) -> tuple[Soup, UpAxis]:

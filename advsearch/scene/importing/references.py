@@ -53,7 +53,9 @@ class References:
     def tried(self, name: str) -> bytes | str:
         """Return the content of a named file, or why it is not read, which is not remembered."""
         reason = MISSING
-        for candidate in _candidates(name, plain_name(name)):
+        plain = plain_name(name)
+        tried = [form for text in (name.strip(), plain) for form in (text, text.lstrip("/"), os.path.basename(text))]
+        for candidate in [form for form in dict.fromkeys(tried) if form]:
             try:
                 return self._content(candidate)
             except ValueError:  # a zero byte in the name
@@ -86,9 +88,3 @@ class References:
         if size > most:
             raise files.too_large(path, f"files of at most {most:,} bytes in all", f"{size:,}")
         self._contents[path] = data
-
-
-def _candidates(name: str, plain: str) -> list[str]:
-    """Return the names to try: as it stands, plain, without the root, without folders."""
-    tried = [form for text in (name.strip(), plain) for form in (text, text.lstrip("/"), os.path.basename(text))]
-    return [form for form in dict.fromkeys(tried) if form]
