@@ -170,11 +170,7 @@ class PatchControl(Control):
         return {**named, **given, **self._placement.given}
 
     def _pixel_spec(self) -> Range | Fixed:
-        """What the pixels are set to; where there is a picture, that takes their place.
-
-        Raises:
-            InputError: they were given as a list, or beside a picture.
-        """
+        """What the pixels are set to; where there is a picture, that takes their place."""
         if self._pixels_given is None:
             return Fixed(0.0) if self.picture is not None else Range(0.0, 1.0)
         if self.picture is not None:

@@ -138,11 +138,7 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
 
 
 def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what is in the config.json of a repository or a folder.
-
-    Raises:
-        ModelError: it is neither there nor to be had, or it has the files of open_clip and none of transformers.
-    """
+    """Return what is in the config.json of a repository or a folder."""
     has = partial(transformers.utils.cached_file, name, _raise_exceptions_for_missing_entries=False, **where)
     try:
         if not has("config.json") and has("open_clip_config.json"):
