@@ -338,7 +338,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _align(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         path = f"/runs/{quote(name, safe='')}/align/"
         elsewhere = self.server.address_of(path) if self.server.token else None
-        made = _photographs("photographs_html")(
+        _, made = _photographs("photographs_html")(
             self.server.photographs, self._run(name), name, self.server.key, elsewhere
         )
         return _html(made, "../../../", ("../", name))

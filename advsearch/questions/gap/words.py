@@ -46,7 +46,9 @@ def shown(result: GapResult) -> ShownAnswer:
         parts=[row.run for row in rows],
     )
     meaning = AnswerPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
-    return ShownAnswer(_said(result), [table, meaning] if rows else [], {"model": result.model, "policy": result.policy})
+    return ShownAnswer(
+        _said(result), [table, meaning] if rows else [], {"model": result.model, "policy": result.policy}
+    )
 
 
 def _said(result: GapResult) -> str:
