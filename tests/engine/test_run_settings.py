@@ -16,10 +16,10 @@ from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.patch.control import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.questions.attack import carry_out as attacking
 from advsearch.engine.attack_parts import with_derivatives
 from advsearch.engine.run_settings import RUN_SETTINGS, check, given_to
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.gap.carry_out import gap_from_config
 from advsearch.questions.gap.settings import GapConfig
 from advsearch.questions.sweep.carry_out import job_of
