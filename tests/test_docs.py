@@ -350,4 +350,4 @@ def test_the_picture_and_the_answer_in_the_readme_are_made_from_a_run(tmp_path: 
     assert centres == [(40, 40, 40), (120, 120, 120), (200, 200, 200)]
     readme = images.with_answer(PAGES[0].read_text("utf-8"), summary)
     assert "The model calls this mug a vase in 20 of 20 fresh renders" in readme
-    assert "runs/mug-texture-001\n```\n<!-- end -->" in readme
+    assert "runs/mug-texture-001/report.html\n```\n<!-- end -->" in readme

@@ -146,7 +146,10 @@ def several_meanings(trees: Mapping[str, ast.Module]) -> dict[str, list[str]]:
     """Return the public names with several meanings, each with the modules of each meaning."""
     found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     commands = {
-        name for module, tree in trees.items() for name, _ in defined_in(tree) if module == f"advsearch.api.{name}"
+        name
+        for module, tree in trees.items()
+        for name, _ in defined_in(tree)
+        if module in (f"advsearch.api.{name}", f"advsearch.questions.{name}.carry_out")
     }
     for module, tree in trees.items():
         room = module.split(".")[1] if "." in module else ""

@@ -486,8 +486,8 @@ def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
         lambda: carry_out(RegionConfig(object="mug", controls="pose", run=str(run))),
     ):
         with pytest.MonkeyPatch.context() as patch:
-            for module in ("attack", "sweep"):
-                patch.setattr(f"advsearch.api.{module}.load_models", killed)
+            for module in ("engine.attack_parts", "questions.sweep.carry_out"):
+                patch.setattr(f"advsearch.{module}.load_models", killed)
             with pytest.raises(InterruptedError):
                 ask()
         assert seen.pop() and not run.parent.exists(), "what was only refused leaves nothing"

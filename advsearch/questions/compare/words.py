@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from advsearch.questions.compare.answer import (
     ComparedPair,
@@ -16,29 +16,81 @@ from advsearch.questions.compare.answer import (
 from advsearch.report import wording
 from advsearch.report.claims import Claim, Extent
 from advsearch.report.phrases import percent, percent_number
+from advsearch.report.shown import AnswerPart, Column, Picture, ShownAnswer
 from advsearch.report.wording import conditions_text
 from advsearch.runs.results.base import Interval
 from advsearch.runs.results.sweep import AxisValue
 
-SIDE_HEADS = ("", "right in", "accuracy", "95 % interval", "time an answer")
-"""Of the table of sides."""
+NOTE = (
+    "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
+    "(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares "
+    "Clopper-Pearson's, each for its row by itself."
+)
 
 LEVEL = 0.05
 """A p-value up to this is called a difference."""
 
+MOST_TABLES, MOST_PICTURES = 4, 3
+"""Parameters, and pictures of what one side alone gets right, that a terminal shows; the page has all."""
 
-def side_rows(result: CompareResult) -> list[list[str]]:
-    """Return a row for each side."""
-    return [
-        [
-            one.name,
-            f"{one.correct} of {one.configurations}",
-            percent(one.accuracy),
-            wording.interval_text(one.interval),
-            cost_text(one.seconds),
-        ]
-        for one in result.sides
+
+def shown(result: CompareResult) -> ShownAnswer:
+    """Return each side's accuracy, the pairs, where one is worse, and pictures that one alone gets right."""
+    sides: Mapping[str, Column] = {
+        "": "{0.name}",
+        "right in": "{0.correct} of {0.configurations}",
+        "accuracy": lambda one: percent(one.accuracy),
+        "95 % interval": lambda one: wording.interval_text(one.interval),
+        "time an answer": lambda one: cost_text(one.seconds),
+    }
+    sections = [AnswerPart.table(result.sides, sides, title="How often each is right")]
+    for pair in result.pairs:
+        sections += _of_pair(pair, several=len(result.pairs) > 1)
+    said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
+    sweeps = ", ".join(dict.fromkeys(one.run for one in result.sides))
+    return ShownAnswer(said, sections, {"sweeps": sweeps, "they differ in": ", ".join(result.differ)})
+
+
+def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
+    """Two sides: the pairs in a table of two by two, where one is worse, pictures, and the values of parameters."""
+    said = [headline(pair), alone_text(pair)] if several else [alone_text(pair)]
+    heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
+    rows = [
+        [f"{pair.first} right", str(pair.both), str(pair.first_only)],
+        [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
     ]
+    yield AnswerPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, NOTE)
+    yield AnswerPart("Where one is worse", rules_texts(pair))
+    tables = parts_of(pair)
+    told = telling(tables, MOST_TABLES)
+    heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
+    heads += [f"{pair.first} alone", f"{pair.second} alone"]
+    for name, parts in tables.items():
+        lines = [[value_text(one.value), *_count_cells(one)] for one in parts]
+        yield AnswerPart(name, heads=heads, rows=lines, only="" if name in told else "page")
+    if len(told) < len(tables):
+        more = f"The difference varies most over these; the page has all {len(tables)} parameters."
+        yield AnswerPart(text=[more], only="text")
+    for name in (pair.first, pair.second):
+        listed = [one for one in pair.shown if one.right == name]
+        title = f"Only {name} gets right:"
+        rows = [[picture_text(one, pair), *one.pictures] for one in listed[:MOST_PICTURES]]
+        yield AnswerPart(title, rows=rows, only="text")
+        missing = [picture_text(one, pair) for one in listed if not one.pictures]
+        yield AnswerPart(title, missing, pictures=_pictures(listed, pair), only="page")
+
+
+def _pictures(listed: Sequence[PairPicture], pair: ComparedPair) -> list[list[Picture]]:
+    """A picture of each pair where both sides were shown the same, or else the two beside each other."""
+    groups = []
+    for one in listed:
+        said = _said(one, pair)
+        captions = said if len(one.pictures) == len(said) else ["; ".join(said)]
+        captions = [f"{captions[0]}; {values_text(one)}", *captions[1:]]
+        groups.append([Picture(file, text) for file, text in zip(one.pictures, captions, strict=False)])
+    if all(len(group) == 1 for group in groups):
+        return [[one for group in groups for one in group]] if groups else []
+    return [group for group in groups if group]
 
 
 def cost_text(seconds: float) -> str:
@@ -77,15 +129,6 @@ def points_text(interval: Interval) -> str:
 def p_text(p: float) -> str:
     """Return a p-value: ``= 0.012``, or ``< 0.0001``."""
     return f"= {p:.2g}" if p >= 0.0001 else "< 0.0001"
-
-
-def paired_rows(pair: ComparedPair) -> list[list[str]]:
-    """Return the pairs as a table of two by two, with its head."""
-    return [
-        ["", f"{pair.second} right", f"{pair.second} wrong"],
-        [f"{pair.first} right", str(pair.both), str(pair.first_only)],
-        [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
-    ]
 
 
 def rules_texts(pair: ComparedPair) -> list[str]:
@@ -136,24 +179,6 @@ def telling(tables: dict[str, list[PairPart]], most: int) -> dict[str, list[Pair
     return {name: parts for name, parts in tables.items() if name in chosen}
 
 
-def part_heads(pair: ComparedPair, name: str) -> list[str]:
-    """Return the heads of the table of one parameter."""
-    return [
-        name,
-        "pairs",
-        pair.first,
-        pair.second,
-        "difference, points (95 % interval)",
-        f"{pair.first} alone",
-        f"{pair.second} alone",
-    ]
-
-
-def part_rows(parts: Sequence[PairPart]) -> list[list[str]]:
-    """Return a row for each value of a parameter."""
-    return [[value_text(one.value), *_count_cells(one)] for one in parts]
-
-
 def _count_cells(one: PairCounts) -> list[str]:
     first, second = (percent(right / one.pairs) for right in one.right)
     difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
@@ -169,8 +194,13 @@ def value_text(value: AxisValue) -> str:
 
 def picture_text(one: PairPicture, pair: ComparedPair) -> str:
     """Return what both sides say of a pair, and where it is."""
-    said = ", ".join(f"{name}: {text}" for name, text in zip((pair.first, pair.second), one.answers, strict=True))
-    return f"{said}; {values_text(one)}"
+    return "; ".join([*_said(one, pair), values_text(one)])
+
+
+def _said(one: PairPicture, pair: ComparedPair) -> list[str]:
+    """What each side says of a pair, and which of them is right."""
+    names = zip((pair.first, pair.second), one.answers, strict=True)
+    return [f"{name}: {text}{' (right)' if name == one.right else ''}" for name, text in names]
 
 
 def values_text(one: PairPicture) -> str:

@@ -39,10 +39,10 @@ class PhotoTaker(Protocol):
         """Return the run's table."""
 
 
-def photographs_html(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> bytes:
+def photographs_html(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> Response:
     """Return the page of a run's photographs; arguments as for `align_page`."""
     table = _there(taker).agreement(run)
-    return align_page(name, rendering_names(run), table, key, elsewhere).encode()
+    return "text/html; charset=utf-8", align_page(name, rendering_names(run), table, key, elsewhere).encode()
 
 
 def rendering_picture(run: Path, name: str) -> Response:

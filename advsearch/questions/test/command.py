@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.output import as_notes
 from advsearch.cli.question import Positional, QuestionCommand
 
 if TYPE_CHECKING:
@@ -73,22 +72,4 @@ def write_files(config: Config, result: SuiteResult) -> None:
         write_text(path, getattr(machines, name)(result), durable=False)
 
 
-def answer(result: SuiteResult) -> str:
-    """Return what the suite says, a table of its claims, what repeats those that are not held, and the cost."""
-    from advsearch.questions.test.answer import HELD
-    from advsearch.questions.test.words import NOT_TRIED, TABLE_HEADS, facts, suite_text, table_rows
-    from advsearch.runs.directory import REPORT
-
-    listed = output.aligned([TABLE_HEADS, *table_rows(result)])
-    parts = [f"{result.title}\n{suite_text(result)}", listed]
-    for one in result.claims:
-        if one.answer != HELD and one.reason != NOT_TRIED:
-            rows = [["picture", f"{result.run}/{one.picture}"]] if one.picture else []
-            parts.append(f"{one.name}\n{output.aligned([*rows, ['again', one.repeat]])}")
-    parts += ["Expected from now on\n" + output.aligned([[one] for one in result.changes])] if result.changes else []
-    parts.append(output.aligned([*map(list, facts(result).items()), ["page", f"{result.run}/{REPORT}"]]))
-    parts += ["Interrupted."] if result.ending == "interrupted" else []
-    return "\n\n".join(parts) + as_notes(result.warnings)
-
-
-COMMAND = _Test("test", answer, about="suite", place=Positional("SUITE", "a suite, a YAML file"))
+COMMAND = _Test("test", about="suite", place=Positional("SUITE", "a suite, a YAML file"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
@@ -10,14 +11,34 @@ from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer
 from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
 from advsearch.report.claims import Claim, Kind
 from advsearch.report.phrases import percent, with_article
+from advsearch.report.shown import AnswerPart, Picture, ShownAnswer
 from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
 from advsearch.runs.results.attack import AttackSummary
 
 TABLE_HEADS = ("claim", "answer", "pictures", "why")
 
+NOTE = (
+    "Held and failed are shown at the stated confidence, by an interval that holds however often it is looked at. A "
+    "search that finds nothing is no proof."
+)
+
 TIME_OVER = "the time of the suite was over"
 STOPPED = "it was interrupted"
 NOT_TRIED = "not tried, since a counterexample failed"
+
+
+def shown(result: SuiteResult) -> ShownAnswer:
+    """Return what the suite says, a table of its claims, and what repeats those that are not held."""
+    runs = [one.part for one in result.claims]
+    sections = [AnswerPart("The claims", heads=TABLE_HEADS, rows=table_rows(result), note=NOTE, parts=runs)]
+    for one in result.claims:
+        if one.answer != HELD and one.reason != NOT_TRIED:
+            caption = f"{one.statement}: {one.answer}. {one.reason}."
+            pictures = [[Picture(one.picture, caption)]] if one.picture else []
+            sections.append(AnswerPart(one.name, rows=[["again", one.repeat]], pictures=pictures))
+    sections.append(AnswerPart("Expected from now on", result.changes))
+    about = [Path(result.suite).name, result.object, result.model]
+    return ShownAnswer(f"{result.title}. {suite_text(result)}", sections, facts(result), about)
 
 
 def statement(claim: AnyClaim, config: SceneConfig) -> str:
