@@ -54,7 +54,6 @@ __all__ = [
     "get_objective",
     "log_odds",
     "margin",
-    "negated",
     "objective_summaries",
     "targeted_margin",
 ]
@@ -105,22 +104,21 @@ class ObjectiveKind:
         return found
 
 
+def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
+    """An objective that asks for nothing more."""
+
+    def plain(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        return function(output, images, truth)
+
+    return plain
+
+
 def _score_of(task: Task) -> Objective:
-    """The score of a task."""
-
-    def score(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return task.score(output, truth)
-
-    return score
+    return _plain(lambda output, images, truth: task.score(output, truth))
 
 
 def _pixel_margin_of(task: Segmentation) -> Objective:
-    """The mean over the object's pixels."""
-
-    def pixel_margin(output: Tensor, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return task.pixel_margin(output, truth)
-
-    return pixel_margin
+    return _plain(lambda output, images, truth: task.pixel_margin(output, truth))
 
 
 _OWN = {
@@ -245,7 +243,7 @@ def get_objective(
     task = task or Classification()
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
-    kind = _kind_of(objective)
+    kind, of_answers = _kind_of(objective), False
     if kind is None:
         found = checked(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
@@ -260,10 +258,14 @@ def get_objective(
     else:
         form = kind.form(targeted=targeted)
         found = _plain(form) if _OWN.get(kind.name) is kind else checked(form)
-        if isinstance(task, Similarity) or (isinstance(task, ClassTask) and task.nothing):
-            found = _of_answers(found, task)
-    found = _aimed(found, task.target) if targeted else found
-    return negated(found) if task.minimise else found
+        of_answers = isinstance(task, Similarity) or (isinstance(task, ClassTask) and bool(task.nothing))
+
+    def sought(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        wanted = task.target if targeted else truth
+        value = found(task.answerable(output, wanted) if of_answers else output, images, wanted, more)
+        return -value if task.minimise else value
+
+    return sought
 
 
 def check_objective(
@@ -322,39 +324,3 @@ def _kind_of(objective: object) -> ObjectiveKind | None:
     if isinstance(objective, str):
         return OBJECTIVE_KINDS[objective]
     return next((kind for kind in OBJECTIVE_KINDS.values() if kind.plain is objective), None)
-
-
-def _plain(function: Callable[..., Tensor]) -> Objective:
-    """An objective that asks for nothing more."""
-
-    def plain(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return function(output, images, truth)
-
-    return plain
-
-
-def _aimed(objective: Objective, target: Any) -> Objective:
-    """Wrap an objective of a target so that it is called with the truth, like any other."""
-
-    def aimed(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return objective(output, images, target, more)
-
-    return aimed
-
-
-def _of_answers(objective: Objective, task: Task) -> Objective:
-    """Wrap an objective of logits so that it sees only what is an answer."""
-
-    def of_answers(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return objective(task.answerable(output, truth), images, truth, more)
-
-    return of_answers
-
-
-def negated(objective: Objective) -> Objective:
-    """Wrap an objective so that what is maximised is its negative: easier to recognise instead of harder."""
-
-    def negative(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return -objective(output, images, truth, more)
-
-    return negative

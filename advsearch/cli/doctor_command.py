@@ -11,7 +11,6 @@ HELP = "check every part that a run needs, with versions and how to mend it"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     output.add_flags(parser)
 
 

@@ -21,7 +21,6 @@ HELP = "show what a run found, or the details of a control, a policy, a task or 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
     parser.add_argument(
         "what",

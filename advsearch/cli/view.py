@@ -13,7 +13,6 @@ EXAMPLES = ("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle sit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle")
     parser.add_argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures")
     output.add_flags(parser)

@@ -122,7 +122,6 @@ class Similarity(Classification):
 
     @property
     def looks(self) -> bool:
-        """See `Task.looks`."""
         return not self.references and self.clean is None
 
     def seeing(self, output: Tensor, truth: Labels | None) -> Similarity:
