@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array, csgraph
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.geometry import Array, Ints, Soup
+from advsearch.scene.importing.geometry import Array, Ints, Soup, connected
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.importing.normal_maps import FLAT
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
@@ -180,9 +179,8 @@ def _into_unit_square(soup: Soup) -> Array:
     _, vertex = np.unique(corners, axis=0, return_inverse=True)
     vertex = vertex.reshape(-1, 3)
     a, b = np.concatenate([vertex[:, 0], vertex[:, 1]]), np.concatenate([vertex[:, 1], vertex[:, 2]])
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(int(vertex.max()) + 1,) * 2)
-    charts, chart = csgraph.connected_components(graph, directed=False)
-    low = np.full((charts, 2), np.inf)
+    chart = connected(int(vertex.max()) + 1, a, b)
+    low = np.full((int(chart.max()) + 1, 2), np.inf)
     np.minimum.at(low, chart[vertex.reshape(-1)], soup.uvs.reshape(-1, 2))
     moved: Array = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
     return moved
