@@ -99,8 +99,6 @@ class MaterialControl(NumberControl):
             return {}
         return {self.name: linear_to_srgb(self.scene_inputs(scene, values, so_far)[self._base_color])}
 
-    # ---- inside -----------------------------------------------------------------------------------------------------
-
     @property
     def _base_color(self) -> str:
         return f"{self.mesh}.base_color"
