@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from advsearch.attacks.domain import Block, Distribution, Domain
-from advsearch.attacks.evaluation import Evaluate, Evaluation, Query, WhichGradient
-from advsearch.attacks.objectives import OBJECTIVES, Objective, cross_entropy, get_objective, margin
+from advsearch.attacks.domain import Block, Domain
+from advsearch.attacks.evaluation import Evaluate, Evaluation, Query
+from advsearch.attacks.objectives import OBJECTIVES, Objective, get_objective, margin
 from advsearch.attacks.policies import (
     CMAES,
     NES,
@@ -25,7 +25,7 @@ from advsearch.attacks.policies import (
     make_policy,
     seeded,
 )
-from advsearch.attacks.sample_count import Rung, SampleCount, choose_spp
+from advsearch.attacks.sample_count import SampleCount, choose_spp
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
 from advsearch.attacks.trials import Trials, clopper_pearson
 from advsearch.attacks.verification import Ending, Verification, count_right, run_trials, verify
@@ -40,7 +40,6 @@ __all__ = [
     "Auto",
     "Block",
     "Choices",
-    "Distribution",
     "Domain",
     "Ending",
     "Evaluate",
@@ -54,18 +53,15 @@ __all__ = [
     "Query",
     "Random",
     "Restarts",
-    "Rung",
     "SampleCount",
     "SearchResult",
     "Sobol",
     "StepRecord",
     "Trials",
     "Verification",
-    "WhichGradient",
     "choose_spp",
     "clopper_pearson",
     "count_right",
-    "cross_entropy",
     "draw_seed",
     "get_objective",
     "make_policy",

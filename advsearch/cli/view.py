@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the page and say where it is."""
     from advsearch.runs.directory import find_run
-    from advsearch.viewer.bundle import renewed, write_bundle
+    from advsearch.viewer.pages import renewed, write_bundle
 
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:

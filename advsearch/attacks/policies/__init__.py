@@ -10,7 +10,7 @@ from advsearch.attacks.policies.adam import Adam
 from advsearch.attacks.policies.archive import MapElites
 from advsearch.attacks.policies.auto import Auto
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
-from advsearch.attacks.policies.choices import Choices, with_choices
+from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.cmaes import CMAES
 from advsearch.attacks.policies.grid import Grid
 from advsearch.attacks.policies.mixture import Mixture
@@ -102,8 +102,6 @@ __all__ = [
     "Choices",
     "Evaluated",
     "Grid",
-    "MapElites",
-    "Mixture",
     "Policy",
     "Portfolio",
     "Proposal",
@@ -114,5 +112,4 @@ __all__ = [
     "draw_seed",
     "make_policy",
     "seeded",
-    "with_choices",
 ]
