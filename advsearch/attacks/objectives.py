@@ -125,77 +125,51 @@ _OWN = {
     kind.name: kind
     for kind in (
         ObjectiveKind(
-            "margin",
-            "the largest wrong logit minus the largest right one",
-            "logits (log-odds)",
-            margin,
+            "margin", "the largest wrong logit minus the largest right one", "logits (log-odds)", margin,
             targeted_margin,
         ),
         ObjectiveKind(
-            "log_odds",
-            "the log-odds of a wrong answer, over all classes",
-            "logits (log-odds)",
-            log_odds,
+            "log_odds", "the log-odds of a wrong answer, over all classes", "logits (log-odds)", log_odds,
             targeted_log_odds,
         ),
         ObjectiveKind(
-            "cross_entropy",
-            "minus the logarithm of the probability of the right answers",
-            "nats",
-            cross_entropy,
+            "cross_entropy", "minus the logarithm of the probability of the right answers", "nats", cross_entropy,
             targeted_cross_entropy,
         ),
         ObjectiveKind(
-            "dlr",
-            "the margin over a distance between logits: independent of their scale",
-            "none (a ratio)",
-            dlr,
+            "dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)", dlr,
             targeted_dlr,
         ),
         ObjectiveKind(
-            "feature_distance",
-            "how far the features lie from those of the clean picture",
-            "lengths of the clean features",
-            of_features=feature_distance,
+            "feature_distance", "how far the features lie from those of the clean picture",
+            "lengths of the clean features", of_features=feature_distance,
         ),
         ObjectiveKind(
-            "distance",
-            "how far the features lie from those of the clean picture, by the angle",
-            "1 - cosine",
-            task=Similarity.name,
-            of_features=cosine_distance,
+            "distance", "how far the features lie from those of the clean picture, by the angle", "1 - cosine",
+            task=Similarity.name, of_features=cosine_distance,
         ),
         ObjectiveKind(
-            "score",
-            "the task's own score, over 0 where an answer is what is sought; in classification the margin",
-            "that of the task",
-            task=None,
-            of_task=_score_of,
+            "score", "the task's own score, over 0 where an answer is what is sought; in classification the margin",
+            "that of the task", task=None, of_task=_score_of,
         ),
         *(
             ObjectiveKind(name, f"sought: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
             for name, summary in GOALS.items()
         ),
         ObjectiveKind(
-            Together.objective,
-            "of several tasks at once: each task's own objective, put together by `ensemble`",
-            "those of the tasks",
-            task=Together.name,
-            of_task=_score_of,
+            Together.objective, "of several tasks at once: each task's own objective, put together by `ensemble`",
+            "those of the tasks", task=Together.name, of_task=_score_of,
         ),
         *(
             ObjectiveKind(name, f"sought: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
             for name, summary in DEPTH_GOALS.items()
         ),
         ObjectiveKind(
-            "pixel_margin",
-            "the largest wrong logit minus the largest right one, mean over the object's pixels",
-            "logits (log-odds)",
-            task=Segmentation.name,
-            of_task=_pixel_margin_of,
+            "pixel_margin", "the largest wrong logit minus the largest right one, mean over the object's pixels",
+            "logits (log-odds)", task=Segmentation.name, of_task=_pixel_margin_of,
         ),
     )
-}
+}  # fmt: skip
 
 OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
     "advsearch.objectives",
