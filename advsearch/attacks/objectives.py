@@ -41,22 +41,10 @@ from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import Together
 
 __all__ = [
-    "OBJECTIVES",
-    "OBJECTIVE_KINDS",
-    "Objective",
-    "ObjectiveKind",
-    "asked_by",
-    "check_objective",
-    "checked",
-    "cross_entropy",
-    "dlr",
-    "feature_distance",
-    "get_objective",
-    "log_odds",
-    "margin",
-    "objective_summaries",
+    "OBJECTIVES", "OBJECTIVE_KINDS", "Objective", "ObjectiveKind", "asked_by", "check_objective", "checked",
+    "cross_entropy", "dlr", "feature_distance", "get_objective", "log_odds", "margin", "objective_summaries",
     "targeted_margin",
-]
+]  # fmt: skip
 
 
 @final

@@ -31,14 +31,6 @@ def __getattr__(name: str) -> object:
 
 
 __all__ = [
-    "CLOSE_LOOKS",
-    "CONFIGS",
-    "FEWEST_TRIALS",
-    "TRIALS",
-    "TRIALS_OVER",
-    "AttackConfig",
-    "GapConfig",
-    "RenderConfig",
-    "SceneConfig",
-    "SweepConfig",
-]
+    "CLOSE_LOOKS", "CONFIGS", "FEWEST_TRIALS", "TRIALS", "TRIALS_OVER", "AttackConfig", "GapConfig", "RenderConfig",
+    "SceneConfig", "SweepConfig",
+]  # fmt: skip

@@ -93,23 +93,6 @@ def _nested(spec: Spec, where: str) -> Policy[Any]:
 
 
 __all__ = [
-    "CMAES",
-    "NES",
-    "PGD",
-    "POLICIES",
-    "Adam",
-    "Auto",
-    "Choices",
-    "Evaluated",
-    "Grid",
-    "Policy",
-    "Portfolio",
-    "Proposal",
-    "Random",
-    "Restarts",
-    "Sobol",
-    "Spec",
-    "draw_seed",
-    "make_policy",
-    "seeded",
-]
+    "CMAES", "NES", "PGD", "POLICIES", "Adam", "Auto", "Choices", "Evaluated", "Grid", "Policy", "Portfolio",
+    "Proposal", "Random", "Restarts", "Sobol", "Spec", "draw_seed", "make_policy", "seeded",
+]  # fmt: skip
