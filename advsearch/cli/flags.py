@@ -141,7 +141,7 @@ def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
 
 
 def _controls(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose={...},texture={...}``."""
+    """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose={...},x={...}``."""
     controls: list[tuple[str, Any]] = []
     for part in (part for text in given for part in _parts(text) if part.strip()):
         name, settings = parse_assignment(part, flag) if "=" in part else (part.strip(), {})

@@ -28,9 +28,9 @@ from advsearch.rooms import there
 
 GROUPS = {
     "ask: what does a model get wrong?": {
-        "attack": "advsearch.cli.attack",
-        "sweep": "advsearch.cli.sweep",
-        "gap": "advsearch.cli.gap",
+        "attack": "advsearch.questions.attack.command",
+        "sweep": "advsearch.questions.sweep.command",
+        "gap": "advsearch.questions.gap.command",
         "region": "advsearch.questions.region.command",
         "explain": "advsearch.questions.explain.command",
         "compare": "advsearch.questions.compare.command",

@@ -124,7 +124,7 @@ def shown_text(result: Result) -> str:
     given, run = shown(result), getattr(result, "run", None)
     parts = [given.said]
     for one in given.sections:
-        if one.only == "page" or one.empty:
+        if one.only not in ("", "text") or one.empty:
             continue
         table = aligned([one.heads, *one.rows] if one.heads else one.rows)
         pictures = [[picture.file, picture.caption] for group in one.pictures for picture in group]

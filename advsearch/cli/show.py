@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from advsearch.controls import Choice, Parameter
+    from advsearch.questions.photographs.answer import PhotoAgreement
     from advsearch.runs.listing import Listed
-    from advsearch.runs.results.photos import PhotoAgreement
 
 
 import sys
@@ -89,12 +89,12 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
 
 def photos_of(run: Path) -> PhotoAgreement | None:
     """Return how photographs agree with the run's renderings; None where there are none."""
+    from advsearch.questions.photographs.files import FOLDER
     from advsearch.runs.directory import IMAGES
-    from advsearch.viewer.photos import FOLDER
 
     if not (run / IMAGES / FOLDER).is_dir():
         return None
-    from advsearch.api.photos import photo_agreement
+    from advsearch.questions.photographs.carry_out import photo_agreement
 
     return photo_agreement(run)
 

@@ -8,7 +8,7 @@ that this package stays light.
 from __future__ import annotations
 
 from advsearch import rooms
-from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig, GapConfig
+from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import CLOSE_LOOKS, SceneConfig
 from advsearch.config.sweep import SweepConfig
@@ -18,7 +18,7 @@ CONFIGS: dict[str, type[Config]]
 """What the settings of each command are, in the order in which the docs show them; those of questions that are rooms
 are read when somebody first asks, since they are made of the kinds here."""
 
-_OWN: tuple[type[Config], ...] = (AttackConfig, RenderConfig, SweepConfig, GapConfig)
+_OWN: tuple[type[Config], ...] = (AttackConfig, RenderConfig, SweepConfig)
 
 
 def __getattr__(name: str) -> object:
@@ -31,6 +31,6 @@ def __getattr__(name: str) -> object:
 
 
 __all__ = [
-    "CLOSE_LOOKS", "CONFIGS", "FEWEST_TRIALS", "TRIALS", "TRIALS_OVER", "AttackConfig", "GapConfig", "RenderConfig",
+    "CLOSE_LOOKS", "CONFIGS", "FEWEST_TRIALS", "TRIALS", "TRIALS_OVER", "AttackConfig", "RenderConfig",
     "SceneConfig", "SweepConfig",
 ]  # fmt: skip

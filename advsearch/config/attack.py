@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, model_validator
 
@@ -13,10 +13,6 @@ from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.files import JsonObject
 from advsearch.settings import Clash, setting, setting_as_in, split_names
-
-if TYPE_CHECKING:
-    pass
-
 
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
@@ -105,7 +101,9 @@ class AttackConfig(DerivativeConfig):
         otherwise="each by itself",
     )
     measure: Literal["no", "quick", "full"] = setting(
-        "quick", "search", "measure which gradient estimator is best on this scene; full also measures step and samples"
+        "quick",
+        "search",
+        "measure which gradient estimator is best on this scene; full also measures step and samples",
     )
     policy: str | dict[str, JsonValue] = setting(
         "auto", "search", "the search policy, which proposes configurations",
@@ -239,15 +237,3 @@ def instance(asked: str) -> str:
     """A control as it is asked for, without its parameter: `light:key`, or `camera` of `camera.azimuth`."""
     kind, colon, own = asked.partition(":")
     return kind.partition(".")[0] + colon + own.partition(".")[0]
-
-
-class GapConfig(AttackConfig):
-    """Everything that decides what `gap` does: the worst case beside the average, for each object and each control."""
-
-    command: ClassVar[str] = "gap"
-    several: ClassVar[tuple[str, ...]] = ("object",)
-    without: ClassVar[tuple[str, ...]] = ("smallest", "ensemble", "printable", "aov", "metrics", "log")
-
-    model: str = setting_as_in(SceneConfig, "model")
-    average: int = setting_as_in(AttackConfig, "average", default=200, ge=1)
-    workers: int | None = setting_as_in(AttackConfig, "workers", description="worker processes that share the attacks")

@@ -57,7 +57,7 @@ from advsearch.runs.results.attack import (
 from advsearch.runs.results.base import Formation, MovedValue, VariedValue
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
-from advsearch.viewer.attack_page import write_report
+from advsearch.viewer.pages import write_page
 
 T = TypeVar("T")
 
@@ -110,7 +110,7 @@ def summarise(
     )
     if run is not None:
         run.write_summary(summary)
-        write_report(run.path)
+        write_page(run.path, summary)
         if not findings.interrupted:
             run.finish()
     return AttackResult(

@@ -1,4 +1,6 @@
-"""The attacks of a study on workers: each in a folder on the worker's own disk, which comes back as files.
+"""Studies: questions that take several attacks, each in a folder of its own in the run, on workers if asked to.
+
+A worker carries an attack out in a folder on its own disk, which comes back as files.
 
 An attack that this process has begun itself stays its own. What is shared are whole attacks, in a curve all those of an
 object, so that one whose worker died begins again.
@@ -7,24 +9,42 @@ object, so that one whose worker died begins again.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-from advsearch.api.attack import attack_once
+from advsearch import rooms
 from advsearch.cluster.executor import Call, Work
 from advsearch.cluster.opening import executor_of
-from advsearch.config import CONFIGS, AttackConfig, GapConfig
+from advsearch.config import CONFIGS, AttackConfig
 from advsearch.engine import run_settings
-from advsearch.engine.naming import different
+from advsearch.engine.answers import one_label_for_several
+from advsearch.engine.attack_result import AttackResult
+from advsearch.engine.naming import different, load_models
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
-from advsearch.progress import Progress
+from advsearch.interrupts import interruptible
+from advsearch.progress import NullProgress, Progress
+from advsearch.report.notebook import figure_of_answer
+from advsearch.report.shown import shown
 from advsearch.runs import lock
-from advsearch.runs.directory import PARTS, default_name, is_run
+from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
 from advsearch.runs.files import PART, storage_errors, write_bytes
+from advsearch.runs.listing import finished
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results.study import StudyResult
+from advsearch.runs.summary import attack_of
+from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES
+from advsearch.tasks import make_task
+from advsearch.viewer.pages import write_page
+
+Study = TypeVar("Study", bound=StudyResult)
+Rows = TypeVar("Rows")
 
 LONGEST = 6 * 3600.0
 """Seconds that one attack may take on a worker before it counts as hanging."""
@@ -72,12 +92,12 @@ def chains_of(config: AttackConfig) -> list[Chain]:
     Raises:
         InputError: a setting that none of the controls takes, or a name comes twice.
     """
-    if isinstance(config, GapConfig):
+    if config.command == "gap":
         return [[one] for one in _controls_of(config)]
     return [[one] for one in _models_of(config)] if config.is_matrix else _objects_of(config)
 
 
-def _controls_of(config: GapConfig) -> Chain:
+def _controls_of(config: AttackConfig) -> Chain:
     """Every object with every control."""
     run_settings.check(config)
     attacks = []
@@ -112,6 +132,12 @@ def _objects_of(config: AttackConfig) -> list[Chain]:
     return chains
 
 
+def attack_once() -> Callable[..., AttackResult]:
+    """Return what carries out one attack, of the room that attacks."""
+    found: Callable[..., AttackResult] = rooms.in_room("attack", "carry_out", "attack_once")
+    return found
+
+
 def attacks_of(settings: JsonObject) -> Call:
     """Return what carries out the attacks of the study that the settings describe: what a worker does."""
     config = CONFIGS[str(settings["command"])](**{k: v for k, v in settings.items() if k != "command"})
@@ -124,7 +150,7 @@ def attacks_of(settings: JsonObject) -> Call:
             for part in chains[numbers[0]]:
                 path = Path(folder) / part.name
                 own = part.config.model_copy(update={"run": str(path), "overwrite": True})
-                ending = attack_once(own, clean=clean).summary.ending
+                ending = attack_once()(own, clean=clean).summary.ending
                 files = (one for one in path.rglob("*") if one.is_file() and one.name != lock.NAME)
                 read = {one.relative_to(path).as_posix(): one.read_bytes() for one in files}
                 found.append((part.name, str(path), read))
@@ -150,7 +176,7 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
     left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / one.name) for one in chain)]
     plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     settings, threads = {"command": config.command, **plain}, config.used_threads or 1
-    work = Work("advsearch.api.parts:attacks_of", settings, FILES, threads, seconds=LONGEST, ahead=False)
+    work = Work("advsearch.api.studies:attacks_of", settings, FILES, threads, seconds=LONGEST, ahead=False)
     workers, cluster = (config.workers, config.cluster) if left else (None, None)
     with executor_of(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
         if executor is None:
@@ -176,3 +202,109 @@ def _place(folder: Path, name: str, before: str, files: Mapping[str, bytes]) -> 
             (part / relative).parent.mkdir(parents=True, exist_ok=True)
             write_bytes(part / relative, data)
         part.rename(path)
+
+
+# ---- one study ------------------------------------------------------------------------------------------------------
+
+
+def carry_out_study(
+    config: AttackConfig,
+    attacks: Callable[[StudyRun], Rows],
+    result_of: Callable[[Rows, StudyResult], Study],
+    progress: Progress | None,
+    resumed: Path | None,
+) -> Study:
+    """Carry out the attacks of a study in its run.
+
+    Args:
+        config: what is asked.
+        attacks: carries out the attacks and returns their rows.
+        result_of: puts these into a result, beside what all studies have in common.
+        progress: told how far it is.
+        resumed: folder of the run to go on with.
+    """
+    begun, progress = time.perf_counter(), progress or NullProgress()
+    with RunDirectory.of(config, resumed) as run:
+        notes = _label_for_all(config)
+        for text in notes:
+            progress.message(text)
+        study = StudyRun(config, run, progress)
+        rows = attacks(study)
+        common = StudyResult(
+            run=str(run.path),
+            objects=list(config.objects),
+            controls=list(config.controls),
+            environment=config.lit_by,
+            model=config.model,
+            task=config.task_name,
+            policy=config.policy_name,
+            warnings=[*notes, *study.warnings],
+            parts=study.names,
+            ending=INTERRUPTED if study.interrupted else "done",
+            seconds={"total": time.perf_counter() - begun},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        result = result_of(rows, common)
+        for suffix, data in figure_of_answer(shown(result)).items():
+            write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
+        run.write_summary(result)
+        write_page(run.path, result)
+        return result
+
+
+def _label_for_all(config: AttackConfig) -> list[str]:
+    """What there is to say where several bundled objects have one label."""
+    if config.label is None or len(config.objects) < 2:
+        return []
+    bundled = list_objects()
+    own = {name: load_object(name).label if name in bundled else None for name in config.objects}
+    models, _ = load_models([config.model], make_task(config.task), config)
+    return one_label_for_several(models, config.label, own)
+
+
+class StudyRun:
+    """Carries out attacks, each in a folder of its own, unless they are done already; first on workers, if asked to.
+
+    Attributes:
+        chains: all that there are.
+        run: of the study.
+        progress: told how far it is.
+        names: of the parts so far.
+        warnings: what they said, each sentence once.
+        interrupted: whether one was; nothing more is carried out then.
+    """
+
+    def __init__(self, config: AttackConfig, run: RunDirectory, progress: Progress) -> None:
+        self.chains, self.run, self.progress = chains_of(config), run, progress
+        self.names: list[str] = []
+        self.warnings: list[str] = []
+        self.interrupted = False
+        try:
+            with interruptible():
+                share(config, self.chains, run.path, progress)
+        except KeyboardInterrupt:
+            self.interrupted = True
+
+    def attack(self, one: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
+        """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
+        if self.interrupted:
+            return None
+        config, path = one.config, self.run.path / PARTS / one.name
+        self.names.append(one.name)
+        budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
+        what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
+        self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
+        if is_run(path) and (path / CONFIG).is_file():
+            began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG)
+            summary = (
+                attack_once()(began, progress=self.progress, resumed=path, clean=clean).summary
+                if began
+                else attack_of(path)
+            )
+        else:
+            own = config.model_copy(update={"run": str(path), "overwrite": True})
+            summary = attack_once()(own, progress=self.progress, clean=clean).summary
+        self.warnings += [text for text in summary.warnings if text not in self.warnings]
+        self.interrupted = summary.ending == INTERRUPTED
+        return None if self.interrupted else summary

@@ -14,18 +14,10 @@ from pathlib import Path
 from typing import Protocol
 
 from advsearch.errors import InputError
-from advsearch.runs.results.photos import PhotoAgreement
-from advsearch.viewer.align_page import align_page, table_html
-from advsearch.viewer.photos import LARGEST, photo_file, rendering_file, rendering_names
-
-
-class Refused(Exception):
-    """A request that is not answered as asked."""
-
-    def __init__(self, status: HTTPStatus, text: str) -> None:
-        super().__init__(text)
-        self.status = status
-
+from advsearch.questions.photographs.answer import PhotoAgreement
+from advsearch.questions.photographs.files import LARGEST, photo_file, rendering_file, rendering_names
+from advsearch.questions.photographs.page import align_page, table_html
+from advsearch.viewer.refused import Refused
 
 SENDING = 60.0
 """Seconds in which a photograph has to have come."""
@@ -38,7 +30,7 @@ Response = tuple[str, bytes]
 
 
 class PhotoTaker(Protocol):
-    """Takes photographs in; `advsearch.api.photos.Photographs` does."""
+    """Takes photographs in; `Photographs` does."""
 
     def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
         """Judge and keep a photograph, and return the run's table; InputError says why it can't."""

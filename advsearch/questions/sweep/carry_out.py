@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from advsearch.api.attack import LOADING, executor_for, is_named
 from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, SweepConfig
@@ -18,6 +17,7 @@ from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, measured_in
 from advsearch.engine import run_settings
 from advsearch.engine.answers import one_label_for_several, shown
+from advsearch.engine.attack_parts import LOADING, executor_for, is_named
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import Controls, Scene, load_scene, named_camera, only_here, settings_of
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
-ANSWERING = "advsearch.api.sweep:sweep_answers"
+ANSWERING = "advsearch.questions.sweep.carry_out:sweep_answers"
 """What a worker does."""
 
 CLEAN = "clean"

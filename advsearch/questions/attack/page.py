@@ -12,18 +12,26 @@ from pathlib import Path
 import numpy as np
 
 from advsearch.files import JsonObject
+from advsearch.questions.attack.method import PLAN_HEADS, method_facts, plan_rows, plan_text
+from advsearch.questions.attack.words import answered_text, failures_part, failures_text, range_text
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
-from advsearch.report.failures import FAILURE_HEADS, answered_text, failure_rows, failures_text, range_text
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.method import PLAN_HEADS, method_facts, plan_rows, plan_text
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, is_command, marks_text, objective_label
 from advsearch.runs import directory, images, store
-from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, DifferentFailure, FoundValue, PicturedAnswer
+from advsearch.runs.results.base import Result
 from advsearch.runs.summary import attack_of
-from advsearch.viewer.document import data_script, data_url, document, scrolled
-from advsearch.viewer.study_page import facts_table, heading, study_table, subject_html
+from advsearch.viewer.document import (
+    data_script,
+    data_url,
+    document,
+    facts_table,
+    heading,
+    scrolled,
+    study_table,
+    subject_html,
+)
 from advsearch.viewer.turning import object_data, object_section, read_object
 
 LARGE_PICTURE = 1_000_000
@@ -67,19 +75,17 @@ class RunData:
     thing: bytes = b""
 
 
-def write_report(run: str | Path) -> Path:
-    """Write `report.html` into the directory of a run that has its summary, and return its path.
+def page(run: Path, result: Result) -> str | None:
+    """Return the page of an attack in the folder `run`; None of several, which are shown as all answers are.
 
     Raises:
-        FileFormatError: there is no summary, or the results are damaged.
-        StorageError: the page cannot be written.
+        FileFormatError: the results are damaged.
     """
-    data = read_run(Path(run))
-    return write_text(data.path / directory.REPORT, attack_page_html(data), durable=False)
+    return attack_page_html(read_run(run)) if isinstance(result, AttackSummary) else None
 
 
 def read_run(path: Path) -> RunData:
-    """Return what the run in `path` left behind; errors as for `write_report`."""
+    """Return what the run in `path` left behind; errors as for `page`."""
     recipe = path / directory.CONFIG
     return RunData(
         path=path,
@@ -179,12 +185,12 @@ def _failures(data: RunData) -> Html:
         for one in known.listed
         if one.picture and one.holds
     ]
-    rows = failure_rows(known)
+    table = failures_part(known)
     return join_html(
         element("h2", "Different failures"),
         element("p", f"Failures are {failures_text(known)}."),
         element("div", *shown, class_="pictures") if shown else None,
-        study_table(FAILURE_HEADS, rows) if rows else None,
+        study_table(table.heads, table.rows) if table.rows else None,
     )
 
 

@@ -14,12 +14,11 @@ import numpy as np
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import judged_alone, problem_from_config
-from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
 from advsearch.engine.answers import facts_of
+from advsearch.engine.attack_parts import judged_alone, problem_from_config
 from advsearch.engine.metrics import judgements
 from advsearch.engine.naming import load_models, scene_of
 from advsearch.engine.retrial import kept_answer
@@ -30,15 +29,16 @@ from advsearch.engine.turn import in_turn
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
+from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
+from advsearch.questions.photographs.files import FOLDER, LARGEST, photo_name, rendering_file, sound_photo
+from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.photos import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
 from advsearch.tasks import Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
-from advsearch.viewer.photos import FOLDER, LARGEST, photo_name, rendering_file, sound_photo
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 """Of the files in a folder that are photographs."""

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import quote
 
+from advsearch.questions.photographs.answer import PhotoAgreement, PhotographedRendering
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.phrases import percent
-from advsearch.runs.results.photos import PhotoAgreement, PhotographedRendering
 from advsearch.viewer.document import data_script, document
 
 NO_QR = "pip install segno"
