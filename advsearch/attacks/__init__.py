@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from advsearch.attacks.domain import Block, Distribution, Domain
-from advsearch.attacks.evaluation import Evaluate, Evaluation, Query, WhichGradient
-from advsearch.attacks.objectives import OBJECTIVES, Objective, cross_entropy, get_objective, margin
+from advsearch.attacks.domain import Block, Domain
+from advsearch.attacks.evaluation import Evaluate, Evaluation, Query
+from advsearch.attacks.objectives import OBJECTIVES, Objective, get_objective, margin
 from advsearch.attacks.policies import (
     CMAES,
     NES,
@@ -25,54 +25,15 @@ from advsearch.attacks.policies import (
     make_policy,
     seeded,
 )
-from advsearch.attacks.sample_count import Rung, SampleCount, choose_spp
+from advsearch.attacks.sample_count import SampleCount, choose_spp
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
 from advsearch.attacks.trials import Trials, clopper_pearson
 from advsearch.attacks.verification import Ending, Verification, count_right, run_trials, verify
 
 __all__ = [
-    "CMAES",
-    "NES",
-    "OBJECTIVES",
-    "PGD",
-    "POLICIES",
-    "Adam",
-    "Auto",
-    "Block",
-    "Choices",
-    "Distribution",
-    "Domain",
-    "Ending",
-    "Evaluate",
-    "Evaluated",
-    "Evaluation",
-    "Grid",
-    "Objective",
-    "Policy",
-    "Portfolio",
-    "Proposal",
-    "Query",
-    "Random",
-    "Restarts",
-    "Rung",
-    "SampleCount",
-    "SearchResult",
-    "Sobol",
-    "StepRecord",
-    "Trials",
-    "Verification",
-    "WhichGradient",
-    "choose_spp",
-    "clopper_pearson",
-    "count_right",
-    "cross_entropy",
-    "draw_seed",
-    "get_objective",
-    "make_policy",
-    "margin",
-    "planned_renders",
-    "run_trials",
-    "search",
-    "seeded",
-    "verify",
-]
+    "CMAES", "NES", "OBJECTIVES", "PGD", "POLICIES", "Adam", "Auto", "Block", "Choices", "Domain", "Ending", "Evaluate",
+    "Evaluated", "Evaluation", "Grid", "Objective", "Policy", "Portfolio", "Proposal", "Query", "Random", "Restarts",
+    "SampleCount", "SearchResult", "Sobol", "StepRecord", "Trials", "Verification", "choose_spp", "clopper_pearson",
+    "count_right", "draw_seed", "get_objective", "make_policy", "margin", "planned_renders", "run_trials", "search",
+    "seeded", "verify",
+]  # fmt: skip

@@ -121,9 +121,6 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     return targeted_margin(logits, images, target) / _safe(_wider(top), spread)
 
 
-# ---- parts ----------------------------------------------------------------------------------------------------------
-
-
 def _log_odds(logits: Tensor, of: Tensor) -> Tensor:
     inside = logits.masked_fill(~of, -math.inf).logsumexp(dim=1)
     return inside - logits.masked_fill(of, -math.inf).logsumexp(dim=1)

@@ -41,23 +41,10 @@ from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import Together
 
 __all__ = [
-    "OBJECTIVES",
-    "OBJECTIVE_KINDS",
-    "Objective",
-    "ObjectiveKind",
-    "asked_by",
-    "check_objective",
-    "checked",
-    "cross_entropy",
-    "dlr",
-    "feature_distance",
-    "get_objective",
-    "log_odds",
-    "margin",
-    "negated",
-    "objective_summaries",
+    "OBJECTIVES", "OBJECTIVE_KINDS", "Objective", "ObjectiveKind", "asked_by", "check_objective", "checked",
+    "cross_entropy", "dlr", "feature_distance", "get_objective", "log_odds", "margin", "objective_summaries",
     "targeted_margin",
-]
+]  # fmt: skip
 
 
 @final
@@ -105,99 +92,72 @@ class ObjectiveKind:
         return found
 
 
+def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
+    """An objective that asks for nothing more."""
+
+    def plain(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        return function(output, images, truth)
+
+    return plain
+
+
 def _score_of(task: Task) -> Objective:
-    """The score of a task."""
-
-    def score(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return task.score(output, truth)
-
-    return score
+    return _plain(lambda output, images, truth: task.score(output, truth))
 
 
 def _pixel_margin_of(task: Segmentation) -> Objective:
-    """The mean over the object's pixels."""
-
-    def pixel_margin(output: Tensor, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return task.pixel_margin(output, truth)
-
-    return pixel_margin
+    return _plain(lambda output, images, truth: task.pixel_margin(output, truth))
 
 
 _OWN = {
     kind.name: kind
     for kind in (
         ObjectiveKind(
-            "margin",
-            "the largest wrong logit minus the largest right one",
-            "logits (log-odds)",
-            margin,
+            "margin", "the largest wrong logit minus the largest right one", "logits (log-odds)", margin,
             targeted_margin,
         ),
         ObjectiveKind(
-            "log_odds",
-            "the log-odds of a wrong answer, over all classes",
-            "logits (log-odds)",
-            log_odds,
+            "log_odds", "the log-odds of a wrong answer, over all classes", "logits (log-odds)", log_odds,
             targeted_log_odds,
         ),
         ObjectiveKind(
-            "cross_entropy",
-            "minus the logarithm of the probability of the right answers",
-            "nats",
-            cross_entropy,
+            "cross_entropy", "minus the logarithm of the probability of the right answers", "nats", cross_entropy,
             targeted_cross_entropy,
         ),
         ObjectiveKind(
-            "dlr",
-            "the margin over a distance between logits: independent of their scale",
-            "none (a ratio)",
-            dlr,
+            "dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)", dlr,
             targeted_dlr,
         ),
         ObjectiveKind(
-            "feature_distance",
-            "how far the features lie from those of the clean picture",
-            "lengths of the clean features",
-            of_features=feature_distance,
+            "feature_distance", "how far the features lie from those of the clean picture",
+            "lengths of the clean features", of_features=feature_distance,
         ),
         ObjectiveKind(
-            "distance",
-            "how far the features lie from those of the clean picture, by the angle",
-            "1 - cosine",
-            task=Similarity.name,
-            of_features=cosine_distance,
+            "distance", "how far the features lie from those of the clean picture, by the angle", "1 - cosine",
+            task=Similarity.name, of_features=cosine_distance,
         ),
         ObjectiveKind(
-            "score",
-            "the task's own score, over 0 where an answer is what is sought; in classification the margin",
-            "that of the task",
-            task=None,
-            of_task=_score_of,
+            "score", "the task's own score, over 0 where an answer is what is sought; in classification the margin",
+            "that of the task", task=None, of_task=_score_of,
         ),
         *(
             ObjectiveKind(name, f"sought: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
             for name, summary in GOALS.items()
         ),
         ObjectiveKind(
-            Together.objective,
-            "of several tasks at once: each task's own objective, put together by `ensemble`",
-            "those of the tasks",
-            task=Together.name,
-            of_task=_score_of,
+            Together.objective, "of several tasks at once: each task's own objective, put together by `ensemble`",
+            "those of the tasks", task=Together.name, of_task=_score_of,
         ),
         *(
             ObjectiveKind(name, f"sought: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
             for name, summary in DEPTH_GOALS.items()
         ),
         ObjectiveKind(
-            "pixel_margin",
-            "the largest wrong logit minus the largest right one, mean over the object's pixels",
-            "logits (log-odds)",
-            task=Segmentation.name,
-            of_task=_pixel_margin_of,
+            "pixel_margin", "the largest wrong logit minus the largest right one, mean over the object's pixels",
+            "logits (log-odds)", task=Segmentation.name, of_task=_pixel_margin_of,
         ),
     )
-}
+}  # fmt: skip
 
 OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
     "advsearch.objectives",
@@ -245,7 +205,7 @@ def get_objective(
     task = task or Classification()
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
-    kind = _kind_of(objective)
+    kind, of_answers = _kind_of(objective), False
     if kind is None:
         found = checked(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
@@ -260,10 +220,14 @@ def get_objective(
     else:
         form = kind.form(targeted=targeted)
         found = _plain(form) if _OWN.get(kind.name) is kind else checked(form)
-        if isinstance(task, Similarity) or (isinstance(task, ClassTask) and task.nothing):
-            found = _of_answers(found, task)
-    found = _aimed(found, task.target) if targeted else found
-    return negated(found) if task.minimise else found
+        of_answers = isinstance(task, Similarity) or (isinstance(task, ClassTask) and bool(task.nothing))
+
+    def sought(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        wanted = task.target if targeted else truth
+        value = found(task.answerable(output, wanted) if of_answers else output, images, wanted, more)
+        return -value if task.minimise else value
+
+    return sought
 
 
 def check_objective(
@@ -322,39 +286,3 @@ def _kind_of(objective: object) -> ObjectiveKind | None:
     if isinstance(objective, str):
         return OBJECTIVE_KINDS[objective]
     return next((kind for kind in OBJECTIVE_KINDS.values() if kind.plain is objective), None)
-
-
-def _plain(function: Callable[..., Tensor]) -> Objective:
-    """An objective that asks for nothing more."""
-
-    def plain(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return function(output, images, truth)
-
-    return plain
-
-
-def _aimed(objective: Objective, target: Any) -> Objective:
-    """Wrap an objective of a target so that it is called with the truth, like any other."""
-
-    def aimed(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return objective(output, images, target, more)
-
-    return aimed
-
-
-def _of_answers(objective: Objective, task: Task) -> Objective:
-    """Wrap an objective of logits so that it sees only what is an answer."""
-
-    def of_answers(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return objective(task.answerable(output, truth), images, truth, more)
-
-    return of_answers
-
-
-def negated(objective: Objective) -> Objective:
-    """Wrap an objective so that what is maximised is its negative: easier to recognise instead of harder."""
-
-    def negative(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return -objective(output, images, truth, more)
-
-    return negative

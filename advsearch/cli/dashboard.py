@@ -24,7 +24,6 @@ EXAMPLES = ("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --h
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)")
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen at (default: %(default)s); others need the printed token"
@@ -79,9 +78,7 @@ class _LoadedLater:
         return Photographs()
 
     def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
-        """See `Photographs.add`."""
         return self._loaded.add(run, rendering, data)
 
     def agreement(self, run: Path) -> PhotoAgreement:
-        """See `Photographs.agreement`."""
         return self._loaded.agreement(run)

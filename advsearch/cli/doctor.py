@@ -6,7 +6,8 @@ takes its process down, and the rest should still be told.
 
 from __future__ import annotations
 
-import json as jsonlib
+import argparse
+import json
 import os
 import platform
 import re
@@ -21,7 +22,10 @@ from importlib import metadata, resources
 from pathlib import Path
 
 from advsearch import __version__, threads
+from advsearch.cli import output
 from advsearch.errors import AdvsearchError
+
+HELP = "check every part that a run needs, with versions and how to mend it"
 
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
 """The states of a part. A warning does not keep anything from running."""
@@ -60,17 +64,27 @@ class Component:
     fix: str = _NO_FIX_NEEDED
 
 
-def run(json: bool = False) -> int:
-    """Check every part and print the list: a table for a person, one JSON value with `json`.
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    output.add_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check, print, and return the checks' exit status."""
+    print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
+    return told(as_json=args.json)
+
+
+def told(as_json: bool = False) -> int:
+    """Check every part and print the list: a table for a person, one JSON value with `as_json`.
 
     Returns:
         0 when everything that is necessary works, 3 otherwise.
     """
     parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
-    if json:
+    if as_json:
         answer = {"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]}
-        print(jsonlib.dumps(answer, indent=2))
+        print(json.dumps(answer, indent=2))
     else:
         _print_table(parts, good)
     return 0 if good else FELL_SHORT
@@ -105,7 +119,7 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
     tried = {}
     for line in output.splitlines():
         try:
-            answer = jsonlib.loads(line)
+            answer = json.loads(line)
             tried[answer["name"]] = (bool(answer["ok"]), str(answer["detail"]))
         except (ValueError, KeyError, TypeError):  # a library's own words
             continue

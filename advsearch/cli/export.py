@@ -35,7 +35,6 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
     names = ", ".join([*WRITERS, "csv", "json", "parquet"])
     parser.add_argument("--format", help=f"{names} (default: by the name of --out, or csv)")

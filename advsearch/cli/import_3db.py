@@ -11,7 +11,6 @@ HELP = "turn a folder that 3DB wrote into a run"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.description = (
         "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page."
     )

@@ -24,7 +24,6 @@ VIEWS, SIDE = 4, 192
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba")
     parser.add_argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)")
     output.add_flags(parser)

@@ -13,7 +13,6 @@ EXAMPLES = ("labels", "labels mug --labels labels.json", "labels mug --model mod
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     from advsearch.cli.flags import add_settings
 
     parser.add_argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it")

@@ -30,7 +30,6 @@ MODELS = {"reference": "the bundled classifier of household objects; models of y
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all")
     output.add_flags(parser)
 

@@ -53,7 +53,7 @@ GROUPS = {
         "plan": "advsearch.questions.plan.command",
         "precision": "advsearch.questions.precision.command",
         "stability": "advsearch.questions.stability.command",
-        "doctor": "advsearch.cli.doctor_command",
+        "doctor": "advsearch.cli.doctor",
     },
     "files and runs: repeat, continue, bring in, take out": {
         "run": "advsearch.cli.run",

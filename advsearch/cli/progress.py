@@ -66,11 +66,9 @@ class LoadingProgress:
         self._progress.stage(name, total, hint=hint, at_most=at_most)
 
     def advance(self, n: int = 1, **info: float | str) -> None:
-        """See `Progress.advance`."""
         self._progress.advance(n, **info)
 
     def message(self, text: str) -> None:
-        """See `Progress.message`."""
         self._progress.message(text)
 
     def end(self) -> None:

@@ -20,7 +20,6 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
     parser.add_argument(
         "change", metavar="NAME=VALUE", nargs="*", help="a setting to change that decides no number: threads=2"

@@ -24,7 +24,6 @@ COMMANDS = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("file", metavar="FILE", help="YAML with settings and values, such as a run's run.yaml")
     parser.add_argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80")
     parser.add_argument("--run", help="where the run is kept: a name (kept in runs/) or the path of a folder")

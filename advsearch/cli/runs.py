@@ -16,7 +16,6 @@ HELP = "list the runs in a folder and how each ended"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)")
     output.add_flags(parser)
 

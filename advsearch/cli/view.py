@@ -13,7 +13,6 @@ EXAMPLES = ("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle sit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle")
     parser.add_argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures")
     output.add_flags(parser)
@@ -22,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the page and say where it is."""
     from advsearch.runs.directory import find_run
-    from advsearch.viewer.bundle import renewed, write_bundle
+    from advsearch.viewer.pages import renewed, write_bundle
 
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:

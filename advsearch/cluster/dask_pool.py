@@ -125,7 +125,6 @@ class DaskPool:
     # ---- what the coordinator calls ---------------------------------------------------------------------------------
 
     def submit(self, ticket: int, worker: str, function: Callable[..., Any], *args: Any) -> None:
-        """See `Pool.submit`."""
 
         def begin() -> None:
             self._calls[ticket] = self._loop.create_task(self._call(ticket, worker, function, args))
@@ -133,7 +132,6 @@ class DaskPool:
         self._loop.call_soon_threadsafe(begin)
 
     def forget(self, ticket: int) -> None:
-        """See `Pool.forget`."""
 
         def cancel() -> None:
             if (call := self._calls.pop(ticket, None)) is not None:
@@ -146,7 +144,6 @@ class DaskPool:
         self._begin(self._restart(worker))
 
     def events(self, seconds: float) -> list[Event]:
-        """See `Pool.events`."""
         found: list[Event] = []
         try:
             found.append(self._events.get(timeout=seconds))
@@ -156,12 +153,10 @@ class DaskPool:
             return found
 
     def reconnect(self) -> None:
-        """See `Pool.reconnect`."""
         self._done(self._leave())
         self._done(self._open(RECONNECT))
 
     def close(self) -> None:
-        """See `Pool.close`."""
         if self._loop.is_closed():
             return
         try:

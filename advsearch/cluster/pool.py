@@ -9,23 +9,14 @@ from typing import Any, Protocol
 
 @dataclass(frozen=True)
 class Joined:
-    """A worker is there.
-
-    Attributes:
-        worker: its address.
-    """
+    """The worker with that address is there."""
 
     worker: str
 
 
 @dataclass(frozen=True)
 class Left:
-    """A worker has gone.
-
-    Attributes:
-        worker: its address.
-        told: whether it was told to go.
-    """
+    """The worker with that address has gone, because it was told to or for another reason."""
 
     worker: str
     told: bool = False
@@ -33,12 +24,7 @@ class Left:
 
 @dataclass(frozen=True)
 class Ended:
-    """A call has ended.
-
-    Attributes:
-        ticket: of the call.
-        value: what it returned.
-    """
+    """The call with that ticket has ended, and has returned the value."""
 
     ticket: int
     value: Any
@@ -46,12 +32,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class Dropped:
-    """A call came to no end, because its worker or the connection went.
-
-    Attributes:
-        ticket: of the call.
-        reason: in words.
-    """
+    """The call with that ticket came to no end, because its worker or the connection went; the reason in words."""
 
     ticket: int
     reason: str = ""

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from advsearch import rooms
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
-from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.rendering import RenderConfig
-from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
+from advsearch.config.scene import CLOSE_LOOKS, SceneConfig
 from advsearch.config.sweep import SweepConfig
 from advsearch.settings import Config
 
@@ -32,16 +31,6 @@ def __getattr__(name: str) -> object:
 
 
 __all__ = [
-    "AUTO_SHARE",
-    "CLOSE_LOOKS",
-    "CONFIGS",
-    "FEWEST_TRIALS",
-    "SEARCH_SPP",
-    "TRIALS",
-    "TRIALS_OVER",
-    "AttackConfig",
-    "DerivativeConfig",
-    "RenderConfig",
-    "SceneConfig",
-    "SweepConfig",
-]
+    "CLOSE_LOOKS", "CONFIGS", "FEWEST_TRIALS", "TRIALS", "TRIALS_OVER", "AttackConfig", "RenderConfig",
+    "SceneConfig", "SweepConfig",
+]  # fmt: skip

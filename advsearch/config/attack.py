@@ -35,31 +35,27 @@ class AttackConfig(DerivativeConfig):
     several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
 
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "log", "workers", "cluster")
+    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
         Clash(
-            "smallest",
-            lambda one: one.epsilons,
+            "smallest", lambda one: one.epsilons,
             "finds one epsilon by itself; give one `epsilon` as the largest, or none",
         ),
         Clash(
-            "smallest",
-            lambda one: one.is_study,
+            "smallest", lambda one: one.is_study,
             "is about one object and one model; name one `object`, one `model`, and one `epsilon` as the largest",
         ),
         Clash(
-            "model",
-            lambda one: one.is_matrix and one.is_curve,
+            "model", lambda one: one.is_matrix and one.is_curve,
             "several make a matrix, of one object and one epsilon; name one `object` and one `epsilon`, or one `model`",
         ),
         Clash(
-            "ensemble",
-            lambda one: len(split_names(one.model)) < 2,
+            "ensemble", lambda one: len(split_names(one.model)) < 2,
             "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
         ),
         Clash(
-            "smallest",
-            lambda one: one.seconds is not None,
+            "smallest", lambda one: one.seconds is not None,
             "takes several searches; give `steps` for each, and leave `seconds` out",
         ),
         Clash("smallest", lambda one: one.over, "cannot be combined with `over` yet; leave one of them out"),
@@ -68,8 +64,7 @@ class AttackConfig(DerivativeConfig):
         Clash("minimise", lambda one: one.target, "makes the right answer easier to give; leave `target` out"),
         Clash("minimise", lambda one: one.smallest, "has no smallest change; leave `smallest` out"),
         Clash(
-            "over",
-            lambda one: {*map(instance, one.over)} & {*map(instance, one.controls)},
+            "over", lambda one: {*map(instance, one.over)} & {*map(instance, one.controls)},
             "names a control that is searched already; leave it out of one of the two",
         ),
         Clash(
@@ -86,26 +81,22 @@ class AttackConfig(DerivativeConfig):
             "names a control that varies by chance, whose derivative nobody asks for; leave it out",
         ),
         Clash(
-            "average",
-            lambda one: one.command == "attack" and one.is_curve,
+            "average", lambda one: one.command == "attack" and one.is_curve,
             "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one `epsilon`",
         ),
     )
 
     object: str = setting_as_in(
-        SceneConfig,
-        "object",
+        SceneConfig, "object",
         description="the object that the model should recognise; several, separated by commas, are attacked in turn",
     )
     model: str = setting_as_in(
-        SceneConfig,
-        "model",
+        SceneConfig, "model",
         description="the network under test; of several, separated by commas, each is attacked and its answer tried "
         "on all",
     )
     ensemble: Literal["mean", "worst"] | None = setting(
-        None,
-        "model",
+        None, "model",
         "find one answer against several models together: maximise the mean of their objectives, or the lowest one",
         otherwise="each by itself",
     )
@@ -115,145 +106,90 @@ class AttackConfig(DerivativeConfig):
         "measure which gradient estimator is best on this scene; full also measures step and samples",
     )
     policy: str | dict[str, JsonValue] = setting(
-        "auto",
-        "search",
-        "the search policy, which proposes configurations",
+        "auto", "search", "the search policy, which proposes configurations",
         "the name of a policy, or NAME={OPTION: VALUE}",
     )
     steps: int | None = setting(
-        None,
-        "search",
-        "number of search steps, each of which evaluates one configuration",
+        None, "search", "number of search steps, each of which evaluates one configuration",
         otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} where pictures are predicted, "
         f"{OVER_RENDERED[0]} where they are rendered",
-        ge=1,
-        le=1_000_000,
+        ge=1, le=1_000_000,
     )
     seconds: float | None = setting(
-        None,
-        "search",
-        "stop the search after this time; the random search beside it gets as many renders",
-        otherwise="no limit",
-        unit="seconds",
-        gt=0.0,
-        le=1e9,
+        None, "search", "stop the search after this time; the random search beside it gets as many renders",
+        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
     )
     target: str | None = setting(
-        None,
-        "search",
-        "the wrong answer to aim for, or several",
-        "names of classes or their numbers, separated by commas",
-        otherwise="any wrong answer",
+        None, "search", "the wrong answer to aim for, or several",
+        "names of classes or their numbers, separated by commas", otherwise="any wrong answer",
     )
     minimise: bool = setting(False, "search", "make the object easier to recognise, not harder")
     smallest: bool = setting(
         False, "search", "find the smallest epsilon at which the model is wrong; --epsilon is the largest to try"
     )
     printable: bool = setting(
-        False,
-        "search",
+        False, "search",
         "prefer a smooth texture or patch in printable colours; a second search without this tells what it costs in "
         "margin",
     )
     aov: str | None = setting_as_in(
-        RenderConfig,
-        "aov",
+        RenderConfig, "aov",
         description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for the clean "
         "scene and the answer",
     )
     metrics: dict[str, str] = setting(
-        dict,
-        "run",
-        "your own numbers for every picture, each a column of the rows; may be repeated",
-        "NAME=package.module:function of image, output and truth",
-        flag="--metric",
-        metavar="NAME=FUNCTION",
+        dict, "run", "your own numbers for every picture, each a column of the rows; may be repeated",
+        "NAME=package.module:function of image, output and truth", flag="--metric", metavar="NAME=FUNCTION",
         form="assignments",
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
-        None,
-        "run",
-        "experiment tracker to which every evaluation is sent; its package has to be installed",
+        None, "run", "experiment tracker to which every evaluation is sent; its package has to be installed",
         otherwise="none",
     )
     over: ControlsByName = setting_as_in(
-        SceneConfig,
-        "controls",
-        default=dict,
-        description="controls that are drawn at random; one answer has to hold across the draws",
-        flag="",
+        SceneConfig, "controls", default=dict,
+        description="controls that are drawn at random; one answer has to hold across the draws", flag="",
         min_length=None,
     )
     path: str | None = setting(
-        None,
-        "search",
+        None, "search",
         "the path along which the camera travels, with --over path; pictures of the answer along it are kept",
-        "approach, pass, orbit, or a .csv file",
-        otherwise="approach",
-        min_length=1,
+        "approach, pass, orbit, or a .csv file", otherwise="approach", min_length=1,
     )
     draws: int | None = setting(
-        None,
-        "search",
-        "how many random conditions each step looks at, with --over",
-        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted, otherwise {OVER_RENDERED[1]}",
-        ge=1,
-        le=1000,
+        None, "search", "how many random conditions each step looks at, with --over",
+        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted, otherwise {OVER_RENDERED[1]}", ge=1, le=1000,
     )
     average: int = setting(
-        0,
-        "search",
-        "also evaluate this many random configurations, to tell how often the model is wrong on average",
-        unit="renders",
-        ge=0,
-        le=1_000_000,
+        0, "search", "also evaluate this many random configurations, to tell how often the model is wrong on average",
+        unit="renders", ge=0, le=1_000_000,
     )
     baseline: bool = setting(
-        True,
-        "search",
-        "run a random search with as many renders beside it",
-        flag="--no-baseline",
+        True, "search", "run a random search with as many renders beside it", flag="--no-baseline",
         switched="skip the random search that runs beside the search as a baseline",
     )
 
     verify_spp: int | None = setting(
-        None,
-        "verification",
-        "samples per pixel of the verification",
-        otherwise="raised until more would leave the margin on its side",
-        unit="samples",
-        ge=1,
-        le=65536,
+        None, "verification", "samples per pixel of the verification",
+        otherwise="raised until more would leave the margin on its side", unit="samples", ge=1, le=65536,
     )
     trials: int | None = setting(
-        None,
-        "verification",
-        "fresh renders that verify the answer, and as many of the clean scene",
+        None, "verification", "fresh renders that verify the answer, and as many of the clean scene",
         f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be called found)",
-        otherwise=f"14, or 23 where one fails; {TRIALS_OVER} with --over, {TRIALS} with --smallest",
-        unit="renders",
-        ge=FEWEST_TRIALS,
-        le=100_000,
+        otherwise=f"14, or 23 where one fails; {TRIALS_OVER} with --over, {TRIALS} with --smallest", unit="renders",
+        ge=FEWEST_TRIALS, le=100_000,
     )
 
     workers: int | None = setting(
-        None,
-        "run",
+        None, "run",
         "worker processes; they share the attacks of several objects or models, or the independent renders of one",
-        otherwise="this one alone",
-        unit="processes",
-        ge=1,
-        le=100_000,
+        otherwise="this one alone", unit="processes", ge=1, le=100_000,
     )
     cluster: str | None = setting(
-        None,
-        "run",
-        "where the workers are",
-        "the address of a Dask scheduler, local, or a .yaml file",
-        metavar="PLACE",
-        otherwise="this machine, if there are `workers`",
-        min_length=1,
+        None, "run", "where the workers are", "the address of a Dask scheduler, local, or a .yaml file",
+        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1,
     )
+    # fmt: on
 
     @model_validator(mode="before")
     @classmethod

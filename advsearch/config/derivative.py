@@ -18,52 +18,40 @@ LARGEST_EPSILON = 1e6
 class DerivativeConfig(SceneConfig):
     """What every command that differentiates a scene needs to know: budgets of the controls, and what is maximised."""
 
+    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
         Clash(
-            "epsilon",
-            lambda one: one.epsilons and "epsilon" not in one.several,
+            "epsilon", lambda one: one.epsilons and "epsilon" not in one.several,
             "several make a curve, which only `advsearch attack` draws; give one",
         ),
     )
 
     object: str = setting_as_in(SceneConfig, "object", default="mug")
     epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
-        None,
-        "search",
+        None, "search",
         "how far a control may move from its start, in its own unit (for several controls CONTROL=NUMBER,...; in "
         "`attack` also NUMBER,NUMBER,... for a curve)",
-        f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
-        otherwise="the control's own",
+        f"a number greater than 0 and at most {LARGEST_EPSILON:g}", otherwise="the control's own",
     )
     norm: Literal["linf", "l2"] | None = setting(
         None, "search", "norm in which epsilon is measured", otherwise="the control's own"
     )
     estimators: dict[str, str] = setting(
-        dict,
-        "search",
-        "force a gradient estimator",
+        dict, "search", "force a gradient estimator",
         "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
-        alias="estimator",
-        flag="--estimator",
-        metavar="NAME",
-        form="choices",
+        alias="estimator", flag="--estimator", metavar="NAME", form="choices",
     )
     objective: str | None = setting(
-        None,
-        "search",
-        "the objective that the search maximises",
-        "the name of an objective",
+        None, "search", "the objective that the search maximises", "the name of an objective",
         otherwise="the task's own: margin",
     )
     specialise: bool = setting(
-        True,
-        "search",
-        "leave out what the scene and the search don't need",
-        flag="--no-specialise",
+        True, "search", "leave out what the scene and the search don't need", flag="--no-specialise",
         switched="compute everything, also what this search does not need; `advsearch plan` shows what is left out "
         "otherwise",
     )
+    # fmt: on
 
     @field_validator("epsilon", mode="before")
     @classmethod
@@ -110,12 +98,10 @@ def _positive(value: Any) -> float:
 class TimedConfig(Config):
     """A question that may run out of time."""
 
+    # fmt: off
     seconds: float | None = setting(
-        None,
-        "check",
+        None, "check",
         "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
-        otherwise="no limit",
-        unit="seconds",
-        gt=0.0,
-        le=1e9,
+        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
     )
+    # fmt: on

@@ -22,39 +22,27 @@ class RenderConfig(SceneConfig):
     command: ClassVar[str] = "render"
     without: ClassVar[tuple[str, ...]] = ("run", "overwrite")
 
+    # fmt: off
     controls: ControlsByName = setting_as_in(
-        SceneConfig,
-        "controls",
-        default=dict,
-        group="picture",
+        SceneConfig, "controls", default=dict, group="picture",
         description="what differs from the scene, separated by commas; a range stays where a search would start",
-        expects="names of controls, or NAME={PARAMETER: VALUE}",
-        min_length=None,
+        expects="names of controls, or NAME={PARAMETER: VALUE}", min_length=None,
     )
     around: int | None = setting(
-        None,
-        "picture",
-        "one sheet of so many views, from azimuths all around the object",
-        otherwise="one view",
-        unit="views",
-        ge=2,
-        le=64,
+        None, "picture", "one sheet of so many views, from azimuths all around the object", otherwise="one view",
+        unit="views", ge=2, le=64,
     )
     spp: int = setting(PICTURE_SPP, "picture", "samples per pixel", unit="samples", ge=1, le=65536)
     aov: str | None = setting(
-        None,
-        "picture",
+        None, "picture",
         "write ground truth of each pixel, names separated by commas, as layers of an EXR beside the picture",
-        "names among mask, depth, normal, uv, id",
-        otherwise="none",
-        metavar="NAMES",
+        "names among mask, depth, normal, uv, id", otherwise="none", metavar="NAMES",
     )
     out: str = setting(
-        ...,
-        "picture",
-        "the file to write: a .png holds what the model sees, an .exr linear radiance times the gain",
+        ..., "picture", "the file to write: a .png holds what the model sees, an .exr linear radiance times the gain",
         "the path of a .png or .exr file",
     )
+    # fmt: on
 
     @field_validator("out", mode="before")
     @classmethod

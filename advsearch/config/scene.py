@@ -39,15 +39,14 @@ class SceneConfig(Config):
 
     several: ClassVar[tuple[str, ...]] = ()
     """Which of object, environment and model may be several, separated by commas."""
+    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         Clash(
-            "threads",
-            lambda one: one.deterministic and one.threads != 1,
+            "threads", lambda one: one.deterministic and one.threads != 1,
             "`deterministic` works on one thread; leave one of them out",
         ),
         Clash(
-            "overwrite",
-            lambda one: one.run is None,
+            "overwrite", lambda one: one.run is None,
             "replaces the run that `run` names, and none is named; name it, or leave `overwrite` out",
         ),
     )
@@ -56,121 +55,79 @@ class SceneConfig(Config):
         ..., "scene", "the object that the model should recognise", f"the name of an object or a {either(MESHES)} file"
     )
     environment: str | None = setting(
-        None,
-        "scene",
-        "the environment map that lights the scene",
-        "the name of an environment, a .hdr or .exr file, or none",
-        otherwise=DEFAULT_ENVIRONMENT,
+        None, "scene", "the environment map that lights the scene",
+        "the name of an environment, a .hdr or .exr file, or none", otherwise=DEFAULT_ENVIRONMENT,
     )
     up: Literal["y", "z"] | None = setting(
-        None,
-        "scene",
-        "which axis of an imported object points up",
+        None, "scene", "which axis of an imported object points up",
         otherwise="as the format says, or else the axis along which it stands best",
     )
     camera: str | None = setting(
-        None,
-        "scene",
+        None, "scene",
         "which camera takes the picture: one of a scene file, or the one around the object with a lens of its own",
         "a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, Kalibr, ROS "
         "or COLMAP",
-        metavar="NAME",
-        otherwise="orbit, the pinhole around the object that camera.* describes",
-        min_length=1,
+        metavar="NAME", otherwise="orbit, the pinhole around the object that camera.* describes", min_length=1,
     )
     set_: dict[str, float | str | tuple[float, ...]] = setting(
-        dict,
-        "scene",
-        "fix a parameter of the scene, such as camera.azimuth=130; may be repeated",
-        "PARAMETER=VALUE with a finite number, a name or a list of numbers",
-        alias="set",
-        flag="--set",
-        metavar="PARAMETER=VALUE",
-        form="assignments",
+        dict, "scene", "fix a parameter of the scene, such as camera.azimuth=130; may be repeated",
+        "PARAMETER=VALUE with a finite number, a name or a list of numbers", alias="set", flag="--set",
+        metavar="PARAMETER=VALUE", form="assignments",
     )
     exposure: float = setting(
         0.0, "scene", "brightness, relative to the metered exposure", unit="stops", ge=-10.0, le=10.0
     )
     resolution: tuple[int, int] | None = setting(
-        None,
-        "scene",
-        "size of the rendered picture",
-        "SIDE or HEIGHTxWIDTH, each from 8 to 4096",
-        otherwise="what the model takes",
-        unit="pixels",
+        None, "scene", "size of the rendered picture", "SIDE or HEIGHTxWIDTH, each from 8 to 4096",
+        otherwise="what the model takes", unit="pixels",
     )
 
     model: str = setting(
-        "reference",
-        "model",
-        "the network under test",
+        "reference", "model", "the network under test",
         "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, or "
         "package.module:callable",
     )
     labels: str | None = setting(
-        None,
-        "model",
-        "names of the model's classes",
+        None, "model", "names of the model's classes",
         "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91, voc, or the names with commas between "
         "them",
-        metavar="FILE",
-        otherwise="the model's own",
+        metavar="FILE", otherwise="the model's own",
     )
     prompt: str | None = setting(
-        None,
-        "model",
+        None, "model",
         "text for a model that takes text beside the picture: for CLIP what a picture is compared with, one text for "
         "each label; for a model such as LLaVA the question",
         "a text, for CLIP with {} where the name goes, or several with | between them",
-        otherwise="a photo of a {}, or What is this?",
-        metavar="TEXT",
+        otherwise="a photo of a {}, or What is this?", metavar="TEXT",
     )
     task: str | dict[str, JsonValue] = setting(
-        "classification",
-        "model",
+        "classification", "model",
         "what the model does, and how its answers are judged; for several models one task each, with + between them",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
     label: str | None = setting(
-        None,
-        "model",
-        "the answers that count as right, separated by commas",
-        'names of classes or their numbers, such as "coffee mug,cup" or #504',
-        otherwise="the object's own",
+        None, "model", "the answers that count as right, separated by commas",
+        'names of classes or their numbers, such as "coffee mug,cup" or #504', otherwise="the object's own",
     )
 
     controls: ControlsByName = setting(
-        lambda: {"texture": {}},
-        "search",
-        "what may change in the scene, separated by commas",
-        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
-        flag="--control",
-        metavar="NAME",
-        form="controls",
-        min_length=1,
+        lambda: {"texture": {}}, "search", "what may change in the scene, separated by commas",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}", flag="--control", metavar="NAME",
+        form="controls", min_length=1,
     )
     texture_resolution: int | None = setting(
-        None,
-        "search",
-        "side length of the searched texture",
-        unit="texels",
-        otherwise="chosen from the object's own",
-        ge=2,
-        le=4096,
+        None, "search", "side length of the searched texture", unit="texels", otherwise="chosen from the object's own",
+        ge=2, le=4096,
     )
     spp: int | Literal["auto"] | None = setting(
-        None,
-        "search",
+        None, "search",
         "samples per pixel of a render of the search; auto takes half of the default, and renders the best candidates "
         "again while they are close",
-        "a whole number from 1 to 65536, or auto",
-        otherwise="8 with the denoiser, 16 without",
-        unit="samples",
+        "a whole number from 1 to 65536, or auto", otherwise="8 with the denoiser, 16 without", unit="samples",
     )
     denoise: Literal["oidn", "none"] = setting("oidn", "search", "denoiser of every render, in search and verification")
     pixel_sampler: Literal["independent", "multijitter"] = setting(
-        "multijitter",
-        "search",
+        "multijitter", "search",
         "how samples are spread over a pixel, in search and verification; multijitter has less noise and rounds the "
         "number of samples up to a product of two near numbers",
     )
@@ -181,13 +138,10 @@ class SceneConfig(Config):
     threads: int | None = setting(None, "run", "number of processor threads", otherwise="all", ge=1, le=1024)
     deterministic: bool = setting(False, "run", "use one thread, so that a run repeats bit for bit; slower")
     run: str | None = setting(
-        None,
-        "run",
-        "where the run is stored",
-        "a name (kept in runs/) or the path of a folder",
-        otherwise="runs/OBJECT-CONTROL-NNN",
-        min_length=1,
+        None, "run", "where the run is stored", "a name (kept in runs/) or the path of a folder",
+        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1,
     )
+    # fmt: on
     overwrite: bool = setting(False, "run", "replace a run that is already there")
 
     @model_validator(mode="after")

@@ -25,11 +25,11 @@ class SweepConfig(SceneConfig):
     command: ClassVar[str] = "sweep"
     free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface", "workers", "cluster", "log")
     several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
+    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
         Clash(
-            "sampler",
-            lambda one: not one.controls,
+            "sampler", lambda one: not one.controls,
             "is how `controls` are drawn, and none are; add `controls`, or leave `sampler` out",
         ),
         Clash("fps", lambda one: one.path is None, "is of a drive; add `path`, or leave `fps` out"),
@@ -39,54 +39,34 @@ class SweepConfig(SceneConfig):
     )
 
     object: str = setting_as_in(
-        SceneConfig,
-        "object",
-        description="the object that the model should recognise; several, separated by commas",
+        SceneConfig, "object", description="the object that the model should recognise; several, separated by commas",
         expects=f"names of objects or {either(MESHES)} files",
     )
     environment: str | None = setting_as_in(
-        SceneConfig,
-        "environment",
+        SceneConfig, "environment",
         description="the environment map that lights the scene; several, separated by commas",
         expects="names of environments or .hdr or .exr files",
     )
     model: str = setting_as_in(
-        SceneConfig,
-        "model",
+        SceneConfig, "model",
         description="the network under test; several, separated by commas, are shown the same pictures",
     )
     grid: Grid = setting(
-        dict,
-        "sweep",
-        "one axis of the grid; may be repeated",
-        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas",
-        metavar="PARAMETER=VALUES",
-        form="axes",
+        dict, "sweep", "one axis of the grid; may be repeated",
+        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas", metavar="PARAMETER=VALUES", form="axes",
     )
     controls: ControlsByName = setting_as_in(
-        SceneConfig,
-        "controls",
-        default=dict,
-        group="sweep",
-        description="controls that are drawn at random at each grid point, separated by commas",
-        min_length=None,
+        SceneConfig, "controls", default=dict, group="sweep",
+        description="controls that are drawn at random at each grid point, separated by commas", min_length=None,
     )
     answer_of: str | None = setting(
-        None,
-        "sweep",
+        None, "sweep",
         "sweep the answer of this attack beside the clean scene, under the same draws; scene and model come from that "
         "run, and so does what its --over drew if nothing else varies",
-        "the name or the folder of a run",
-        metavar="RUN",
-        otherwise="none",
-        min_length=1,
+        "the name or the folder of a run", metavar="RUN", otherwise="none", min_length=1,
     )
     samples: int | None = setting(
-        None,
-        "sweep",
-        "number of random draws at each grid point",
-        otherwise="1, or 100 without a grid",
-        ge=1,
+        None, "sweep", "number of random draws at each grid point", otherwise="1, or 100 without a grid", ge=1,
         le=1_000_000_000,
     )
     sampler: Literal["sobol", "random"] = setting(
@@ -96,27 +76,19 @@ class SweepConfig(SceneConfig):
         16, "sweep", "pictures that are classified and stored together", unit="pictures", ge=1, le=1024
     )
     path: str | None = setting_as_in(
-        AttackConfig,
-        "path",
-        group="sweep",
-        description="sweep the frames of a drive, in which the camera travels along this path",
-        otherwise="no path",
+        AttackConfig, "path", group="sweep",
+        description="sweep the frames of a drive, in which the camera travels along this path", otherwise="no path",
     )
     fps: float = setting(
         2.0, "sweep", "frames of the drive that are looked at", unit="frames a second", gt=0.0, le=1000.0
     )
     keep_pictures: Literal["all", "wrong", "none"] = setting("none", "sweep", "keep small pictures of these answers")
     specialise: bool = setting_as_in(
-        DerivativeConfig,
-        "specialise",
-        group="sweep",
-        description="predict pictures that differ in light alone",
+        DerivativeConfig, "specialise", group="sweep", description="predict pictures that differ in light alone",
         switched="render every picture, also those that differ in light alone",
     )
     aov: str | None = setting_as_in(
-        RenderConfig,
-        "aov",
-        group="sweep",
+        RenderConfig, "aov", group="sweep",
         description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for every "
         "configuration",
     )
@@ -127,23 +99,18 @@ class SweepConfig(SceneConfig):
         SceneConfig, "spp", group="sweep", description="samples per pixel of each picture", expects="", ge=1, le=65536
     )
     trials: int = setting(
-        20,
-        "verification",
-        "fresh renders that verify the worst configuration; 0 for none",
-        f"0, or a whole number from {FEWEST_TRIALS} to 100000",
-        unit="renders",
-        ge=0,
-        le=100_000,
+        20, "verification", "fresh renders that verify the worst configuration; 0 for none",
+        f"0, or a whole number from {FEWEST_TRIALS} to 100000", unit="renders", ge=0, le=100_000,
     )
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these trials")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
     metrics: dict[str, str] = setting_as_in(AttackConfig, "metrics")
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(AttackConfig, "log")
     workers: int | None = setting_as_in(
-        AttackConfig,
-        "workers",
+        AttackConfig, "workers",
         description="worker processes that share the sweep, each with one thread unless `threads` says more",
     )
+    # fmt: on
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
 
     @property

@@ -252,19 +252,6 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
-    "CONTROLS",
-    "BoundControl",
-    "Budget",
-    "Choice",
-    "Control",
-    "Group",
-    "NumberControl",
-    "Parameter",
-    "Space",
-    "compose",
-    "gathered",
-    "make_control",
-    "make_space",
-    "names_of",
-    "settings_by_name",
-]
+    "CONTROLS", "BoundControl", "Budget", "Choice", "Control", "Group", "NumberControl", "Parameter", "Space",
+    "compose", "gathered", "make_control", "make_space", "names_of", "settings_by_name",
+]  # fmt: skip

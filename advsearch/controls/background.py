@@ -40,43 +40,21 @@ class BackgroundControl(NumberControl):
     summary: ClassVar[str] = "A plain colour behind the object; the environment keeps lighting it."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "what",
-            (),
-            "name",
-            0,
-            len(WHAT) - 1,
-            "colour",
-            "What is behind the object: the colour, or the environment as ever.",
-            options=WHAT,
-            estimators=(),
+            "what", (), "name", 0, len(WHAT) - 1, "colour",
+            "What is behind the object: the colour, or the environment as ever.", options=WHAT, estimators=(),
         ),
         Parameter(
-            "hue",
-            (),
-            "degrees",
-            0.0,
-            360.0,
-            0.0,
-            "Hue: 0 is red, 120 green, 240 blue.",
-            periodic=True,
-            search=(0.0, 360.0),
-            estimators=("image",),
+            "hue", (), "degrees", 0.0, 360.0, 0.0, "Hue: 0 is red, 120 green, 240 blue.", periodic=True,
+            search=(0.0, 360.0), estimators=("image",),
         ),
         Parameter(
             "saturation", (), "1", 0.0, 1.0, 0.0, "Saturation: 0 is grey.", search=(0.0, 1.0), estimators=("image",)
         ),
         Parameter(
-            "value",
-            (),
-            "sRGB",
-            0.0,
-            1.0,
-            0.5,
-            "The largest of red, green and blue: 0 is black.",
-            search=(0.0, 1.0),
+            "value", (), "sRGB", 0.0, 1.0, 0.5, "The largest of red, green and blue: 0 is black.", search=(0.0, 1.0),
             estimators=("image",),
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
             "ground", "hide", "Whether the ground plane stays in the picture: keep or hide.", options=("keep", "hide")

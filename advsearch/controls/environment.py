@@ -45,15 +45,9 @@ class EnvironmentControl(NumberControl):
     summary: ClassVar[str] = "Which environment lights the scene, how it is turned, how bright it is, and its colour."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "which",
-            (),
-            "name",
-            0.0,
-            float(len(library.list_environments())),
-            OWN_MAP,
+            "which", (), "name", 0.0, float(len(library.list_environments())), OWN_MAP,
             "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr file.",
-            options=(OWN_MAP, *library.list_environments()),
-            estimators=(),
+            options=(OWN_MAP, *library.list_environments()), estimators=(),
         ),
         *settings.ENVIRONMENT,
         *(
@@ -61,26 +55,17 @@ class EnvironmentControl(NumberControl):
             for color in CHANNELS
         ),
         Parameter(
-            "harmonics",
-            (COEFFICIENTS,),
-            "mean radiances",
-            -1.0,
-            1.0,
-            0.0,
+            "harmonics", (COEFFICIENTS,), "mean radiances", -1.0, 1.0, 0.0,
             "Low-order light that is added: spherical-harmonic coefficients, 9 for each channel, inside the ball.",
             estimators=LIT,
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
-            "epsilon",
-            0.5,
-            "Radius of the ball of `harmonics`: L2 norm of all coefficients.",
-            "epsilon",
-            "harmonics",
+            "epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon", "harmonics",
             most=100.0,
         ),
-    )
+    )  # fmt: skip
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:

@@ -40,18 +40,12 @@ class HazeControl(NumberControl):
     summary: ClassVar[str] = "A uniform haze around camera and object: how dense it is, and its colour."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "density",
-            (),
-            "per object size",
-            0.0,
-            2.0,
-            0.0,
-            "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.",
-            search=(0.0, 0.3),
+            "density", (), "per object size", 0.0, 2.0, 0.0,
+            "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.", search=(0.0, 0.3),
             estimators=LIT,
         ),
         *colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
-    )
+    )  # fmt: skip
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         if (own := _haze_of(scene)) is not None and own.density:

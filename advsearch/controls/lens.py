@@ -57,29 +57,19 @@ class LensControl(NumberControl):
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
         _per_dot(
-            "radius",
-            "picture sizes",
-            0.12,
-            "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.",
-            low=0.01,
-            search=(0.03, 0.25),
-            log=True,
+            "radius", "picture sizes", 0.12,
+            "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.", low=0.01,
+            search=(0.03, 0.25), log=True,
         ),
         _per_dot("red", "sRGB", 0.5, "Red of each dot."),
         _per_dot("green", "sRGB", 0.5, "Green of each dot."),
         _per_dot("blue", "sRGB", 0.5, "Blue of each dot."),
         _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", search=(0.0, 0.5)),
         Parameter(
-            "falloff",
-            (),
-            "1",
-            1.0,
-            8.0,
-            1.0,
-            "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc.",
+            "falloff", (), "1", 1.0, 8.0, 1.0, "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc.",
             estimators=("image",),
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),
     )

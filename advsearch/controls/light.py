@@ -59,36 +59,21 @@ class LightControl(NumberControl):
         _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
         *colors("of the lamp's colour.", (0.6, 1.0)),
         Parameter(
-            "power",
-            (),
-            "1",
-            0.0,
-            1000.0,
-            0.0,
+            "power", (), "1", 0.0, 1000.0, 0.0,
             "Irradiance at distance 1, in multiples of the one that shows a white surface just below white.",
-            search=(0.0, 12.0),
-            estimators=LIT,
+            search=(0.0, 12.0), estimators=LIT,
         ),
         moving(
-            ("differences",),
-            "size",
-            "object sizes",
-            0.001,
-            10.0,
-            0.2,
-            "Diameter of an area light; a point has none.",
-            (0.05, 0.6),
-            log=True,
+            ("differences",), "size", "object sizes", 0.001, 10.0, 0.2, "Diameter of an area light; a point has none.",
+            (0.05, 0.6), log=True,
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
-            "type",
-            "area",
-            "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
+            "type", "area", "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
             options=("area", "point"),
         ),
-    )
+    )  # fmt: skip
 
     def check_choices(self) -> None:
         if self.chosen["type"] == "point" and "size" in self._given:

@@ -37,18 +37,11 @@ class PoseControl(NumberControl):
     parameters: ClassVar[tuple[Parameter, ...]] = (
         *POSE[:3],
         Parameter(
-            "rotation",
-            (3,),
-            "degrees",
-            -180.0,
-            180.0,
-            0.0,
-            "Rotation vector on top of the angles.",
-            moves_silhouettes=True,
-            estimators=GEOMETRIC,
+            "rotation", (3,), "degrees", -180.0, 180.0, 0.0, "Rotation vector on top of the angles.",
+            moves_silhouettes=True, estimators=GEOMETRIC,
         ),
         *POSE[3:],
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("on_ground", "yes", "yes: the lowest point stays at height z however it turns; no: its middle stays."),
     )

@@ -57,19 +57,11 @@ class SensorControl(NumberControl):
     summary: ClassVar[str] = "What a camera adds: noise, mosaic, white balance, chromatic aberration, JPEG."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         _number(
-            "aberration",
-            "1",
-            -0.02,
-            0.02,
-            "How much larger the red picture is than the green one; blue smaller.",
+            "aberration", "1", -0.02, 0.02, "How much larger the red picture is than the green one; blue smaller.",
             search=(-0.005, 0.005),
         ),
         _number(
-            "shot",
-            "1",
-            0.0,
-            0.5,
-            "Standard deviation of the noise in white that grows with the root of light.",
+            "shot", "1", 0.0, 0.5, "Standard deviation of the noise in white that grows with the root of light.",
             search=(0.0, 0.1),
         ),
         _number(
@@ -79,15 +71,10 @@ class SensorControl(NumberControl):
         _number("red", "stops", -1.0, 1.0, "White balance: red is this much brighter.", search=(-0.5, 0.5)),
         _number("blue", "stops", -1.0, 1.0, "White balance: blue is this much brighter.", search=(-0.5, 0.5)),
         _number(
-            "compression",
-            "1",
-            0.0,
-            95.0,
-            "0 is no file; above, a JPEG file of quality 100 less this.",
-            search=(0.0, 60.0),
-            estimators=(),
+            "compression", "1", 0.0, 95.0, "0 is no file; above, a JPEG file of quality 100 less this.",
+            search=(0.0, 60.0), estimators=(),
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),
     )

@@ -93,66 +93,37 @@ class TextureControl(Control):
     summary: ClassVar[str] = "The base-colour map of the object or another mesh, inside a ball around the original."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "texels",
-            (None, None, 3),
-            "sRGB",
-            0.0,
-            1.0,
-            "the object's own texture",
-            "Display-referred texel values.",
-            search=(0.0, 1.0),
-            estimators=("adjoint",),
+            "texels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture", "Display-referred texel values.",
+            search=(0.0, 1.0), estimators=("adjoint",),
         ),
         Parameter(
-            "palette",
-            (None, 3),
-            "sRGB",
-            0.0,
-            1.0,
-            "the texture's own colours",
-            "Colours that the texture is repainted with (form palette).",
-            search=(0.0, 1.0),
+            "palette", (None, 3), "sRGB", 0.0, 1.0, "the texture's own colours",
+            "Colours that the texture is repainted with (form palette).", search=(0.0, 1.0),
             estimators=("adjoint", "differences"),
         ),
         Parameter(
-            "amplitudes",
-            (None, None, 3),
-            "1",
-            -1.0,
-            1.0,
-            0.0,
-            "Strength of each wave in each colour channel (form waves).",
-            search=(-1.0, 1.0),
-            estimators=("adjoint",),
+            "amplitudes", (None, None, 3), "1", -1.0, 1.0, 0.0,
+            "Strength of each wave in each colour channel (form waves).", search=(-1.0, 1.0), estimators=("adjoint",),
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
-            "epsilon",
-            DEFAULT_EPSILON,
-            "Radius of the ball around the original texture, display-referred.",
-            "epsilon",
+            "epsilon", DEFAULT_EPSILON, "Radius of the ball around the original texture, display-referred.", "epsilon",
             most=LARGEST_EPSILON,
         ),
         Choice(
-            "norm",
-            "linf",
-            "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values).",
-            "norm",
-            options=NORMS,
+            "norm", "linf", "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values).",
+            "norm", options=NORMS,
         ),
         Choice(
-            "resolution",
-            None,
-            "Side of the searched texture in texels; by default the object's own, 256 to 512.",
-            "texture_resolution",
-            whole=(2, 4096),
+            "resolution", None, "Side of the searched texture in texels; by default the object's own, 256 to 512.",
+            "texture_resolution", whole=(2, 4096),
         ),
         Choice("form", "texels", "What is searched: texels, palette (a few colours) or waves (smooth patterns)."),
         Choice("colors", 6, "Number of colours of the palette.", whole=(1, LARGEST_PALETTE)),
         Choice("waves", 8, "Number of waves along each side of the texture.", whole=(1, LARGEST_WAVES)),
         Choice("materials", None, "Materials of the mesh's file that are painted, by name; by default all of it."),
-    )
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         for choice in self.choices:

@@ -7,12 +7,6 @@ from advsearch.models.loading import load_model
 from advsearch.models.model import Model, ModelWarning, Preprocessing
 
 __all__ = [
-    "LabelSet",
-    "Model",
-    "ModelWarning",
-    "Preprocessing",
-    "find_label_set",
-    "load_model",
-    "matching_labels",
+    "LabelSet", "Model", "ModelWarning", "Preprocessing", "find_label_set", "load_model", "matching_labels",
     "read_labels",
-]
+]  # fmt: skip

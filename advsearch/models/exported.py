@@ -126,8 +126,7 @@ def _check_tensor(archive: Archive, record: str, meta: Any) -> None:
         raise refused(archive.path, f"{record[:80]!r} is empty, but should hold a tensor of {numbers[:8]}")
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# the description of the network
+# ---- the description of the network ----------------------------------------------------------------------------------
 
 
 def _checked_program(archive: Archive, name: str) -> JsonObject:
@@ -236,8 +235,7 @@ _TEXTS: dict[str, Callable[[str], str]] = {
 }
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# pickles of tensors
+# ---- pickles of tensors ----------------------------------------------------------------------------------------------
 
 
 def _check_pickle(archive: Archive, name: str) -> None:

@@ -95,9 +95,6 @@ def features_of(model: Model) -> Features:
     return Features(model, _centred_logits(model), model.classes, why, penultimate=False)
 
 
-# ---- an nn.Module ---------------------------------------------------------------------------------------------------
-
-
 def _layer(model: Model, x: Tensor) -> tuple[Read, str] | None:
     """Return how to read the last layer of a module that calls its layers, if it has one."""
     network = model.module
@@ -142,9 +139,6 @@ def _axis(layer: nn.Module) -> int:
     return -1 if isinstance(layer, nn.Linear) else 1
 
 
-# ---- a graph of operators -------------------------------------------------------------------------------------------
-
-
 def _node(model: Model, x: Tensor) -> tuple[Read, str] | None:
     """Return how to read the last layer of a graph of operators, such as a program of `torch.export`, if it has one."""
     graph = model.module
@@ -185,9 +179,6 @@ def _values(graph: fx.GraphModule, nodes: list[fx.Node], x: Tensor) -> dict[fx.N
 
 def _axis_of(node: fx.Node) -> int:
     return -1 if node.target in CHANNELS_LAST else 1
-
-
-# ---- both -----------------------------------------------------------------------------------------------------------
 
 
 def _pooled(value: Tensor, axis: int) -> Tensor:

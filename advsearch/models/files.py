@@ -113,10 +113,6 @@ def _near_files(path: Path) -> str:
     return f" Did you mean {' or '.join(repr(str(path.parent / name)) for name in near)}?" if near else ""
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# TorchScript
-
-
 def _load_torchscript(path: Path, archive: Archive) -> Source:
     checked = torchscript.rewritten(archive)
     if torchscript.runs_while_loading(archive):
@@ -135,10 +131,6 @@ def _try_to_load(path: Path, checked: io.BytesIO) -> None:
         wrong = str(error)
     if wrong:
         raise FileFormatError(f"model file {path}: {wrong}")
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# torch.export
 
 
 def _load_exported(path: Path, archive: Archive) -> Source:

@@ -28,10 +28,6 @@ def split_weights(spec: str) -> tuple[str, Path | None]:
     return name.strip(), Path(weights.strip()) if weights.strip() else None
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# package.module:callable
-
-
 def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     """Return the model behind ``package.module:callable[@weights.safetensors]``.
 

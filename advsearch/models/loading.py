@@ -101,22 +101,6 @@ def load_model(
         "max_batch": max_batch,
     }
     given = {key: value for key, value in options.items() if value is not None}
-    loaded = _loaded(spec, given, labels, prompt, name, max_batch, task, read)
-    if isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None:
-        return dataclasses.replace(loaded, asked=os.fspath(spec))
-    return loaded
-
-
-def _loaded(
-    spec: object,
-    given: Mapping[str, object],
-    labels: Any,
-    prompt: str | Sequence[str] | None,
-    name: str | None,
-    max_batch: int | None,
-    task: Any,
-    read: Read | None,
-) -> Model:
     read = read or (task and task.reader)
     names, origin = None if labels is None else read_labels(labels), labels_origin(labels)
     if names is not None and task and task.names_from:
@@ -134,21 +118,24 @@ def _loaded(
     if isinstance(found, Model):
         found = dataclasses.replace(found, read=read or found.read)
         found = found if names is None and name is None else dataclasses.replace(found, asked=None)
-        return _relabelled(found, names, origin, name, given)
-    if read is not None and isinstance(found.module, nn.Module):
-        found = _with_what_it_says(found)
-    low, high = found.batch_limits
-    bare = Model(
-        module=found.module,
-        name=name or found.name,
-        labels=(),
-        preprocessing=_preprocessing(found, given),
-        batch_limits=(low, max(low, min(high, _positive("max_batch", max_batch, high)))),
-        dtype=found.dtype,
-        device=found.device,
-        read=read,
-    )
-    return probe(bare, found.labels if names is None else names, origin)
+        loaded = _relabelled(found, names, origin, name, given)
+    else:
+        if read is not None and isinstance(found.module, nn.Module):
+            found = _with_what_it_says(found)
+        low, high = found.batch_limits
+        bare = Model(
+            module=found.module,
+            name=name or found.name,
+            labels=(),
+            preprocessing=_preprocessing(found, given),
+            batch_limits=(low, max(low, min(high, _positive("max_batch", max_batch, high)))),
+            dtype=found.dtype,
+            device=found.device,
+            read=read,
+        )
+        loaded = probe(bare, found.labels if names is None else names, origin)
+    alone = isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None
+    return dataclasses.replace(loaded, asked=os.fspath(spec)) if alone else loaded  # type: ignore[arg-type]
 
 
 def _with_what_it_says(found: Source) -> Source:
@@ -180,7 +167,8 @@ def _find(spec: object) -> Source | Model:
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
-        raise InputError(f"model: expected a name, a path, an nn.Module or a Model, got {_described(spec)}. {FORMS}")
+        got = f"the class {spec.__name__} (pass an instance)" if isinstance(spec, type) else type(spec).__name__
+        raise InputError(f"model: expected a name, a path, an nn.Module or a Model, got {got}. {FORMS}")
     text = spec.strip()
     network, weights = imported.split_weights(text)
     if network == "reference":
@@ -205,10 +193,6 @@ def _by_library(text: str) -> str:
     return f"A library's network is written with its library: 'torchvision:{text}' or 'timm:{text}'. "
 
 
-def _described(spec: object) -> str:
-    return f"the class {spec.__name__} (pass an instance)" if isinstance(spec, type) else type(spec).__name__
-
-
 def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
     """Return the source's own preprocessing with the caller's options on top."""
     made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE, processor=found.processor)
@@ -218,15 +202,7 @@ def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
     own = {"mean": found.mean, "std": found.std, **pre.parse_normalisation(given.get("mean"), given.get("std"))}
     made = dataclasses.replace(made, mean=own["mean"] or made.mean, std=own["std"] or made.std)
     made = dataclasses.replace(made, layout=found.layout or made.layout, channels=found.channels or made.channels)
-    if "input_size" in given:
-        made = dataclasses.replace(made, input_size=pre.parse_input_size(given["input_size"]))
-    if "value_range" in given:
-        made = dataclasses.replace(made, value_range=pre.parse_value_range(given["value_range"]))
-    if "layout" in given:
-        made = dataclasses.replace(made, layout=pre.parse_choice("layout", given["layout"], pre.LAYOUTS))
-    if "channels" in given:
-        made = dataclasses.replace(made, channels=pre.parse_choice("channels", given["channels"], pre.CHANNELS))
-    return made
+    return dataclasses.replace(made, **{key: parse(given[key]) for key, parse in pre.READERS.items() if key in given})
 
 
 def _relabelled(

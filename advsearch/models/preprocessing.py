@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -68,6 +69,15 @@ def parse_choice(key: str, value: Any, choices: Sequence[str]) -> str:
     if text not in choices:
         raise InputError(f"{key}: expected one of {', '.join(choices)}, got {value!r}")
     return text
+
+
+READERS: dict[str, Callable[[Any], Any]] = {
+    "input_size": parse_input_size,
+    "value_range": parse_value_range,
+    "layout": partial(parse_choice, "layout", choices=LAYOUTS),
+    "channels": partial(parse_choice, "channels", choices=CHANNELS),
+}
+"""What reads the fields that have a form of their own."""
 
 
 def _numbers(key: str, value: Any, counts: tuple[int, ...], expected: str) -> tuple[float, ...]:

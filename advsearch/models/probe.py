@@ -389,4 +389,4 @@ def first_line(error: BaseException) -> str:
 
 
 def _warn(message: str) -> None:
-    warnings.warn(message, ModelWarning, stacklevel=4)
+    warnings.warn(message, ModelWarning, stacklevel=3)

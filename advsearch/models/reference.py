@@ -106,10 +106,6 @@ class _Residual(nn.Module):
         return result
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# making, folding, loading
-
-
 def build(classes: int, *, dropout: float = 0.1) -> ReferenceNet:
     """Return an untrained network in channels-last memory format; weights come from torch's current random state."""
     if classes < 2:

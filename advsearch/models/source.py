@@ -133,13 +133,7 @@ def frozen(module: nn.Module, name: str) -> nn.Module:
     if not isinstance(module, (torch.fx.GraphModule, torch.jit.ScriptModule)):
         try:
             module = sharing_copy(module)
-        except (
-            TypeError,
-            AttributeError,
-            RuntimeError,
-            pickle.PickleError,
-            copy.Error,
-        ) as error:  # locks, files, handles
+        except (TypeError, AttributeError, RuntimeError, pickle.PickleError, copy.Error) as error:  # locks, files
             warnings.warn(
                 f"model {name} cannot be copied ({first_line(error)}): the module itself is set to evaluation mode and "
                 "its parameters are frozen",

@@ -91,10 +91,6 @@ def _version(archive: Archive) -> int:
     return int(text)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# source code
-
-
 def _check_code(archive: Archive, code: dict[str, bytes]) -> None:
     if sum(map(len, code.values())) > LARGEST_CODE:
         raise refused(archive.path, f"has more than {LARGEST_CODE:,} bytes of source code")
@@ -125,10 +121,6 @@ def _hides(escape: str) -> bool:
         return True
     value = int(escape, 8)
     return value < 128 and value not in _WHITE
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# pickles
 
 
 class _Inert:

@@ -71,19 +71,6 @@ def _together(names: Sequence[str], options: Mapping[str, Any]) -> Together:
 
 
 __all__ = [
-    "TASKS",
-    "Answer",
-    "AnyTask",
-    "Classification",
-    "Depth",
-    "Detection",
-    "Facts",
-    "FreeAnswer",
-    "Judgement",
-    "Mark",
-    "Segmentation",
-    "Sight",
-    "Similarity",
-    "Task",
-    "make_task",
-]
+    "TASKS", "Answer", "AnyTask", "Classification", "Depth", "Detection", "Facts", "FreeAnswer", "Judgement", "Mark",
+    "Segmentation", "Sight", "Similarity", "Task", "make_task",
+]  # fmt: skip

@@ -115,7 +115,6 @@ class ClassTask(Task):
 
     @property
     def target_names(self) -> tuple[str, ...]:
-        """See `Task.target_names`."""
         return self.names(self.target or ())
 
     def names(self, indices: Sequence[int]) -> tuple[str, ...]:
@@ -139,7 +138,6 @@ class Classification(ClassTask):
     reads_logits = True
 
     def truth(self, facts: Facts) -> Labels:
-        """See `ClassTask.right_classes`."""
         return self.right_classes(facts)
 
     def answerable(self, output: Tensor, truth: Labels) -> Tensor:
@@ -155,7 +153,6 @@ class Classification(ClassTask):
         return wrong_lead(self.answerable(output, truth), truth)
 
     def score(self, output: Tensor, truth: Labels) -> Tensor:
-        """See `Task.score`."""
         if self.target is not None:
             return target_lead(self.answerable(output, truth), self.target)
         return super().score(output, truth)
@@ -178,7 +175,6 @@ class Classification(ClassTask):
         return found
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
-        """See `Task.judge`."""
         logits, own = self.answerable(output, truth), type(self)
         margins = wrong_lead(logits, truth) if own.margin is Classification.margin else self.margin(output, truth)
         if own.score is not Classification.score or self.target is not None:

@@ -199,7 +199,6 @@ class Depth(Task):
         return True
 
     def seeing(self, output: Sequence[Map], truth: Distances | None) -> Depth:
-        """See `Task.seeing`."""
         kind = self.kind or next(iter(output[0]))
         return replace(self, seen_kind=kind, missing=self._missing(kind, truth))
 
@@ -224,7 +223,6 @@ class Depth(Task):
 
     @property
     def unsaid(self) -> str:
-        """See `Task.unsaid`."""
         return self.missing
 
     @property

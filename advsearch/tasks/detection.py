@@ -167,7 +167,6 @@ class Detection(ClassTask):
             raise InputError(f"minimise: expected `objective` vanish, whose opposite is to be found, got {self.seek}")
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Detection:
-        """See `Task.on`."""
         found = super().on(model, target=target, minimise=minimise)
         with torch.no_grad():
             noise = torch.rand((1, *model.input_size, 3), generator=torch.Generator().manual_seed(0))
@@ -182,7 +181,6 @@ class Detection(ClassTask):
         return not (self.told or (self.boxes and self.unit)) or (self.undecided and not self.order)
 
     def seeing(self, output: Sequence[Detections], truth: Place | None) -> Detection:
-        """See `Task.seeing`."""
         found = self._having_seen(output)
         output = found._boxed(output)
         reading, right = found._reading, strongest_boxes(output)[:0]
@@ -236,7 +234,6 @@ class Detection(ClassTask):
 
     @property
     def unsaid(self) -> str:
-        """See `Task.unsaid`."""
         if self.undecided and not (self.order or self.seen_order):
             return f"order: expected what tells scores from classes, and no answer of the model does; {ask_order()}"
         if not (self.unit or self.seen_unit):
@@ -249,7 +246,6 @@ class Detection(ClassTask):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """See `Task.remarks`."""
         said = []
         if self.shape and not self.order:
             said.append(

@@ -164,9 +164,6 @@ def fitted(features: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
     return weights.float(), (biases.detach() - weights @ middle).float()
 
 
-# ---- files ----------------------------------------------------------------------------------------------------------
-
-
 def _listed(folder: Path) -> list[Path]:
     try:
         return sorted(one for one in folder.iterdir() if not one.name.startswith("."))

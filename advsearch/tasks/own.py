@@ -33,7 +33,6 @@ class OwnTask(Task):
     labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> OwnTask:
-        """See `Task.on`."""
         asked = super().on(model, target=target, minimise=minimise)
         return replace(asked, labels=tuple(model.labels) if model.named else ())
 

@@ -102,8 +102,6 @@ class Segmentation(ClassTask):
         """Return the right names."""
         return self.names(truth.labels)
 
-    # ---- scores -----------------------------------------------------------------------------------------------------
-
     def margin(self, output: Tensor, truth: Region) -> Tensor:
         """Return, in logits (N,), the wrong classes' lead at the pixel that decides: over 0 where too few are right.
 
@@ -149,8 +147,6 @@ class Segmentation(ClassTask):
     @staticmethod
     def _unseen(output: Tensor) -> Tensor:
         return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
-
-    # ---- in words ---------------------------------------------------------------------------------------------------
 
     def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
         """Return the things that most pixels of each picture are given, with the shares that they have."""

@@ -87,8 +87,6 @@ class Similarity(Classification):
         if bar is not None and self.references:
             raise InputError("task similarity: threshold: compares with the clean picture; leave `references` out")
 
-    # ---- what it knows ----------------------------------------------------------------------------------------------
-
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Similarity:
         """See `Task.on`; references are read and shown to the model, once.
 
@@ -122,14 +120,11 @@ class Similarity(Classification):
 
     @property
     def looks(self) -> bool:
-        """See `Task.looks`."""
         return not self.references and self.clean is None
 
     def seeing(self, output: Tensor, truth: Labels | None) -> Similarity:
         """See `Task.seeing`: the first picture is the clean one."""
         return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.looks else self
-
-    # ---- features and logits ----------------------------------------------------------------------------------------
 
     def read(self, answer: Any, count: int) -> Tensor:
         """Return features (count, D): a tensor, the first of a tuple, or the first of `PARTS` that is there.
@@ -158,8 +153,6 @@ class Similarity(Classification):
     def answerable(self, output: Tensor, truth: Labels) -> Tensor:
         """See `Task.answerable`: the logits."""
         return super().answerable(self.logits(output), truth)
-
-    # ---- in words ---------------------------------------------------------------------------------------------------
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
         """See `Task.judge`; the payload has the cosine to the clean picture, or what `_ranked` says."""

@@ -86,23 +86,19 @@ class Together(Task):
 
     @property
     def looks(self) -> bool:
-        """See `Task.looks`."""
         return any(one.looks for one in self.tasks)
 
     def seeing(self, output: Sequence[Outputs], truth: Truths | None) -> Together:
-        """See `Task.seeing`."""
         each = zip(self.tasks, of_each(output), truth or [None] * len(self.tasks), strict=True)
         return replace(self, tasks=tuple(one.seeing(own, true) for one, own, true in each))
 
     @property
     def unsaid(self) -> str:
-        """See `Task.unsaid`."""
         pairs = zip(self.models, self.tasks, strict=True)
         return "; ".join(f"{model.name}: {one.unsaid}" for model, one in pairs if one.unsaid)
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """See `Task.remarks`."""
         return tuple(dict.fromkeys(remark for one in self.tasks for remark in one.remarks))
 
     def truth(self, facts: Facts) -> Truths:
@@ -116,7 +112,6 @@ class Together(Task):
 
     @property
     def target_names(self) -> tuple[str, ...]:
-        """See `Task.target_names`."""
         return tuple(dict.fromkeys(name for one in self.tasks for name in one.target_names))
 
     def margin(self, output: Sequence[Outputs], truth: Truths) -> Tensor:

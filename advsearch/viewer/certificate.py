@@ -31,7 +31,7 @@ def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
     Raises:
         InputError: there is no `openssl`, or it makes none.
     """
-    names = ",".join(f"IP:{host}" if _is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
+    names = ",".join(f"IP:{host}" if is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
     with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
         key, certificate = Path(folder) / "key.pem", Path(folder) / "certificate.pem"
         key.touch(mode=0o600)
@@ -69,7 +69,8 @@ def reachable(host: str) -> str:
         return "::1" if host == "::" else "127.0.0.1"
 
 
-def _is_address(host: str) -> bool:
+def is_address(host: str) -> bool:
+    """Whether a host is a number and no name."""
     try:
         ipaddress.ip_address(host)
     except ValueError:

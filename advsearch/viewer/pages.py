@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from advsearch import rooms
+from advsearch.errors import InputError
 from advsearch.report.charts import NARROW, WIDE, study_chart
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
-from advsearch.runs.directory import IMAGES, REPORT
-from advsearch.runs.files import write_text
+from advsearch.runs.directory import IMAGES, PARTS, REPORT
+from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.summary import read_result
+from advsearch.viewer.columns import read_columns
 from advsearch.viewer.document import (
     again,
     data_url,
@@ -24,7 +28,8 @@ from advsearch.viewer.document import (
     study_table,
     subject_html,
 )
-from advsearch.viewer.sweep_page import write_sweep_page
+from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, write_sweep_page
+from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 LARGEST_FIGURE = 2_000_000
 """Bytes of a figure or a picture that the page takes along."""
@@ -132,3 +137,59 @@ def _links(run: Path, parts: list[str]) -> Html:
     linked = zip(parts, part_links(run, parts), strict=True)
     lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
     return element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines))
+
+
+INDEX = "index.html"
+
+
+def renewed(run: Path) -> Path:
+    """Write the page of a run anew and return its path.
+
+    Raises:
+        FileFormatError: its results are damaged.
+        StorageError: it cannot be written.
+    """
+    return write_page(run, read_result(run))
+
+
+def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
+    """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of another run; return the page.
+
+    Raises:
+        InputError: the folder is there and not empty, or runs of these commands have no common page.
+        FileFormatError: results are damaged.
+        StorageError: the folder cannot be written.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"bundle: {folder} is there already and not empty; name another folder")
+    results = [(run, read_result(run)) for run in runs]
+    sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
+    with placed_by("bundle"):
+        if len(results) == 1 and not sweeps:
+            return _alone(runs[0], folder)
+        if len(sweeps) < len(results):
+            raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
+        sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
+        return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
+
+
+def _alone(run: Path, folder: Path) -> Path:
+    """Write the page of a run, and those of the attacks that it consists of, which it links to."""
+    for part in sorted((run / PARTS).glob(f"*/{REPORT}")):
+        if part.is_symlink() or part.parent.is_symlink() or not part.is_file():
+            continue
+        write_bytes(folder / part.relative_to(run), part.read_bytes())
+    return write_bytes(folder / INDEX, renewed(run).read_bytes())
+
+
+def _copied(run: Path, folder: Path, number: int) -> SweepSource:
+    """Write rows and thumbnails of a sweep into the folder, and say where they are."""
+    rows, pictures = f"rows-{number}.bin", f"pictures-{number}"
+    write_bytes(folder / rows, read_columns(run).packed())
+    kept = kept_pictures(run)
+    for one in kept.numbers if kept else ():
+        source = path_of(run, one)
+        target = folder / pictures / source.parent.name / source.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, target)
+    return SweepSource(run.name, rows, pictures=kept, folder=pictures)

@@ -32,7 +32,7 @@ from advsearch.files import open_regular
 from advsearch.report.markup import element
 from advsearch.runs import listing, lock
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
-from advsearch.viewer.certificate import https_context, reachable
+from advsearch.viewer.certificate import https_context, is_address, reachable
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.following import START, following_page, is_under_way, progress_json
 from advsearch.viewer.list_page import list_page
@@ -99,7 +99,8 @@ class Dashboard(HTTPServer):
         photographs: object | None = None,
     ) -> None:
         self._given = tuple(runs)
-        self.token = None if _is_loopback(host) else secrets.token_urlsafe(24)
+        here = host == "localhost" or (is_address(host) and ipaddress.ip_address(host).is_loopback)
+        self.token = None if here else secrets.token_urlsafe(24)
         self.key, self.photographs = secrets.token_urlsafe(24), photographs
         self._host, self.fingerprint = host, None
         self._context: ssl.SSLContext | None = None
@@ -236,13 +237,7 @@ class _Handler(BaseHTTPRequestHandler):
             return False
         if self.server.token is None:
             return name in ("localhost", LOOPBACK, "[::1]")
-        if name in ("localhost", self.server._host):
-            return True
-        try:
-            ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
-        except ValueError:
-            return False
-        return True
+        return name in ("localhost", self.server._host) or is_address(name.removeprefix("[").removesuffix("]"))
 
     def _tokens(self) -> list[str]:
         given = parse_qs(urlsplit(self.path).query).get("token", [])
@@ -295,10 +290,7 @@ class _Handler(BaseHTTPRequestHandler):
         return _html(report.read_bytes(), "../../")
 
     def _progress(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        after = query.get("after", [str(START)])[0]
-        if not re.fullmatch(r"[0-9]{1,15}", after):
-            raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
-        return "application/json", progress_json(self._run(name), int(after))
+        return "application/json", progress_json(self._run(name), _after(query, START))
 
     def _part(self, _query: Mapping[str, list[str]], name: str, part: str) -> tuple[str, bytes]:
         """The page of one of the attacks that a study consists of, where the study's page links to it."""
@@ -321,15 +313,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _rows(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         run = self._run(name)
-        after = query.get("after", ["0"])[0]
-        if not re.fullmatch(r"[0-9]{1,15}", after):
-            raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
-        if after == "0" and (run / COLUMNS).is_file() and listing.finished(run):
+        after = _after(query, 0)
+        if not after and (run / COLUMNS).is_file() and listing.finished(run):
             with open_regular(run / COLUMNS, "columns of a sweep", LARGEST) as file:
                 return "application/octet-stream", file.read()
-        part = PART if int(after) else FIRST_PART
+        part = PART if after else FIRST_PART
         running = lock.is_held(run)  # before the rows are read: what comes later is asked for again
-        columns = read_columns(run, int(after), part)
+        columns = read_columns(run, after, part)
         more = len(columns.step) == part
         return "application/octet-stream", replace(columns, more=more, running=running).packed()
 
@@ -382,6 +372,14 @@ _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
 """What is sent, not asked for."""
 
 
+def _after(query: Mapping[str, list[str]], otherwise: int) -> int:
+    """Return the id of the row after which rows are asked for."""
+    after = query.get("after", [str(otherwise)])[0]
+    if not re.fullmatch(r"[0-9]{1,15}", after):
+        raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
+    return int(after)
+
+
 def _photographs(what: str) -> Callable[..., tuple[str, bytes]]:
     """A part of what takes photographs in, which the tool works without."""
     found: Callable[..., tuple[str, bytes]] | None = rooms.in_room("photographs", "serving", what)
@@ -400,12 +398,3 @@ def _html(page: bytes, home: str, above: tuple[str, str] | None = None) -> tuple
     links = [("All runs", home), *([(above[1], above[0])] if above else [])]
     way = element("nav", *(element("a", text, href=address) for text, address in links), aria_label="back")
     return "text/html; charset=utf-8", page.replace(b"<body>", b"<body>" + way.encode(), 1)
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

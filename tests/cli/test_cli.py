@@ -868,18 +868,13 @@ def test_show_prints_what_the_command_printed(
 
 @pytest.mark.parametrize("flag", [[], ["--json"]])
 def test_doctor_passes_its_status_on(flag: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    import advsearch.cli
-
     asked: list[bool] = []
 
-    def run(json: bool) -> int:
-        asked.append(json)
+    def told(as_json: bool) -> int:
+        asked.append(as_json)
         return 3
 
-    module = types.ModuleType("advsearch.cli.doctor")
-    vars(module).update(run=run)
-    monkeypatch.setitem(sys.modules, "advsearch.cli.doctor", module)
-    monkeypatch.setattr(advsearch.cli, "doctor", module, raising=False)
+    monkeypatch.setattr("advsearch.cli.doctor.told", told)
     assert main(["doctor", *flag]) == 3
     assert asked == [bool(flag)]
 

@@ -18,7 +18,7 @@ from samples import make_run
 from stored_sweeps import make_sweep
 
 from advsearch.cli.main import main
-from advsearch.cli.terminal_pictures import best_pictures
+from advsearch.cli.show import best_pictures
 
 SIXEL, KITTY = b"\x1bP", b"\x1b_G"
 

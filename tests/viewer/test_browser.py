@@ -48,9 +48,8 @@ from advsearch.runs.results.base import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.tasks import Answer
 from advsearch.viewer import thumbnails
-from advsearch.viewer.bundle import write_bundle
 from advsearch.viewer.document import asset
-from advsearch.viewer.pages import write_page
+from advsearch.viewer.pages import write_bundle, write_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

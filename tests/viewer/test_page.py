@@ -13,8 +13,8 @@ from stored_sweeps import make_sweep
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.viewer import sweep_page
-from advsearch.viewer.bundle import renewed, write_bundle
 from advsearch.viewer.document import asset
+from advsearch.viewer.pages import renewed, write_bundle
 
 
 def test_the_page_needs_nothing_else(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from advsearch.attacks.policies.adam import Adam
 from advsearch.attacks.policies.archive import MapElites
 from advsearch.attacks.policies.auto import Auto
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
-from advsearch.attacks.policies.choices import Choices, with_choices
+from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.cmaes import CMAES
 from advsearch.attacks.policies.grid import Grid
 from advsearch.attacks.policies.mixture import Mixture
@@ -93,26 +93,6 @@ def _nested(spec: Spec, where: str) -> Policy[Any]:
 
 
 __all__ = [
-    "CMAES",
-    "NES",
-    "PGD",
-    "POLICIES",
-    "Adam",
-    "Auto",
-    "Choices",
-    "Evaluated",
-    "Grid",
-    "MapElites",
-    "Mixture",
-    "Policy",
-    "Portfolio",
-    "Proposal",
-    "Random",
-    "Restarts",
-    "Sobol",
-    "Spec",
-    "draw_seed",
-    "make_policy",
-    "seeded",
-    "with_choices",
-]
+    "CMAES", "NES", "PGD", "POLICIES", "Adam", "Auto", "Choices", "Evaluated", "Grid", "Policy", "Portfolio",
+    "Proposal", "Random", "Restarts", "Sobol", "Spec", "draw_seed", "make_policy", "seeded",
+]  # fmt: skip

@@ -73,9 +73,6 @@ def interior(asset: ObjectAsset) -> Vessel | None:
     return Vessel(axis, heights, np.where(met, radii, middle[:, None]), _color(asset, faces[faces >= 0]))
 
 
-# ---- where rain collects --------------------------------------------------------------------------------------------
-
-
 def _basin(mesh: Mesh) -> tuple[Doubles, float, float] | None:
     """Return the axis (2,), the floor and the rim of the largest basin, or None if there is none worth the name."""
     from scipy import ndimage
@@ -135,9 +132,6 @@ def _filled(ground: Doubles) -> Doubles:
         if np.array_equal(level, water[1:-1, 1:-1]):
             return water
         water[1:-1, 1:-1] = level
-
-
-# ---- the wall -------------------------------------------------------------------------------------------------------
 
 
 def _wall(mesh: Mesh, axis: Doubles, height: float) -> tuple[Doubles, Ints]:

@@ -63,29 +63,15 @@ class CorruptionControl(NumberControl):
     summary: ClassVar[str] = "A common image corruption (noise, blur, weather, digital) by name and severity."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "which",
-            (),
-            "name",
-            0,
-            len(NAMES) - 1,
-            NAMES[0],
-            "Which corruption.",
-            search=(0, len(NAMES) - 1),
-            options=NAMES,
-            estimators=(),
+            "which", (), "name", 0, len(NAMES) - 1, NAMES[0], "Which corruption.", search=(0, len(NAMES) - 1),
+            options=NAMES, estimators=(),
         ),
         Parameter(
-            "severity",
-            (),
-            "1",
-            0.0,
-            float(LEVELS),
-            0.0,
-            "How strong it is: 0 is none, 1 to 5 are the published severities.",
-            search=(0.0, float(LEVELS)),
+            "severity", (), "1", 0.0, float(LEVELS), 0.0,
+            "How strong it is: 0 is none, 1 to 5 are the published severities.", search=(0.0, float(LEVELS)),
             estimators=("image",),
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
             "seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0.", whole=(0, 2**32 - 1)

@@ -61,41 +61,23 @@ class GeometryControl(Control):
     summary: ClassVar[str] = "A smooth change of the object's shape, at most so far."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "amplitudes",
-            (None,),
-            "1",
-            -1.0,
-            1.0,
-            0.0,
-            "How much of each smooth mode of the shape is added (form modes).",
-            moves_silhouettes=True,
-            search=(-1.0, 1.0),
-            estimators=ESTIMATORS,
+            "amplitudes", (None,), "1", -1.0, 1.0, 0.0,
+            "How much of each smooth mode of the shape is added (form modes).", moves_silhouettes=True,
+            search=(-1.0, 1.0), estimators=ESTIMATORS,
         ),
         Parameter(
-            "pushes",
-            (None, 3),
-            "1",
-            -1.0,
-            1.0,
-            0.0,
-            "Push on each vertex before it is spread out (form large-steps).",
-            moves_silhouettes=True,
-            search=(-1.0, 1.0),
-            estimators=ESTIMATORS,
+            "pushes", (None, 3), "1", -1.0, 1.0, 0.0, "Push on each vertex before it is spread out (form large-steps).",
+            moves_silhouettes=True, search=(-1.0, 1.0), estimators=ESTIMATORS,
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
-            "epsilon",
-            DEFAULT_EPSILON,
-            "Largest displacement of a vertex, in object sizes.",
-            "epsilon",
+            "epsilon", DEFAULT_EPSILON, "Largest displacement of a vertex, in object sizes.", "epsilon",
             most=LARGEST_EPSILON,
         ),
         Choice("modes", DEFAULT_MODES, "Number of smooth modes (form modes).", whole=(1, LARGEST_MODES)),
         Choice("form", "modes", "What is searched: modes (a few smooth fields) or large-steps (every vertex)."),
-    )
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         for choice in self.choices:

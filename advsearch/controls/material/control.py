@@ -46,18 +46,12 @@ class MaterialControl(NumberControl):
     summary: ClassVar[str] = "The object's gloss, metal, coat and tint, and which named material covers it."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "which",
-            (),
-            "name",
-            0.0,
-            float(len(PATTERNS)),
-            OWN,
-            "The object's own surface, or a named material in its place.",
-            options=(OWN, *PATTERNS),
+            "which", (), "name", 0.0, float(len(PATTERNS)), OWN,
+            "The object's own surface, or a named material in its place.", options=(OWN, *PATTERNS),
         ),
         *MATERIAL,
         *colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
-    )
+    )  # fmt: skip
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         numbers = [name for name in NUMBERS if self._varies(name)]
@@ -98,8 +92,6 @@ class MaterialControl(NumberControl):
         if not self._colours():
             return {}
         return {self.name: linear_to_srgb(self.scene_inputs(scene, values, so_far)[self._base_color])}
-
-    # ---- inside -----------------------------------------------------------------------------------------------------
 
     @property
     def _base_color(self) -> str:

@@ -40,47 +40,25 @@ class SkyControl(NumberControl):
     summary: ClassVar[str] = "A clear sky instead of the environment: where the sun stands, and how hazy the air is."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "azimuth",
-            (),
-            "degrees",
-            -3600.0,
-            3600.0,
-            90.0,
-            "Direction of the sun about the vertical; 0 is +x.",
-            periodic=True,
-            search=(0.0, 360.0),
+            "azimuth", (), "degrees", -3600.0, 3600.0, 90.0, "Direction of the sun about the vertical; 0 is +x.",
+            periodic=True, search=(0.0, 360.0), estimators=("differences",),
+        ),
+        Parameter(
+            "elevation", (), "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.", search=(5.0, 85.0),
             estimators=("differences",),
         ),
         Parameter(
-            "elevation",
-            (),
-            "degrees",
-            2.0,
-            90.0,
-            45.0,
-            "Height of the sun above the horizon.",
-            search=(5.0, 85.0),
-            estimators=("differences",),
-        ),
-        Parameter(
-            "turbidity",
-            (),
-            "1",
-            *TURBIDITIES,
-            3.0,
-            "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.",
-            search=(2.0, 8.0),
+            "turbidity", (), "1", *TURBIDITIES, 3.0,
+            "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", search=(2.0, 8.0),
             estimators=("adjoint", "differences"),
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
-            "exposure",
-            "metered",
-            "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
+            "exposure", "metered", "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
             options=("metered", "fixed"),
         ),
-    )
+    )  # fmt: skip
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         radiance = self.radiance(scene, self.start_values(scene)).numpy().astype(np.float32)

@@ -103,9 +103,6 @@ def _made(address: str) -> Any:
         return None
 
 
-# ---- the table ------------------------------------------------------------------------------------------------------
-
-
 def table_html(table: PhotoAgreement) -> Html:
     """Return the counts of right and wrong answers in rendering and photograph, in all and by rendering."""
     if not table.photos or table.interval is None:

@@ -18,6 +18,7 @@ from typing import Any, Generic, TypeVar
 
 from advsearch import seeds, threads
 from advsearch.cluster.executor import Executor
+from advsearch.cluster.machine import processor
 from advsearch.errors import ClusterError
 from advsearch.questions.precision.answer import Machine
 from advsearch.questions.precision.points import Array, MeasuredSetting
@@ -280,24 +281,12 @@ def timing_machine(cpu_info: Path = _CPU_INFO) -> Machine:
         cpu_info: Linux's description of the processor.
     """
     return Machine(
-        cpu=_cpu_name(cpu_info),
+        cpu=processor(cpu_info),
         cores=threads.cores(),
         threads=_threads(),
         system=f"{platform.system()} {platform.machine()}",
         python=platform.python_version(),
     )
-
-
-def _cpu_name(cpu_info: Path) -> str:
-    """The processor's name; what the system says where the file has none."""
-    try:
-        for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():
-            key, _, value = line.partition(":")
-            if key.strip().lower() == "model name" and value.strip():
-                return " ".join(value.split())
-    except OSError:
-        pass
-    return platform.processor() or platform.machine() or "unknown"
 
 
 def _threads() -> dict[str, int]:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
@@ -85,6 +89,24 @@ def text_of(data: bytes) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
+
+
+def numbers_in(data: bytes, kind: type) -> npt.NDArray[np.generic]:
+    """Return the numbers in a text with blanks between them, up to the first word that is none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return np.fromstring(data, dtype=kind, sep=" ")
+        except ValueError:
+            return np.zeros(0, kind)
+
+
+def is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return "_" not in word
 
 
 def shown(name: str, *, quoted: bool = True) -> str:

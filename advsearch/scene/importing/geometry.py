@@ -209,8 +209,7 @@ def _agreement(area: Array, left: Ints, right: Ints, same_way: Bools) -> tuple[B
     f, g, count = left // 3, right // 3, len(area)
     a = np.concatenate([2 * f, 2 * f + 1])
     b = np.concatenate([2 * g + same_way, 2 * g + 1 - same_way])
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(2 * count, 2 * count))
-    side = csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+    side = connected(2 * count, a, b)
     kept, turned = side[0::2], side[1::2]
     votes = np.bincount(kept, weights=area, minlength=int(side.max()) + 1)
     turn = (votes[turned] > votes[kept]) | ((votes[turned] == votes[kept]) & (turned < kept))
@@ -296,14 +295,12 @@ def smooth_normals(soup: Soup) -> Array:
     left, right = left[gentle & ~same_way], right[gentle & ~same_way]
     after = [corner - corner % 3 + (corner + 1) % 3 for corner in (left, right)]
     a, b = np.concatenate([left, after[0]]), np.concatenate([after[1], right])
-    count = soup.faces.size
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
-    groups, group = csgraph.connected_components(graph, directed=False)
+    group = connected(soup.faces.size, a, b)
     corners = soup.points[soup.faces]
     ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     angles: Array = np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2))
     weighted = unit[:, None] * angles[:, :, None]
-    sums: Array = np.stack([np.bincount(group, weighted[:, :, k].ravel(), groups) for k in range(3)], axis=1)
+    sums: Array = np.stack([np.bincount(group, weighted[:, :, k].ravel()) for k in range(3)], axis=1)
     smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
     sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0  # NaN, where normals cancel, is not
     return np.where(sound, smooth, unit[:, None])
@@ -318,8 +315,7 @@ def _welded(points: Array) -> tuple[Array, Ints]:
     pairs = cKDTree(unique).query_pairs(WELD, output_type="ndarray")
     if not len(pairs):
         return unique, index.reshape(-1)
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(unique),) * 2)
-    _, cluster = csgraph.connected_components(graph, directed=False)
+    cluster = connected(len(unique), pairs[:, 0], pairs[:, 1])
     _, first, merged = np.unique(cluster, return_index=True, return_inverse=True)
     return unique[first], merged[index.reshape(-1)].astype(np.int64)
 
@@ -336,3 +332,9 @@ def unit_vectors(vectors: Array) -> Array:
         scaled = vectors / largest
         result = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
     return np.where(np.isfinite(result).all(axis=-1, keepdims=True), result, np.nan)
+
+
+def connected(count: int, a: Ints, b: Ints) -> Ints:
+    """Return the component (count,) of each node of a graph with edges between a and b."""
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
+    return np.asarray(csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import check_faces, damaged, looks_like, shown, text_of
+from advsearch.scene.importing.files import check_faces, damaged, is_number, looks_like, numbers_in, shown, text_of
 
 Ints = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.generic]
@@ -112,12 +111,7 @@ class _Words:
     """The numbers of a text, one a cell."""
 
     def __init__(self, data: bytes) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                self.values = np.fromstring(data, dtype=np.float64, sep=" ")
-            except ValueError:
-                self.values = np.zeros(0)
+        self.values = numbers_in(data, np.float64)
         self.end, self.data = len(self.values), data
 
     def width(self, kind: np.dtype[np.generic]) -> int:
@@ -127,11 +121,11 @@ class _Words:
         return self.values[places]
 
     def number(self, place: int, kind: np.dtype[np.generic]) -> float:
-        return self.values.item(place)
+        return float(self.values.item(place))
 
     def odd(self) -> str | None:
         """The first word that is no number, if there is one."""
-        return next((text_of(word) for word in self.data.split() if not _is_number(word)), None)
+        return next((word for word in map(text_of, self.data.split()) if not is_number(word)), None)
 
 
 class _Bytes:
@@ -155,14 +149,6 @@ class _Bytes:
 
     def odd(self) -> str | None:
         return None
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _fill(path: Path, element: Element, cells: _Words | _Bytes, at: int) -> int:

@@ -12,14 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array, csgraph
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.geometry import Array, Ints, Soup
+from advsearch.scene.importing.geometry import Array, Bools, Ints, Soup, connected, unit_vectors
 from advsearch.scene.importing.images import TEXTURE_LIMIT
-from advsearch.scene.importing.normal_maps import FLAT
+from advsearch.scene.importing.normal_maps import FLAT, texels_of
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
-from advsearch.scene.importing.tangents import mirrored, turned, unmirrored
 from advsearch.scene.importing.unwrap import unwrapped
 from advsearch.scene.raster import doubled_areas, pixels_in
 from advsearch.scene.surface_map import looked_up
@@ -180,9 +178,8 @@ def _into_unit_square(soup: Soup) -> Array:
     _, vertex = np.unique(corners, axis=0, return_inverse=True)
     vertex = vertex.reshape(-1, 3)
     a, b = np.concatenate([vertex[:, 0], vertex[:, 1]]), np.concatenate([vertex[:, 1], vertex[:, 2]])
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(int(vertex.max()) + 1,) * 2)
-    charts, chart = csgraph.connected_components(graph, directed=False)
-    low = np.full((charts, 2), np.inf)
+    chart = connected(int(vertex.max()) + 1, a, b)
+    low = np.full((int(chart.max()) + 1, 2), np.inf)
     np.minimum.at(low, chart[vertex.reshape(-1)], soup.uvs.reshape(-1, 2))
     moved: Array = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
     return moved
@@ -322,3 +319,80 @@ def sampled(texture: Floats, uvs: Array) -> Floats:
     height, width = texture.shape[:2]
     u, v = (uvs % 1.0).T  # first, since a huge number times a width is infinite
     return looked_up(texture, u * width - 0.5, (1.0 - v) * height - 0.5)
+
+
+# ---- normal maps at other texture coordinates ---------------------------
+#
+# In a file the bitangent runs up the picture; Mitsuba's is normal x tangent, which runs down it where texture
+# coordinates are mirrored.
+
+FEW = 1e-3
+"""Share of the surface whose texture coordinates may be mirrored without anything being done about it."""
+
+
+def mirrored(soup: Soup, uvs: Array) -> Bools:
+    """Return (F,) which faces have their texture mirrored; where these, or the others, are `FEW`, none or all have."""
+    turned = doubled_areas(uvs) < 0.0
+    area = np.linalg.norm(soup.face_vectors(), axis=1)
+    share = float(area[turned].sum() / area.sum())
+    return np.full(len(turned), share > 0.5) if min(share, 1.0 - share) < FEW else turned
+
+
+def unmirrored(
+    uvs: Array, over: Bools, color: Floats, normals: Floats, emission: Floats | None
+) -> tuple[Array, tuple[Floats, Floats, Floats | None]]:
+    """Return texture coordinates that mirror no face, and the maps for them; no texel is resampled.
+
+    The maps get a second half, which is the first one mirrored, and there the faces go.
+
+    Args:
+        uvs: (F, 3, 2) in [0, 1].
+        over: (F,) the mirrored faces, as `mirrored` gives them.
+        color: (H, W, C).
+        normals: (H', W', 3), a normal map.
+        emission: (H", W", 3); None where there is none.
+    """
+    if not over.any():
+        return uvs, (color, normals, emission)
+    if over.all():
+        return uvs, (color, normals * np.array([1, -1, 1], np.float32) + np.array([0, 1, 0], np.float32), emission)
+    placed = uvs.copy()
+    placed[over, :, 0] = 2.0 - placed[over, :, 0]
+    placed[:, :, 0] /= 2.0
+    other = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array([1, 0, 0], np.float32)
+    glow = emission if emission is None or emission.shape == (1, 1, 3) else _beside(emission, emission[:, ::-1])
+    return placed, (_beside(color, color[:, ::-1]), _beside(normals, other), glow)
+
+
+def _beside(left: Floats, right: Floats) -> Floats:
+    return np.concatenate([left, right], axis=1)
+
+
+def turned(texels: Floats, before: Soup, after: Array, face: Ints, weights: Array) -> Floats:
+    """Return texels of a normal map for other texture coordinates.
+
+    Args:
+        texels: (T, 3) as they are for the coordinates of the soup.
+        before: with these.
+        after: (F, 3, 2) the other ones.
+        face: (T,) on which each lies.
+        weights: (T, 3) where on it.
+    """
+    normal = unit_vectors(np.einsum("tk,tkc->tc", weights, before.normals[face]))
+    old, new = (_tangents(one, normal, face) for one in (before, replace(before, uvs=after)))
+    up = np.cross(normal, old) * np.sign(doubled_areas(before.uvs[face]))[:, None]
+    x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)
+    way = x[:, None] * old + y[:, None] * up
+    found = np.stack([(way * new).sum(axis=1), (way * np.cross(normal, new)).sum(axis=1), z], axis=1)
+    return texels_of(np.where(np.isfinite(found).all(axis=1, keepdims=True), found, [0.0, 0.0, 1.0]))
+
+
+def _tangents(soup: Soup, normal: Array, face: Ints) -> Array:
+    """Unit directions (T, 3) along u in the plane across the normals (T, 3); NaN where there is none."""
+    used, at = np.unique(face, return_inverse=True)
+    a, b, c = (soup.points[soup.faces[used, k]] for k in range(3))
+    uvs = soup.uvs[used]
+    (_, v1), (_, v2) = (uvs[:, 1] - uvs[:, 0]).T, (uvs[:, 2] - uvs[:, 0]).T
+    along = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * np.sign(doubled_areas(uvs))[:, None]
+    along = along[at.reshape(-1)]
+    return unit_vectors(along - normal * (along * normal).sum(axis=1, keepdims=True))

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import xatlas
-from scipy.sparse import coo_array, csgraph
+from scipy.sparse import coo_array
 
-from advsearch.scene.importing.geometry import Array, Ints, Soup, neighbours, unit_vectors
+from advsearch.scene.importing.geometry import Array, Ints, Soup, connected, neighbours, unit_vectors
 
 ATLAS_SIZE = 512
 ATLAS_PADDING = 4
@@ -81,7 +81,7 @@ def _patches(soup: Soup) -> Ints:
     left, right, _ = neighbours(soup.faces)
     f, g = left // 3, right // 3
     flush = (unit[f] * unit[g]).sum(axis=1) > _FLUSH
-    plane = _connected(len(unit), f[flush], g[flush])
+    plane = connected(len(unit), f[flush], g[flush])
     mean: Array = np.stack([np.bincount(plane, unit[:, k]) for k in range(3)], axis=1)
     straight = (unit * unit_vectors(mean)[plane]).sum(axis=1) > _PLANE
     if straight.all() and len(unit) <= _MANY:
@@ -91,12 +91,12 @@ def _patches(soup: Soup) -> Ints:
     facing = _smoothed(unit, f, g) @ np.concatenate([axes, corners]).T
     direction = facing.argmax(axis=1)
     same = direction[f] == direction[g]
-    patch = _connected(len(unit), f[same], g[same])
+    patch = connected(len(unit), f[same], g[same])
     if len(unit) <= _LARGE:
         return patch
     cell = _cells(soup.points[soup.faces].mean(axis=1), patch)
     near = same & (cell[f] == cell[g])
-    return _connected(len(unit), f[near], g[near])
+    return connected(len(unit), f[near], g[near])
 
 
 def _cells(middles: Array, patch: Ints) -> Ints:
@@ -127,9 +127,3 @@ def _smoothed(unit: Array, f: Ints, g: Ints) -> Array:
     for _ in range(_SMOOTHING):
         unit = np.nan_to_num(unit_vectors(average @ unit))
     return unit
-
-
-def _connected(count: int, a: Ints, b: Ints) -> Ints:
-    """Return the component (count,) of each node of a graph with edges between a and b."""
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
-    return np.asarray(csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)

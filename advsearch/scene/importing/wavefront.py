@@ -6,7 +6,6 @@ Statements of numbers are read as arrays, since a file may have millions of line
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +16,17 @@ import numpy.typing as npt
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import MOST_CORNERS, Inventory, check_faces, damaged, looks_like, shown, text_of
+from advsearch.scene.importing.files import (
+    MOST_CORNERS,
+    Inventory,
+    check_faces,
+    damaged,
+    is_number,
+    looks_like,
+    numbers_in,
+    shown,
+    text_of,
+)
 from advsearch.scene.importing.imported_part import ImportedPart, Looked, split_at_corners
 from advsearch.scene.importing.mtl import without_comment
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
@@ -266,7 +275,7 @@ class Lines:
         begins[1:] &= blank[:-1]
         ends = np.flatnonzero(data == _NEWLINE)
         counts = np.add.reduceat(begins, np.concatenate([[0], ends[:-1] + 1]), dtype=np.int64)
-        values: Array = _parsed(data, np.float64).astype(np.float64, copy=False)
+        values: Array = numbers_in(data.tobytes(), np.float64).astype(np.float64, copy=False)
         if counts.min() < fewest or len(values) != counts.sum():
             self._blame_numbers(kind, fewest, rows)
         if (counts == counts[0]).all():
@@ -298,7 +307,7 @@ class Lines:
         place[2:] += np.where(first[2:] | first[1:-1], 0, step[:-2])
         longer = ~(first[3:] | first[2:-1] | first[1:-2])
         odd = (slash[1:] & blank[:-1]).any() or not _IN_CORNERS[data].all() or longer.any() or (place > 2).any()
-        values = _parsed(np.where(slash, np.uint8(ord(" ")), data), np.int64)
+        values = numbers_in(np.where(slash, np.uint8(ord(" ")), data).tobytes(), np.int64)
         if odd or len(values) != len(begins) or (values == 0).any():
             self._blame_faces(rows)
         at = np.flatnonzero(first)
@@ -357,7 +366,7 @@ class Lines:
             if len(words) < fewest:
                 what = "3 numbers" if fewest == 3 else "numbers"
                 raise damaged(self.path, f"{what} after {kind!r} on line {number}", f"{rest} (is the file cut short?)")
-            if not all(map(_is_number, words)):
+            if not all(map(is_number, words)):
                 raise damaged(self.path, f"numbers after {kind!r} on line {number}", rest)
         raise damaged(self.path, f"numbers after {kind!r}", "something else")
 
@@ -374,21 +383,3 @@ class Lines:
                 if any(not index or index < -most for index, most in zip(indices, counts[number - 1], strict=False)):
                     raise damaged(self.path, f"indices that count from 1 in the face on line {number}", shown(word))
         raise damaged(self.path, "whole numbers in faces", "something else")
-
-
-def _parsed(data: Bytes, kind: type) -> npt.NDArray[np.generic]:
-    """Return the numbers in a text, up to the first word that is none."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return np.fromstring(data.tobytes(), dtype=kind, sep=" ")
-        except ValueError:
-            return np.zeros(0, kind)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return "_" not in word
