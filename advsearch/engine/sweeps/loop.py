@@ -28,8 +28,8 @@ from advsearch.engine.sharing import Sent, Shared, answering, lost
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.drives import Drives, time_axis
 from advsearch.engine.sweeps.job import KIND, Job, check_all
-from advsearch.engine.sweeps.light import combined
 from advsearch.engine.sweeps.points import Picks
+from advsearch.engine.sweeps.predicting import combined
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
 from advsearch.engine.sweeps.surface import map_surface
 from advsearch.engine.sweeps.swept_scene import Scenes

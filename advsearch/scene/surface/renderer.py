@@ -45,6 +45,17 @@ class SurfaceRenderer(PredictingRenderer):
             texture = self.there.shape[0], self.there.shape[1]
             self.arrangement = Arrangement(renderer, standing, texture, seed)
 
+    def stands(self, inputs: Mapping[str, Tensor]) -> bool:
+        """Whether everything but cameras and environment is the same in scene inputs."""
+        own, others = self.arrangement.inputs, {name: inputs[name] for name in inputs if name not in FREE}
+        if own.keys() != others.keys() or not _same(self.there, self.color(inputs)):
+            return False
+        return all(_same(own[name], others[name]) for name in own)
+
+    def forget(self) -> None:
+        """Let go of all light."""
+        self._lights.clear()
+
     def renew(self, u: Tensor) -> None:
         """Take the light between surfaces from the base colour at u from now on."""
         with torch.no_grad():
@@ -114,3 +125,7 @@ class SurfaceRenderer(PredictingRenderer):
     def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """The base colour (h, w, 3) of scene inputs."""
         return inputs.get(COLOR, self._base[COLOR])
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and torch.equal(one, other)
