@@ -3,7 +3,8 @@
     python benchmarks/kill.py [--kills 50] [--resolution 32] [--command attack|verdict|sweep|views|workers]
 
 Every row must agree in every column but times. The attack has an adjoint, so it runs under `--deterministic`; the sweep
-does not. `views` are predicted by light on surfaces. With workers the process that is killed is the one that gives them work; they have to end by themselves.
+does not. The rows of `views` are predicted by light on surfaces. With workers the process that is killed is the one
+that gives them work; they have to end by themselves.
 """
 
 from __future__ import annotations
