@@ -1,6 +1,7 @@
 """Light on surfaces: what a picture from a new viewpoint takes, and how far it is off, beside a rendered one.
 
     python benchmarks/surface_light.py [SCENE ...] [--views 5] [--truth 1024] [--repeats 5] [--sizes 128,224]
+    python benchmarks/surface_light.py [SCENE ...] --sweep [--rows 1000]
 
 A SCENE is OBJECT@ENVIRONMENT, each a bundled name or a file; the default is the bundled mug, bottle and bowl. The model
 is the reference model, for scenes whose object has a class of it. For each scene and size, over random cameras within
@@ -11,11 +12,16 @@ their whole ranges:
   (two of them are traced), predicted and rendered;
 - margin: mean absolute difference of the model's margin from that of the traced pictures, predicted and rendered;
 - light: seconds of processor time until the first picture can be predicted, and ms for another environment.
+
+With `--sweep`, of a sweep over azimuth, elevation and distance that is predicted, and two that are rendered with other
+seeds: rows a second, light and comparisons included, and how often that is of the rendered ones (asked for: 5); the
+accuracy; and in how many rows the verdict is not that of the rendered ones, and how many differ between these.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -28,8 +34,13 @@ from advsearch import threads
 
 threads.configure()
 
+from advsearch.api.sweep import job_of  # noqa: E402
+from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.engine.sweeps.answer import SweepResult  # noqa: E402
+from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
+from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 from advsearch.scene.surface.plan import why_not  # noqa: E402
 from advsearch.scene.surface.renderer import SurfaceRenderer  # noqa: E402
@@ -47,7 +58,13 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--sizes", default="128,224")
     parser.add_argument("--label", help="what the object is, for a file")
+    parser.add_argument("--sweep", action="store_true", help="rows of a sweep")
+    parser.add_argument("--rows", type=int, default=1000, help="of it, about (default 1000)")
     args = parser.parse_args()
+    if args.sweep:
+        for scene in args.scenes:
+            swept(scene, args.rows, args.label)
+        return
     model = load_model("reference")
     print("predicted | rendered          ms a picture       levels off         margin off     light: s   ms")
     for scene in args.scenes:
@@ -97,6 +114,35 @@ def row(name: str, renderer: Renderer, model: Model, label: str | None, args: ar
     ms = " | ".join(f"{statistics.median(one[1:]):6.1f}" for one in taken)
     levels = " | ".join(f"{statistics.fmean(one):6.2f}" for one in off)
     print(f"{name:20s} {height:4d}  {ms}   {levels}   {shown}   {first:6.1f} {statistics.median(others):6.0f}")
+
+
+def swept(scene: str, rows: int, label: str | None) -> None:
+    """Print what a sweep over the camera comes to, predicted and rendered."""
+    thing, _, environment = scene.partition("@")
+    grid = {
+        "camera.azimuth": f"0:360:{max(2, rows // 50)}",
+        "camera.elevation": "5:60:10",
+        "camera.distance": "2:5:5",
+    }
+    config = SweepConfig(object=thing, environment=environment or "studio", label=label, grid=grid, trials=0)
+    sweeps = [config, *(config.model_copy(update={"specialise": False, "seed": seed}) for seed in (0, 1))]
+    found, speeds = list[SweepResult](), list[float]()
+    for one in sweeps:
+        sweep = Sweep(job_of(one), None, NullProgress())
+        found.append(sweep.carry_out())
+        speeds.append(sweep.total / sweep.stages.seconds["sweep"])
+    right = [[row.correct for row in one.rows()] for one in found]
+    differ = [sum(a != b for a, b in zip(*pair, strict=True)) for pair in itertools.combinations(right, 2)]
+    accuracy = " | ".join(f"{statistics.fmean(map(bool, one)):.3f}" for one in right)
+    speed = " | ".join(f"{one:.1f}" for one in speeds)
+    told = found[0].summary.transport
+    print(f"{scene}, {len(right[0])} rows, predicted | rendered | rendered with another seed")
+    print(f"  rows a second   {speed}   ({speeds[0] / statistics.fmean(speeds[1:]):.1f} times)")
+    print(f"  accuracy        {accuracy}")
+    print(f"  verdicts that differ: {differ[0]} and {differ[1]} of the rendered ones, {differ[2]} between these")
+    assert told is not None
+    error = "" if told.error is None else f"{told.error.levels:.2f} levels off, {told.error.logits:+.2f} logits; "
+    print(f"  {error}{told.reason or 'all predicted'}", flush=True)
 
 
 def views(renderer: Renderer, count: int) -> list[Tensor]:

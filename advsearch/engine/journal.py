@@ -29,7 +29,6 @@ from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
-from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 
 PLAN = "gradient plan"
 """The note under which the store keeps how derivatives are obtained."""
@@ -166,7 +165,8 @@ class Journal:
         values = dict(query.values)
         if query.drawn:
             values |= self.problem.conditions_of(query.u, query.seed)
-        seed, spp = (None, BASIS_SPP) if answer.predicted else (query.seed, query.spp)  # it has no noise of its own
+        seed = None if answer.predicted else query.seed  # it has no noise of its own
+        spp = answer.predicted or query.spp
         said, told = answer.said, {"machine": answer.machine, "renders": answer.cost, "seconds": answer.seconds}
         return trial_row(query.kind, query.number, seed, spp, said, values, sought=query.sought, **told)
 

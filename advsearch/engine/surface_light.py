@@ -25,6 +25,7 @@ from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import BOUND, CHECK_SPP, Conditions, Deviation, Predictor, Tick
 from advsearch.scene.formation import to_8_bit
+from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import MAP
 from advsearch.scene.surface.plan import varied
 from advsearch.scene.surface.renderer import SurfaceRenderer
@@ -187,37 +188,52 @@ class SurfaceLight(Predictor):
             self.seconds += time.perf_counter() - begun
 
     def _deviation(self, whole: Tensor, seed: int) -> Deviation:
-        """Compare a predicted picture and a rendered one with two that are traced without the denoiser, which leaves
-        its own marks in all that it is given. The mean product of the differences to both is the squared error without
-        their noise, which a square would count."""
+        """Compare a predicted picture and a rendered one with traced ones."""
         problem, renderer = self.problem, self.problem.renderer
-        undenoised = renderer.like(denoiser="none")
         with torch.no_grad():
             predicted, rendered = self.renderer(whole), renderer(whole, seeds.stream(seed, "rendered"), problem.spp)
-            traced = [undenoised(whole, seeds.stream(seed, "traced", half), CHECK_SPP) for half in range(2)]
             shown = renderer(whole, seeds.stream(seed, "shown"), CHECK_SPP)
-
-        def off(picture: Tensor) -> float:
-            product = float(((picture - traced[0]) * (picture - traced[1])).mean())
-            return 255.0 * math.sqrt(max(0.0, product))
-
+        off, good = levels_off(renderer, (predicted, rendered), whole, seed, CHECK_SPP)
         values = [problem.judge(one, whole).objective or 0.0 for one in (predicted, shown)]
-        return Deviation(off(predicted), values[0] - values[1], max(BOUND, off(rendered)), pictures=4)
+        return Deviation(off, values[0] - values[1], max(BOUND, good), pictures=4)
 
     def _compare(self, u: Tensor, index: int) -> Deviation:
-        """Compare predicted pictures with traced ones under conditions, and keep what was found: of all pictures the
-        root mean square difference, and the mean of what it may be."""
+        """Compare predicted pictures with traced ones under conditions, and keep what was found."""
         begun, problem = time.perf_counter(), self.problem
         query = Query(u, 0, kind="surface check", number=index)
         wholes = [torch.cat([u, one]) for one in self._drawn(query)[:COMPARED]]
         found = [self._deviation(whole, seeds.stream(problem.seed, query.kind, index)) for whole in wholes]
-        self.deviations.append(
-            Deviation(
-                levels=statistics.fmean(one.levels**2 for one in found) ** 0.5,
-                logits=statistics.fmean(one.logits for one in found),
-                most=statistics.fmean(one.most for one in found),
-                pictures=sum(one.pictures for one in found),
-            )
-        )
+        self.deviations.append(over_all(found))
         self.seconds += time.perf_counter() - begun
         return self.deviations[-1]
+
+
+def levels_off(renderer: Renderer, pictures: Sequence[Tensor], u: Tensor, seed: int, spp: int) -> list[float]:
+    """Return how far pictures (H, W, 3) of a configuration are off, levels of 255.
+
+    They are compared with two that are traced without the denoiser, which leaves its own marks in all that it is given.
+    The mean product of the differences to both is the squared error without their noise, which a square would count.
+
+    Args:
+        renderer: the one that traces.
+        pictures: to be compared.
+        u: (d,) the configuration.
+        seed: of the noise.
+        spp: samples a pixel of each of the two.
+    """
+    undenoised = renderer.like(denoiser="none")
+    with torch.no_grad():
+        one, other = (undenoised(u, seeds.stream(seed, "traced", half), spp) for half in range(2))
+    squares = [float(((picture - one) * (picture - other)).mean()) for picture in pictures]
+    return [255.0 * math.sqrt(max(0.0, square)) for square in squares]
+
+
+def over_all(found: Sequence[Deviation]) -> Deviation:
+    """Return what several comparisons say together: of all pictures the root mean square difference, and the mean of
+    what it may be."""
+    return Deviation(
+        levels=statistics.fmean(one.levels**2 for one in found) ** 0.5,
+        logits=statistics.fmean(one.logits for one in found),
+        most=statistics.fmean(one.most for one in found),
+        pictures=sum(one.pictures for one in found),
+    )

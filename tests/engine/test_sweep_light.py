@@ -11,7 +11,7 @@ from stand_ins import rows
 import advsearch
 from advsearch.attacks.product import Product
 from advsearch.engine.sweeps import light
-from advsearch.engine.sweeps.light import Groups
+from advsearch.engine.sweeps.predicting import Groups, combined
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.transport import Deviation
 from advsearch.runs.results.attack import LinearTransport, PredictionError
@@ -29,14 +29,13 @@ def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_pictures_fall_into_groups_that_differ_in_light_alone() -> None:
     """Of pose x power x camera x tint with two draws each, each group has all of power and tint."""
     groups = Groups(Product((2, 3, 2, 4)), 2, (False, True, False, True), True)
-    assert (groups.size, groups.count, groups.at_once) == (24, 4, 4)
+    assert (groups.size, groups.count, groups.at_once) == (24, 4, 2)
     found: dict[int, list[int]] = {}
     for number in range(groups.grid.count * 2):
-        found.setdefault(groups.group(groups.grid.digits(number // 2)), []).append(number)
+        found.setdefault(groups.group(number), []).append(number)
     assert sorted(found) == [0, 1, 2, 3]
     for members in found.values():
-        digits = groups.grid.digits(members[-1] // 2)
-        assert [groups.member(digits, number) for number in range(groups.size)] == members
+        assert [groups.member(members[-1], place) for place in range(groups.size)] == members
 
 
 def test_light_as_the_last_axes_needs_one_group_at_a_time() -> None:
@@ -124,6 +123,6 @@ def test_of_several_scenes_the_worst_is_told() -> None:
     def one(levels: float, seconds: float) -> LinearTransport:
         return LinearTransport(used=True, bytes=8, seconds=seconds, error=PredictionError(levels=levels, logits=0.0))
 
-    found = light.combined([one(1.0, 2.0), None, one(3.0, 4.0)])
+    found = combined([one(1.0, 2.0), None, one(3.0, 4.0)])
     assert found is not None and found.error is not None and (found.error.levels, found.seconds) == (3.0, 6.0)
-    assert light.combined([None]) is None
+    assert combined([None]) is None

@@ -28,8 +28,8 @@ from advsearch.engine.sharing import Sent, Shared, answering, lost
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.drives import Drives, time_axis
 from advsearch.engine.sweeps.job import KIND, Job, check_all
-from advsearch.engine.sweeps.light import combined
 from advsearch.engine.sweeps.points import Picks
+from advsearch.engine.sweeps.predicting import combined
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
 from advsearch.engine.sweeps.surface import map_surface
 from advsearch.engine.sweeps.swept_scene import Scenes
@@ -357,6 +357,7 @@ class Sweep:
         """Put the summary together and write it."""
         job, seconds = self.job, self.stages.seconds
         view, checked = self._scenes.scene, worst.verified if worst else None
+        predicting = self._transport.values() or [[one.summary() for one in (view.light.values() if view else ())]]
         swept = seconds.get("sweep", 0.0)
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
         gains = self._gains() if formation else {}
@@ -390,7 +391,7 @@ class Sweep:
                 "verification": checked.renders if checked else 0,
                 **({"products": self._predicted} if self._predicted else {}),
             },
-            transport=combined([one for light in self._transport.values() for one in light]),
+            transport=combined([one for light in predicting for one in light]),
             surface=self._surface,
             drives=self._drives,
             shared=SharedWork.of_facts(self._executor.facts, self.journal.machines.known),

@@ -20,8 +20,10 @@ from advsearch.described import Value
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.metrics import judgements
 from advsearch.engine.sweeps.job import Job
-from advsearch.engine.sweeps.light import SweptLight, SweptPicture
+from advsearch.engine.sweeps.light import SweptLight
 from advsearch.engine.sweeps.points import Picks, Points
+from advsearch.engine.sweeps.predicting import Asked, SweptPicture, SweptPredictor
+from advsearch.engine.sweeps.surface_light import SweptSurfaceLight
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
@@ -42,7 +44,7 @@ class SweptScene:
         job, number: likewise.
         points: its configurations for each size of picture, on which what a control frames may depend.
         renderers: likewise.
-        light: what predicts pictures of these that differ in light alone.
+        light: what predicts pictures of these that differ in little.
         prepared: nothing.
     """
 
@@ -60,19 +62,19 @@ class SweptScene:
                 description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
             )
             self.points[size] = job.points(space)
-        self.light = {
-            size: SweptLight(
-                renderer,
-                self.points[size],
-                job.axes,
-                job.spp,
-                seeds.stream(config.seed, "sweep light", number),
-                partial(self._score, job.sizes.index(size)),
-                config.specialise,
-            )
-            for size, renderer in self.renderers.items()
-        }
+        self.light = {size: self._predictor(size) for size in self.renderers}
         self._truths = [None if task.varies else job.truth(place, k, {}) for k, task in enumerate(job.tasks)]
+
+    def _predictor(self, size: tuple[int, int]) -> SweptPredictor:
+        """What predicts the pictures of one size: basis pictures where they pay, or light on surfaces."""
+        job, config, points = self.job, self.job.config, self.points[size]
+        seed, score = seeds.stream(config.seed, "sweep light", self.number), partial(self._score, job.sizes.index(size))
+        scene = (self.renderers[size], points, job.axes, job.spp, seed, score, config.specialise)
+        basis = SweptLight(*scene, before=self.number * points.count)
+        if basis.reason is None:
+            return basis
+        surface = SweptSurfaceLight(*scene, before=self.number * points.count)
+        return surface if surface.reason is None or not basis.reason else basis
 
     @property
     def not_finite(self) -> int:
@@ -119,16 +121,15 @@ class SweptScene:
 
     def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
         """The pictures of one size, rounded to 8 bits, by their numbers."""
-        job, points = self.job, self.points[size]
-        models, before = len(job.models), self.number * points.count
-        asked = {one.number // models: one for one in queries if job.sizes[one.number % models] == size}
-        found: dict[int, SweptPicture] = {}
-        for number, query in asked.items():
-            digits = points.digits(number - before)
-            with torch.no_grad():
-                shown = self.light[size].show(number, digits, query.u, query.seed, before)
-            found[number] = replace(shown, picture=to_8_bit(shown.picture))
-        return found
+        job, models = self.job, len(self.job.models)
+        before, asked = self.number * self.points[size].count, dict[int, Asked]()
+        for one in queries:
+            number, model = divmod(one.number, models)
+            if job.sizes[model] == size:
+                asked[number] = Asked(number - before, one.u, one.seed)
+        with torch.no_grad():
+            shown = self.light[size].pictures(list(asked.values()))
+        return {n: replace(one, picture=to_8_bit(one.picture)) for n, one in zip(asked, shown, strict=True)}
 
     def pictures(self, queries: Sequence[Query]) -> Tensor:
         """Return the pictures (n, H, W, 3) of rows as the first model sees them."""

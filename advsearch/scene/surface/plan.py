@@ -24,16 +24,9 @@ def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
         renderer: which traces.
         varying: names of the controls that vary; the others are searched, and may change base colours alone.
     """
-    description = renderer.scene.made[0]
-    thing = description.meshes[OBJECT]
-    if thing.mesh.repeats or thing.surface is not None or thing.opacity is not None:
-        return "the object's surface repeats its texture, has cut-outs, or is one of Mitsuba's own"
-    if description.environment is None or description.emits or len(description.parts) > 0:
-        return "there is more in the scene than the object, its ground and an environment"
-    if renderer.scene.volumetric or description.thin_lens or description.backdrop:
-        return "there is haze, a lens with an aperture, or a plain background"
-    if renderer.formation.denoiser != "oidn":
-        return NOISE
+    reason = why_not_kept(renderer)
+    if reason is not None:
+        return reason
     for group in renderer.plan.groups:
         if group.control in varying or group.estimator == "image":
             continue
@@ -46,8 +39,25 @@ def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
     return None if changed & CAMERAS else "no camera varies"
 
 
+def why_not_kept(renderer: Renderer) -> str | None:
+    """Why light cannot be kept on the surfaces of a renderer's scene, in words; None if it may be."""
+    description = renderer.scene.made[0]
+    thing = description.meshes[OBJECT]
+    if thing.mesh.repeats or thing.surface is not None or thing.opacity is not None:
+        return "the object's surface repeats its texture, has cut-outs, or is one of Mitsuba's own"
+    if description.environment is None or description.emits or len(description.parts) > 0:
+        return "there is more in the scene than the object, its ground and an environment"
+    if description.camera_model is not None:
+        return "the camera has a lens that bends the picture"
+    if renderer.scene.volumetric or description.thin_lens or description.backdrop:
+        return "there is haze, a lens with an aperture, or a plain background"
+    if renderer.formation.denoiser != "oidn":
+        return NOISE
+    return None
+
+
 def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
-    """The scene inputs that some controls change."""
+    """The scene inputs that some controls, or groups of coordinates, change; by their names."""
     with torch.no_grad():
         start = renderer.scene.assembly(renderer.space.inputs(renderer.start))
         found: set[str] = set()
@@ -61,7 +71,7 @@ def _places(renderer: Renderer, varying: Collection[str]) -> Iterator[Tensor]:
     for value in PLACES:
         place = renderer.start.clone()
         for group in renderer.space.groups:
-            if group.control in varying:
+            if group.control in varying or group.name in varying:
                 place[group.coordinates] = value
         yield place
 

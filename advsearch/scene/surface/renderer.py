@@ -45,6 +45,17 @@ class SurfaceRenderer(PredictingRenderer):
             texture = self.there.shape[0], self.there.shape[1]
             self.arrangement = Arrangement(renderer, standing, texture, seed)
 
+    def stands(self, inputs: Mapping[str, Tensor]) -> bool:
+        """Whether everything but cameras and environment is the same in scene inputs."""
+        own, others = self.arrangement.inputs, {name: inputs[name] for name in inputs if name not in FREE}
+        if own.keys() != others.keys() or not _same(self.there, self.color(inputs)):
+            return False
+        return all(_same(own[name], others[name]) for name in own)
+
+    def forget(self) -> None:
+        """Let go of all light."""
+        self._lights.clear()
+
     def renew(self, u: Tensor) -> None:
         """Take the light between surfaces from the base colour at u from now on."""
         with torch.no_grad():
@@ -81,18 +92,24 @@ class SurfaceRenderer(PredictingRenderer):
             wholes: (d,) configurations of the space, for what controls do to the finished picture.
         """
         lights = [self.light(one) for one in inputs]
-        views: dict[int, SurfaceView] = {}
+        found: dict[int, Tensor] = {}
         for light in dict.fromkeys(lights):
             numbers = [number for number, one in enumerate(lights) if one is light]
-            cameras = [self._camera(inputs[number]) for number in numbers]
-            seen = self.arrangement.seen(cameras, light)
-            views |= {number: SurfaceView(seen, place, self.arrangement.fine) for place, number in enumerate(numbers)}
-        fine = self.arrangement.finer(color)
+            some = self.under(light, [inputs[number] for number in numbers], color, [wholes[n] for n in numbers])
+            found |= dict(zip(numbers, some, strict=True))
+        return torch.stack([found[number] for number in range(len(lights))])
+
+    def under(
+        self, light: Light, inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]
+    ) -> Tensor:
+        """Return the pictures under one light, in one launch; arguments as of `pictures`."""
+        seen = self.arrangement.seen([self._camera(one) for one in inputs], light)
+        reflected = self.arrangement.finer(color) * light.on_object
         self.products += len(inputs)
         return torch.stack(
             [
-                self._shown(views[number].radiance(fine * light.on_object), one, wholes[number])
-                for number, (one, light) in enumerate(zip(inputs, lights, strict=True))
+                self._shown(SurfaceView(seen, place, self.arrangement.fine).radiance(reflected), one, wholes[place])
+                for place, one in enumerate(inputs)
             ]
         )
 
@@ -108,3 +125,7 @@ class SurfaceRenderer(PredictingRenderer):
     def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """The base colour (h, w, 3) of scene inputs."""
         return inputs.get(COLOR, self._base[COLOR])
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and torch.equal(one, other)

@@ -1,0 +1,325 @@
+"""What predicts pictures of a sweep: of neighbours that have most things in common, once that pays.
+
+Pictures that have everything in common but what a prediction follows are a *group*. What predicts them is found for
+each group by itself, and depends on the group alone, so that a sweep that was stopped goes on with the same. Some
+pictures of each group are traced beside; where predicted ones are too far off, the group is rendered.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks.product import Product
+from advsearch.engine.sweeps.axes import Axis
+from advsearch.engine.sweeps.points import Points
+from advsearch.engine.transport import Deviation
+from advsearch.runs.results.attack import LinearTransport, PredictionError
+from advsearch.scene.renderer import Renderer
+
+PAYS = 2.0
+"""Times the samples that a prediction takes, comparisons included, that a group has to take rendered, for it to pay."""
+
+MarginOf = Callable[[Tensor, Tensor], float]
+"""What a model says of a picture (H, W, 3) of a configuration, as a number of logits."""
+
+
+@dataclass(frozen=True)
+class Groups:
+    """How the pictures of a scene fall into groups.
+
+    Attributes:
+        grid: of the scene.
+        samples: draws at each point of the grid.
+        within: of every axis of the grid, whether the pictures of a group may differ in it.
+        drawn: whether they may differ in what is drawn.
+        frames: number of the axis of the frames of a drive, which have one draw; None without.
+    """
+
+    grid: Product
+    samples: int
+    within: tuple[bool, ...]
+    drawn: bool
+    frames: int | None = None
+
+    @property
+    def _free(self) -> tuple[bool, ...]:
+        """Of every axis, whether a group goes along it."""
+        if self.drawn:
+            return self.within
+        return tuple(within and axis == self.frames for axis, within in enumerate(self.within))
+
+    @property
+    def _draws(self) -> int:
+        """Draws at a point of the grid that are in different groups."""
+        return 1 if self.drawn else self.samples
+
+    @property
+    def size(self) -> int:
+        """Pictures of a group."""
+        free = math.prod(size for size, free in zip(self.grid.sizes, self._free, strict=True) if free)
+        return free * self.samples // self._draws
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self.grid.count * self.samples // self.size
+
+    @property
+    def at_once(self) -> int:
+        """How many have to be held at once, so that none is made twice."""
+        if True not in self._free:
+            return 1
+        first = self._free.index(True)
+        later = zip(self.grid.sizes[first:], self._free[first:], strict=True)
+        return self._draws * math.prod(size for size, free in later if not free)
+
+    def group(self, number: int) -> int:
+        """Return the number of the group of a picture of the scene."""
+        place, sample = divmod(number, self.samples)
+        found = 0
+        for digit, size, free in zip(self.grid.digits(place), self.grid.sizes, self._free, strict=True):
+            found = found if free else found * size + digit
+        return found if self.drawn else found * self.samples + sample
+
+    def member(self, number: int, place: int) -> int:
+        """Return the picture at a place in the group of a picture of the scene."""
+        point, sample = divmod(number, self.samples)
+        if self.drawn:
+            place, sample = divmod(place, self.samples)
+        found = list(self.grid.digits(point))
+        for axis in reversed(range(len(found))):
+            if self._free[axis]:
+                place, found[axis] = divmod(place, self.grid.sizes[axis])
+        return self.grid.index(found) * self.samples + sample
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """A picture that is wanted.
+
+    Attributes:
+        number: of it in the scene.
+        u: (d,) its configuration.
+        seed: of its noise, if it is rendered.
+    """
+
+    number: int
+    u: Tensor
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class SweptPicture:
+    """One picture.
+
+    Attributes:
+        picture: (H, W, 3) sRGB in [0, 1].
+        predicted: samples a pixel of what predicted it; 0 if it was rendered.
+        traced: pictures that were traced for it; the first of a group has all that were traced for the group.
+    """
+
+    picture: Tensor
+    predicted: int
+    traced: int
+
+
+@dataclass
+class SweptPredictor(ABC):
+    """Predicts pictures of one scene at one size.
+
+    Args:
+        renderer: the one that traces paths.
+        points: the configurations.
+        axes: of the grid.
+        spp: samples a pixel of a rendered picture.
+        seed: of what predicts, and of comparisons.
+        score: what a comparison says in logits.
+        specialise: whether anything may be left out.
+        before: pictures of the scenes before.
+
+    Attributes:
+        reason: why every picture is rendered; None if none is, and empty where nothing moves that it follows.
+        deviations: what comparisons found, of the groups that were made.
+        seconds: spent on what predicts and on comparing.
+        left: groups in which a prediction was too far off, so that they are rendered.
+    """
+
+    way: ClassVar[str]
+    samples: ClassVar[int]
+    """Samples a pixel of what predicts."""
+    checks: ClassVar[tuple[int, int]]
+    """Pictures of a scene that are compared, spread over its groups; and those of each group at least."""
+    for_a_check: ClassVar[int]
+    """Pictures that are traced to compare one."""
+
+    renderer: Renderer
+    points: Points
+    axes: tuple[Axis, ...]
+    spp: int
+    seed: int
+    score: MarginOf
+    specialise: bool
+    before: int = 0
+    deviations: list[Deviation] = field(default_factory=list)
+    seconds: float = 0.0
+    left: set[int] = field(default_factory=set)
+    _held: dict[int, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._groups = self._fall(self._follows())
+        self.reason = self._reason()
+
+    # ---- what a way of predicting says ------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _follows(self) -> frozenset[str]:
+        """The groups of coordinates (`control.parameter`) in which the pictures of a group may differ."""
+
+    @abstractmethod
+    def _reason(self) -> str | None:
+        """See `reason`."""
+
+    @abstractmethod
+    def _made(self, u: Tensor, seed: int) -> Any:
+        """Return what predicts the pictures that have everything else in common with a configuration."""
+
+    @abstractmethod
+    def _predicted(self, made: Any, us: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return the pictures (H, W, 3) of configurations of a group."""
+
+    @abstractmethod
+    def _compared(self, made: Any, shown: Sequence[tuple[Tensor, int]]) -> list[Deviation]:
+        """Compare predicted pictures with traced ones, of configurations with seeds; a group is predicted where all
+        that is found is good."""
+
+    @property
+    def _traced(self) -> int:
+        """Pictures that are traced for a group beside comparisons."""
+        return 0
+
+    @property
+    def _bytes(self) -> int:
+        """Memory of what is held."""
+        return 0
+
+    @property
+    def not_finite(self) -> int:
+        """How many values were not finite, and were set to 0."""
+        return 0
+
+    # ---- pictures ---------------------------------------------------------------------------------------------------
+
+    def pictures(self, asked: Sequence[Asked]) -> list[SweptPicture]:
+        """Return pictures, each rendered or predicted."""
+        if self.reason is not None:
+            return [self._rendered(one, 0) for one in asked]
+        found: dict[int, SweptPicture] = {}
+        waiting: dict[int, list[Asked]] = {}
+        made: dict[int, Any] = {}
+        for one in asked:
+            group = self._groups.group(one.number)
+            made[group] = self._of(group, one.number)
+            if made[group] is None:
+                found[one.number] = self._rendered(one, self._spent(one))
+            else:
+                waiting.setdefault(group, []).append(one)
+        for group, some in waiting.items():
+            pictures = self._predicted(made[group], [one.u for one in some])
+            for one, picture in zip(some, pictures, strict=True):
+                found[one.number] = SweptPicture(picture, self.samples, self._spent(one))
+        return [found[one.number] for one in asked]
+
+    def _rendered(self, one: Asked, spent: int) -> SweptPicture:
+        return SweptPicture(self.renderer(one.u, seed=one.seed, spp=self.spp), predicted=0, traced=spent + 1)
+
+    def _spent(self, one: Asked) -> int:
+        """Pictures that were traced for a group, said of its first picture alone."""
+        first = one.number == self._groups.member(one.number, 0)
+        return (self._traced + self._checks * self.for_a_check) * first
+
+    @property
+    def _checks(self) -> int:
+        """Comparisons of a group."""
+        whole, least = self.checks
+        return max(least, -(-whole // self._groups.count))
+
+    def _fall(self, follows: frozenset[str]) -> Groups:
+        """How pictures fall into groups that may differ in some groups of coordinates."""
+        of_grid = [axis.name for axis in self.axes]
+        drawn = all(group.name in follows for group in self.renderer.space.groups if group.name not in of_grid)
+        frames = next((place for place, axis in enumerate(self.axes) if axis.is_time), None)
+        within = tuple(name in follows for name in of_grid)
+        return Groups(self.points.grid, self.points.samples, within, drawn, frames)
+
+    def _of(self, group: int, number: int) -> Any:
+        """What predicts the pictures of a group, of which this is one; None where they are rendered."""
+        if group not in self._held:
+            if len(self._held) >= self._groups.at_once:
+                self._held.pop(next(iter(self._held)))
+            self._held[group] = self._make(group, number)
+        return self._held[group]
+
+    def _make(self, group: int, number: int) -> Any:
+        begun = time.perf_counter()
+        seed = seeds.stream(self.seed, "light", self.before + group)
+        made = self._made(self._configuration(number, 0), seed)
+        places = [seeds.stream(seed, "check", check) % self._groups.size for check in range(self._checks)]
+        shown = [(self._configuration(number, p), seeds.stream(seed, "traced", k)) for k, p in enumerate(places)]
+        found = self._compared(made, shown)
+        self.deviations += found
+        good = all(one.levels <= one.most for one in found)
+        if not good:
+            self.left.add(group)
+        self.seconds += time.perf_counter() - begun
+        return made if good else None
+
+    def _configuration(self, number: int, place: int) -> Tensor:
+        """u (d,) of the picture at a place in the group of a picture."""
+        member = self._groups.member(number, place)
+        return self.points.configurations(self.points.picks(member, 1, self.before))[0]
+
+    # ---- what is said of it -----------------------------------------------------------------------------------------
+
+    def summary(self) -> LinearTransport | None:
+        """What a result holds of it; None where nothing moves that it follows."""
+        if self.reason is not None:
+            return LinearTransport(used=False, reason=self.reason) if self.reason else None
+        worst = max(self.deviations, key=lambda one: one.levels) if self.deviations else None
+        several = f"{len(self.left)} of {self._groups.count} groups were rendered: predicted pictures were too far off"
+        return LinearTransport(
+            used=True,
+            way=self.way,
+            reason=several if self.left else None,
+            entries=0,
+            bytes=self._bytes,
+            seconds=self.seconds,
+            renewed=0,
+            error=None if worst is None else PredictionError.of(worst),
+        )
+
+
+def combined(found: Sequence[LinearTransport | None]) -> LinearTransport | None:
+    """Return what a result holds of several scenes: the worst error, the largest memory, all seconds."""
+    told = [one for one in found if one is not None]
+    used = [one for one in told if one.used]
+    if not used:
+        return told[-1] if told else None
+    errors = [one.error for one in used if one.error is not None]
+    return LinearTransport(
+        used=True,
+        way=next((one.way for one in used if one.way), None),
+        reason=next((one.reason for one in used if one.reason), None),
+        entries=0,
+        bytes=max(one.bytes or 0 for one in used),
+        seconds=math.fsum(one.seconds or 0.0 for one in used),
+        renewed=0,
+        error=max(errors, key=lambda one: one.levels or 0.0) if errors else None,
+    )

@@ -1,0 +1,185 @@
+"""Sweeps over cameras: pictures that differ in nothing else come from light on surfaces, once that pays."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from stand_ins import rows
+
+import advsearch
+from advsearch.api.sweep import job_of
+from advsearch.attacks.product import Product
+from advsearch.cluster.executor import Done, Workforce
+from advsearch.config import SweepConfig
+from advsearch.engine.sharing import answering
+from advsearch.engine.sweeps import surface_light
+from advsearch.engine.sweeps.loop import Sweep
+from advsearch.engine.sweeps.predicting import Groups
+from advsearch.engine.sweeps.swept_scene import Scenes, SweptScene
+from advsearch.engine.transport import Deviation
+from advsearch.progress import NullProgress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.attack import LinearTransport
+from advsearch.scene.surface import arrangement, texels
+from advsearch.scene.surface.renderer import SurfaceRenderer
+
+SMALL: dict[str, Any] = {"resolution": 24, "trials": 0, "batch": 4}
+GRID: dict[str, Any] = {"pose.yaw": [0, 90], "camera.azimuth": "0:360:4", "camera.distance": [2, 3]}
+KITCHEN_TOO: dict[str, Any] = {"environment.which": ["studio", "kitchen"], "camera.azimuth": "0:360:4"}
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
+    """Few texels and rays, which pay at once, and are near enough; those that are made."""
+    monkeypatch.setattr(texels, "GROUND", 24)
+    for name, value in {"SIDE": 32, "GATHERED": 48}.items():
+        monkeypatch.setattr(arrangement, name, value)
+    numbers: dict[str, float] = {"PAYS": 0.0, "CHECK_SPP": 2, "BOUND": 50.0}
+    for name, number in numbers.items():
+        monkeypatch.setattr(surface_light, name, number)
+    made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__
+
+    def counted(self: SurfaceRenderer, *given: Any) -> None:
+        made.append(self)
+        make(self, *given)
+
+    monkeypatch.setattr(SurfaceRenderer, "__init__", counted)
+    yield made
+
+
+def swept(**more: Any) -> Any:
+    return advsearch.sweep("mug", **{**SMALL, **more})
+
+
+def test_all_frames_of_a_drive_are_a_group_and_draws_tell_drives_apart() -> None:
+    """Of time x pose with three draws, where cameras do not share what is drawn."""
+    groups = Groups(Product((5, 2)), 3, (True, False), False, frames=0)
+    assert (groups.size, groups.count, groups.at_once) == (5, 6, 6)
+    found: dict[int, list[int]] = {}
+    for number in range(30):
+        found.setdefault(groups.group(number), []).append(number)
+    assert sorted(found) == list(range(6)) and all(len({one % 6 for one in some}) == 1 for some in found.values())
+    for members in found.values():
+        assert [groups.member(members[-1], place) for place in range(5)] == members
+
+
+def test_pictures_are_those_that_are_rendered() -> None:
+    """Each nearer to its own traced picture than to that of any other row."""
+    scene = SweptScene(
+        job_of(SweepConfig(object="mug", **SMALL, grid={"camera.azimuth": "0:360:4", "camera.elevation": [5, 60]})), 0
+    )
+    queries = [query for _, _, query in scene.job.queries(range(8))]
+    predicted = scene.pictures(queries)
+    traced = torch.stack([scene.picture(0, query.u, seed=9, spp=64) for query in queries])
+    apart = 255.0 * ((predicted[:, None] - traced[None]) ** 2).mean(dim=(2, 3, 4)).sqrt()
+    assert apart.argmin(dim=1).tolist() == list(range(8))
+    assert float(apart.diagonal().mean()) < 9.0
+
+
+def test_rows_say_how_they_came_and_each_pose_has_light_of_its_own(coarse: list[SurfaceRenderer]) -> None:
+    found = swept(grid=GRID)
+    told, renders = found.summary.transport, found.summary.renders
+    assert told is not None and told.error is not None and told.bytes
+    assert (told.used, told.way, told.reason) == (True, "surface light", None)
+    assert renders == {"sweep": 2 * 2 * 3, "verification": 0, "products": 16} and len(coarse) == 2
+    assert {(row.seed, row.spp) for row in found.rows()} == {(None, 4)}
+    assert [row.renders for row in found.rows()] == [6, *[0] * 7] * 2
+
+
+def test_environments_have_one_arrangement(coarse: list[SurfaceRenderer]) -> None:
+    """Whichever varies faster; pictures are the same."""
+    first, second = swept(grid=KITCHEN_TOO), swept(grid=dict(reversed(KITCHEN_TOO.items())))
+    assert len(coarse) == 2 and first.summary.renders["products"] == second.summary.renders["products"] == 8
+    margins = [row.margin for row in second.rows()]
+    assert [row.margin for row in first.rows()] == pytest.approx([*margins[::2], *margins[1::2]], rel=1e-4)
+
+
+class Two:
+    """Two workers, which carry out batches in any order, each with scenes of its own."""
+
+    facts = Workforce(most=2)
+
+    def __init__(self, job: Any) -> None:
+        self.scenes = [Scenes(job), Scenes(job)]
+
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+        pieces = list(batches)
+        random.Random(1).shuffle(pieces)
+        for number, items in enumerate(pieces):
+            yield Done(items, answering(self.scenes[number % 2].named)(items), f"worker {number % 2}")
+
+
+def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Each of them finds the same light."""
+    grid = {"camera.azimuth": "0:360:4", "camera.distance": [2, 3, 4]}
+    whole, answers = swept(grid=grid, run=tmp_path / "whole").summary, SweptScene.answers
+    looked = iter(range(3))
+
+    def stopped(self: SweptScene, *given: Any) -> Any:
+        if next(looked) == 1:
+            raise KeyboardInterrupt
+        return answers(self, *given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SweptScene, "answers", stopped)
+        assert swept(grid=grid, run=tmp_path / "parts").summary.configurations == 4
+    job = job_of(SweepConfig(object="mug", **SMALL, grid=grid))
+    with RunDirectory.resume(tmp_path / "parts") as run:
+        again = Sweep(job, run, NullProgress(), Two(job)).carry_out().summary
+    assert rows(tmp_path / "parts") == rows(tmp_path / "whole") and again.renders == whole.renders
+
+
+def test_drives_are_predicted_whatever_is_drawn_for_each(coarse: list[SurfaceRenderer]) -> None:
+    """Light turns from drive to drive; what is done to finished pictures comes on top."""
+    drive: dict[str, Any] = {"path": "approach", "fps": 0.5, "samples": 2}
+    found = swept(controls={"environment": {"rotation": [0, 360]}, "sensor": {}}, **drive)
+    drives = found.summary.drives
+    assert drives is not None and (drives[0].drives, drives[0].frames) == (2, 6) and len(coarse) == 1
+    assert found.summary.renders["products"] == 12 and found.summary.renders["sweep"] == 2 * 2 * 3
+
+
+def test_a_group_whose_pictures_are_too_far_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = iter([9.0, 1.0])
+    monkeypatch.setattr(surface_light, "over_all", lambda found: Deviation(next(levels), 0.0, 2.0, pictures=6))
+    found = swept(grid=GRID)
+    told = found.summary.transport
+    assert told is not None and "1 of 2 groups were rendered" in str(told.reason)
+    assert [row.seed is None for row in found.rows()] == [False] * 8 + [True] * 8
+    assert [row.renders for row in found.rows()][:9] == [7, *[1] * 7, 6]
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        ({"specialise": False}, "nothing is left out"),
+        ({"denoise": "none"}, "noise is part of the picture without the denoiser"),
+        (
+            {"controls": {"camera": {"aperture": 0.1}}, "samples": 1},
+            "haze, a lens with an aperture",
+        ),
+        ({"controls": {"camera": {"k1": -0.1}}, "samples": 1}, "a lens that bends the picture"),
+        ({"controls": "haze", "samples": 1}, "more in the scene than the object, its ground and an environment"),
+        ({"grid": {"pose.yaw": [0, 90]}}, None),
+    ],
+)
+def test_why_a_sweep_is_rendered(more: dict[str, Any], reason: str | None) -> None:
+    told = swept(**{"grid": {"camera.azimuth": [0, 90]}, **more}).summary.transport
+    assert (told is None) == (reason is None)
+    if told is not None:
+        assert not told.used and str(reason) in str(told.reason)
+
+
+def test_few_pictures_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface_light, "PAYS", 2.0)
+    monkeypatch.setattr(surface_light, "CHECK_SPP", 32)
+    told = swept(grid=GRID, resolution=128).summary.transport
+    assert told == LinearTransport(
+        used=False, reason="light on surfaces pays where 79 pictures differ in the camera alone; here 8 do"
+    )
