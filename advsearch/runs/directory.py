@@ -252,7 +252,7 @@ class RunDirectory:
         noted = self.store.noted(made_with.NOTE)
         before = noted if isinstance(noted, list) else []
         now = made_with.made_with(config.plain())
-        if changed := made_with.changed_file([one for one in before if isinstance(one, dict)], now):
+        if changed := made_with.changed_file([one for one in before if isinstance(one, dict)], config.plain()):
             raise InputError(
                 f"{self.path}: cannot go on: {changed} is another file now than it was; put that back, or {self.again}"
             )

@@ -11,16 +11,20 @@ from importlib import metadata
 from itertools import islice
 from pathlib import Path
 
-from advsearch.errors import FileFormatError
-from advsearch.files import opened_for, read_bytes
+from advsearch.files import opened_for
 
 NOTE = "made with"
 """The note: a list, with an entry for each sitting."""
 
-MOST, LARGEST = 20_000, 1 << 28
-"""Files of a folder, and bytes of one, that a digest is taken of, at most."""
+MOST = 20_000
+"""Files of a folder that a digest is taken of, at most."""
+FOLDERS = {"task": "*/*", "model": "*"}
+"""Settings that may name a folder, and which files in it decide: a task's pictures, or what `hf:FOLDER` consists of."""
 
 PACKAGES = ("advsearch", "mitsuba", "drjit", "torch", "numpy")
+
+NOT_READ_AGAIN = ("recipe", "suite")
+"""Settings whose file a run keeps in its store and goes on with, whatever became of the file."""
 
 
 def made_with(settings: Mapping[str, object]) -> dict[str, str]:
@@ -36,31 +40,26 @@ def made_with(settings: Mapping[str, object]) -> dict[str, str]:
     return {**facts, **file_digests(settings)}
 
 
-def changed_file(before: Sequence[Mapping[str, object]], now: Mapping[str, str]) -> str | None:
+def changed_file(before: Sequence[Mapping[str, object]], settings: Mapping[str, object]) -> str | None:
     """Return the name of a file that is another one now than in every sitting before; None where all are the same.
 
-    A file may have been moved, so that its name alone tells it. That of a recipe is not read again.
+    A file may have been moved, so that its name alone tells it.
+
+    Args:
+        before: what each sitting was `made_with`.
+        settings: of the run, as in its run.yaml.
     """
-
-    def files(facts: Mapping[str, object]) -> dict[str, set[object]]:
-        found: dict[str, set[object]] = {}
-        for path, digest in facts.items():
-            if path not in ("python", *PACKAGES) and Path(path).suffix not in (".yaml", ".yml"):
-                found.setdefault(Path(path).name, set()).add(digest)
-        return found
-
-    seen = [files(one) for one in before]
-    for name, digests in files(now).items():
-        known = set().union(*(one[name] for one in seen if name in one))
-        if known and not digests <= known:
-            return name
+    again = {name: value for name, value in settings.items() if name not in NOT_READ_AGAIN}
+    for path, digest in file_digests(again).items():
+        known = {one[old] for one in before for old in one if Path(old).name == Path(path).name}
+        if known and digest not in known:
+            return Path(path).name
     return None
 
 
 def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of each file that settings name, in hexadecimal, and of each that was read for it: materials,
-    pictures and buffers that a mesh or a scene names. A folder of a task's pictures has one for all. What is bundled
-    or gone has none."""
+    pictures and buffers that a mesh or a scene names. A folder has one for all. What is bundled or gone has none."""
     from advsearch.settings.configuration import FILES
 
     found: dict[str, str] = {}
@@ -69,8 +68,9 @@ def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
             with suppress(OSError, ValueError):
                 own = os.path.abspath(path)
                 parts = opened_for(own)
-                if name == "task" and os.path.isabs(path) and Path(path).is_dir():
-                    found[path] = _digest_of_folder(Path(path))
+                folder = path if os.path.isabs(path) else path.removeprefix("hf:") if path.startswith("hf:") else ""
+                if folder and name in FOLDERS and Path(folder).is_dir():
+                    found[folder] = _digest_of_folder(Path(folder), FOLDERS[name])
                 if (parts or name in FILES) and Path(path).is_file():
                     found[path] = _digest(Path(path))
                 for part in parts:
@@ -96,13 +96,12 @@ def _paths(value: object) -> Iterator[str]:
             )
 
 
-def _digest_of_folder(folder: Path) -> str:
-    """Return the SHA-256 of the names and contents of the files in the folders of a folder, as far as they are read."""
+def _digest_of_folder(folder: Path, which: str) -> str:
+    """Return the SHA-256 of the names and contents of files in a folder that a pattern names."""
     digest = hashlib.sha256()
-    for path in sorted(islice(folder.glob("*/*"), MOST)):
-        digest.update(f"{path.relative_to(folder).as_posix()}\n".encode())
-        with suppress(OSError, FileFormatError):
-            digest.update(hashlib.sha256(read_bytes(path, "a picture", LARGEST)).digest())
+    for path in sorted(islice(folder.glob(which), MOST)):
+        if path.is_file():
+            digest.update(f"{path.relative_to(folder).as_posix()}\n{_digest(path)}".encode())
     return digest.hexdigest()
 
 

@@ -57,6 +57,10 @@ class Frame:
         right, down = 2.0 * x * shift[0], 2.0 * y * shift[1]
         return Frame(-x + right, x + right, -y - down, y - down)
 
+    def spread(self) -> Doubles:
+        """Unit directions (N, 3) that stand for the whole of it."""
+        return Silhouette(np.ones((GRID, GRID), dtype=np.bool_), self).directions()
+
     def corners(self) -> Doubles:
         """Unit directions (4, 3) to the corners."""
         tangents = [(x, y, 1.0) for x in (self.left, self.right) for y in (self.low, self.high)]
@@ -196,21 +200,21 @@ def middle_axes(hidden: Doubles) -> Doubles:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def angle_outside(frame: Frame, cover: Silhouette, axes: Doubles, direction: float) -> float:
-    """Return the angle in radians beyond which the moving thing is out of the frame on its side.
+def angle_outside(shown: Doubles, rim: Doubles, cover: Silhouette, axes: Doubles, direction: float) -> float:
+    """Return the angle in radians beyond which the moving thing is out of the picture on its side.
 
     Args:
-        frame: what the picture shows.
+        shown: unit directions (N, 3) spread over the whole picture.
+        rim: (M, 3) those at its edge.
         cover: silhouette of the moving thing, straight ahead.
         axes: see `Passage`.
         direction: from which side it comes, degrees.
     """
-    whole = Silhouette(np.ones((GRID, GRID), dtype=np.bool_), frame)
     radius = float(np.arccos(np.clip(cover.window.corners()[:, 2], -1.0, 1.0)).max())
-    reach = float(np.arccos(np.clip(frame.corners() @ axes[2], -1.0, 1.0)).max())
+    reach = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
     angles = np.linspace(min(reach + radius + 0.02, 0.9 * math.pi), 0.0, 2 * SCAN)
-    shown = Passage(whole.directions(), cover, axes, direction).coverage(angles)
-    inside = np.nonzero(shown > 0.0)[0]
+    covered = Passage(shown, cover, axes, direction).coverage(angles)
+    inside = np.nonzero(covered > 0.0)[0]
     return float(angles[max(int(inside[0]) - 1, 0)]) if len(inside) else float(angles[0])
 
 

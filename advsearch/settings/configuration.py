@@ -26,7 +26,7 @@ PLACE: Mapping[str, bool | None] = {"run": None, "overwrite": False}
 
 FILES = (
     *("object", "environment", "camera", "model", "labels", "recipe", "suite"),
-    *("held_out", "held_out_environment", "compared"),
+    *("held_out", "held_out_environment", "compared", "path"),
 )
 """The settings that may name files."""
 
@@ -232,5 +232,6 @@ def _absolute(value: str | None) -> str | None:
 
 
 def _absolute_file(name: str) -> str:
-    is_path = ("/" in name or Path(name).suffix != "") and is_file(name)
-    return str(Path(name).resolve()) if is_path else name
+    path, mark, part = (name, "", "") if is_file(name) else name.partition("#")
+    is_path = ("/" in path or Path(path).suffix != "") and is_file(path)
+    return f"{Path(path).resolve()}{mark}{part}" if is_path else name

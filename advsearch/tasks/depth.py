@@ -24,6 +24,8 @@ from advsearch.models import Model
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task
 
+ASIDE = 0.1
+"""Cosine of the angle to the camera's axis from which on z-depth is no distance any more."""
 DISPARITY, RELATIVE, METRIC = "relative disparity", "relative depth", "metric depth"
 
 KINDS = {
@@ -245,7 +247,16 @@ class Depth(Task):
             raise InputError("label: task depth has no classes; leave it out")
 
     def truth(self, facts: Facts) -> Distances:
-        """Return where the object is seen, and how far everything is."""
+        """Return where the object is seen, and how far everything is.
+
+        Raises:
+            InputError: the lens sees so far aside that the distance along its axis says nothing.
+        """
+        if bool((facts.z_depth < ASIDE * facts.depth).any()):
+            raise InputError(
+                "task depth: a model's depth is the distance along the camera's axis, and this lens sees things more "
+                f"than {math.degrees(math.acos(ASIDE)):.0f} degrees from its axis; take a lens that sees less"
+            )
         return Distances(facts.mask, facts.z_depth)
 
     def truth_names(self, truth: Distances) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from advsearch.controls.occlusion.control import BUNDLED, OPTIONS, OcclusionCont
 from advsearch.controls.occlusion.occluders import loaded, made, sphere
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.cameras.model import bundled, pinhole
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.library import list_objects
@@ -109,15 +111,30 @@ def test_the_share_asked_for_is_hidden(scene: SceneDescription, which: str, dire
     assert placed.hidden == pytest.approx(0.3, abs=ACCURACY)
 
 
+FOLDING = pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11]))
+SEEN = {
+    "pinhole": (pinhole(35.0, 1.0), {}),
+    "wide picture": (pinhole(35.0, 2.0), {}),
+    "fisheye": (bundled()["fisheye"], {"camera.distance": 0.8}),
+    "panorama": (bundled()["equirectangular"], {"camera.distance": 0.8}),
+    "barrel": (replace(FOLDING, name="test"), {"camera.distance": 1.0}),
+}
+
+
 @pytest.mark.parametrize("which", ["sphere", "chair"])
-def test_primary_rays_find_the_same_share(scene: SceneDescription, which: str) -> None:
+@pytest.mark.parametrize("through", list(SEEN))
+def test_primary_rays_find_the_same_share(through: str, which: str) -> None:
+    model, settings = SEEN[through]
+    scene = replace(describe("mug", given=settings), aspect=2.0 if through == "wide picture" else 1.0)
+    scene = replace(scene, camera_model=model if model.name else None)
     control = OcclusionControl(which=which, coverage=[0, 0.3], direction=30.0, size=0.9, turn=50.0)
     bound = control.bind(control.prepare(scene))
     matrix = bound.inputs(torch.ones(1))["occlusion.to_world"].double().numpy()
     occluder = (made if which == "sphere" else loaded)(which)
     camera = camera_to_world(scene)
-    reach = math.tan(math.radians(scene.number("camera.fov")) / 2.0) * (np.arange(200) + 0.5 - 100.0) / 100.0
-    rays = np.stack([*(one.ravel() for one in np.meshgrid(reach, reach)), np.ones(200 * 200)]).T @ camera[:3, :3].T
+    along = (torch.arange(200).double() + 0.5) / 200.0
+    directions, inside = model.rays(torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1).reshape(-1, 2))
+    rays = (directions[inside > 0.0].numpy() * (-1.0, -1.0, 1.0)) @ camera[:3, :3].T
     pose = object_to_world(scene)
     object_hit = met(MeshPart("object", scene.object.mesh, pose, scene.object.base_color), camera[:3, 3], rays)
     cover_hit = met(MeshPart("cover", occluder.mesh, matrix, occluder.base_color), camera[:3, 3], rays)

@@ -29,7 +29,8 @@ from samples import attack, exr, rated, sweep
 
 from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.runs import directory, images
+from advsearch.files import open_regular
+from advsearch.runs import directory, images, made_with
 from advsearch.runs.database import MIGRATIONS
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
 from advsearch.runs.export import FORMATS, write_rows
@@ -426,6 +427,51 @@ def test_the_recipe_repeats_the_run_elsewhere(home: Path) -> None:
         again = AttackConfig.from_yaml(run.path / "run.yaml")
     assert again.run is None and again.object == str(home / "mug.obj")
     assert again.model_copy(update={"run": "first", "object": "mug.obj"}) == config
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "file"),
+    [
+        ("camera", "camchain.yaml#cam1", "camchain.yaml"),
+        ("path", "way.csv", "way.csv"),
+        ("labels", "names.txt", "names.txt"),
+        ("environment", "sky.hdr", "sky.hdr"),
+        ("model", "reference@weights.safetensors", "weights.safetensors"),
+        ("model", "hf:folder", "folder/config.json"),
+        ("controls", {"patch": {"picture": "sticker.png"}}, "sticker.png"),
+        ("controls", {"path": {"path": "way.csv"}}, "way.csv"),
+        ("controls", {"occlusion": {"object": "cover.obj"}}, "cover.obj"),
+    ],
+)
+def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value: object, file: str) -> None:
+    Path("folder").mkdir()
+    Path(file).write_text("one")
+    open_regular(Path(file), "what is opened for a control", 10).close()
+    over = {"over": {"path": {}}} if setting == "path" else {}
+    config = AttackConfig(object="mug", run="first", **over, **{setting: value})
+    for wanted in ("one", "another", "one"):
+        Path(file).write_text(wanted)
+        if wanted == "another":
+            with pytest.raises(InputError, match=f"cannot go on: {Path(file).parts[0]} is another file now"):
+                RunDirectory.resume("first", config)
+        else:
+            (RunDirectory.resume("first", config) if Path("runs").is_dir() else RunDirectory.create_for(config)).close()
+
+
+def test_files_of_one_in_several_are_repeated_elsewhere(home: Path) -> None:
+    Path("camchain.yaml").write_text("one")
+    assert (
+        AttackConfig(object="mug", camera="camchain.yaml#cam1").to_repeat().camera == f"{home / 'camchain.yaml'}#cam1"
+    )
+
+
+def test_a_recipe_that_a_run_has_kept_may_be_another_one(home: Path) -> None:
+    recipe = Path("own.yaml")
+    recipe.write_text("one")
+    noted = made_with.made_with({"recipe": "own.yaml"})
+    recipe.write_text("another")
+    assert made_with.changed_file([noted], {"recipe": "own.yaml"}) is None
+    assert made_with.changed_file([noted], {"camera": "own.yaml"}) == "own.yaml"
 
 
 # ---- whole or not at all ----

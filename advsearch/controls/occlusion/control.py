@@ -29,11 +29,21 @@ from advsearch.controls.occlusion.occluders import MADE, loaded, made
 from advsearch.controls.values import Fixed, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.cameras.model import CameraModel
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, object_to_world
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT, moving
-from advsearch.scene.silhouettes import Frame, Passage, Silhouette, angle_outside, middle_axes, silhouette
+from advsearch.scene.silhouettes import (
+    GRID,
+    RASTER,
+    Frame,
+    Passage,
+    Silhouette,
+    angle_outside,
+    middle_axes,
+    silhouette,
+)
 
 Doubles = npt.NDArray[np.float64]
 _moving = partial(moving, ORBIT)
@@ -46,7 +56,7 @@ CLEARANCE = 0.05
 """Smallest distance in object sizes between the camera and the occluder."""
 PARKED = 1e-3
 """Size of an occluder that is put away, behind the camera."""
-SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "object.to_world", "object.offsets")
+SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "camera.lens", "object.to_world", "object.offsets")
 """Inputs of other controls that an occluder goes by."""
 
 
@@ -235,14 +245,16 @@ class _Seen:
     """The object as the camera sees it.
 
     Attributes:
-        directions: (N, 3) in which it is seen, or None if it is not in the frame.
-        frame: what the picture shows.
+        directions: (N, 3) in which it is seen, each for the same area of the picture; None if it is not in it.
+        shown: (M, 3) directions spread over the whole picture.
+        rim: (K, 3) those at its edge.
         near: distance of its nearest vertex from the camera.
         far: distance of the middle of its bounding box.
     """
 
     directions: Doubles | None
-    frame: Frame
+    shown: Doubles
+    rim: Doubles
     near: float
     far: float
 
@@ -250,24 +262,59 @@ class _Seen:
     def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _Seen:
         camera = _numpy(so_far, "camera.to_world", camera_to_world(scene))
         pose = _numpy(so_far, "object.to_world", object_to_world(scene))
-        fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
-        shift = _numpy(so_far, "camera.shift", np.zeros(2))
         mesh = scene.object.mesh
         vertices = mesh.vertices.astype(np.float64) + _numpy(so_far, "object.offsets", np.zeros(3))
-        world = vertices @ pose[:3, :3].T + pose[:3, 3]
-        points = _from_camera(world, camera)
-        frame = Frame.of(fov, shift=(float(shift[0]), float(shift[1])))
-        if scene.camera_model is not None:
-            x, y = scene.camera_model.tangents
-            frame = Frame(-x, x, -y, y)
-        found = silhouette(points, mesh.faces, frame)
+        points = _from_camera(vertices @ pose[:3, :3].T + pose[:3, 3], camera)
+        if (model := scene.camera_model) is not None:
+            model = model.with_numbers(so_far["camera.lens"].detach().cpu()) if "camera.lens" in so_far else model
+            shown = rim = _looked(model, (0.0, 1.0), (0.0, 1.0), GRID)
+            directions = _through(model, points, mesh.faces)
+        else:
+            fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
+            shift = _numpy(so_far, "camera.shift", np.zeros(2))
+            frame = Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
+            found = silhouette(points, mesh.faces, frame)
+            shown, rim = frame.spread(), frame.corners()
+            directions = None if found is None else found.directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-        return _Seen(
-            None if found is None else found.directions(),
-            frame,
-            float(np.linalg.norm(points, axis=1).min()),
-            float(np.linalg.norm(middle)),
-        )
+        near, far = float(np.linalg.norm(points, axis=1).min()), float(np.linalg.norm(middle))
+        return _Seen(directions, shown, rim, near, far)
+
+
+def _through(model: CameraModel, points: Doubles, faces: npt.NDArray[np.uint32]) -> Doubles | None:
+    """Unit directions (N, 3) in which a mesh is seen through a lens, each for the same area of the picture, or None.
+
+    Args:
+        model: the lens.
+        points: (V, 3) vertices in camera coordinates.
+        faces: (F, 3) vertex indices.
+    """
+    axes = middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
+    cover = silhouette(points @ axes.T, faces)
+    if cover is None:
+        return None
+    places, seen = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
+    (left, top), (right, bottom) = (
+        (places.amin(dim=0).clamp(0.0, 1.0).tolist(), places.amax(dim=0).clamp(0.0, 1.0).tolist())
+        if bool(seen.all())
+        else ((0.0, 0.0), (1.0, 1.0))
+    )
+    looked = _looked(model, (left, right), (top, bottom), RASTER)
+    hidden = looked[cover.contains(*(looked @ axes.T).T)]
+    return hidden if len(hidden) else None
+
+
+def _looked(model: CameraModel, across: tuple[float, float], down: tuple[float, float], count: int) -> Doubles:
+    """Unit directions (N, 3) in which a lens sees a part of the picture: as `Silhouette.directions`, in it."""
+    row, column = np.divmod(np.arange(count * count), count)
+    number = np.arange(count * count)
+    x, y = (
+        low + (index + (0.5 + step * number) % 1.0) / count * (high - low)
+        for (low, high), index, step in ((across, column, 0.7548777), (down, row, 0.5698403))
+    )
+    directions, inside = model.rays(torch.from_numpy(np.stack([x, y], axis=1)))
+    found = directions[inside > 0.0].numpy() * (1.0, -1.0, 1.0)
+    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
 def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: Doubles) -> Doubles:
@@ -287,7 +334,7 @@ def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: fl
     assert seen.directions is not None
     axes = middle_axes(seen.directions)
     sweep = Passage(seen.directions, cover, axes, asked["direction"])
-    outside = angle_outside(seen.frame, cover, axes, asked["direction"])
+    outside = angle_outside(seen.shown, seen.rim, cover, axes, asked["direction"])
     angle = sweep.solve(max(asked["coverage"], EASE), outside)
     if asked["coverage"] < EASE:
         angle = outside + (angle - outside) * asked["coverage"] / EASE

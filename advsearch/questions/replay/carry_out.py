@@ -207,7 +207,7 @@ def _changed(folder: Path, parts: AttackParts) -> list[str]:
     with Store(folder / NAME, read_only=True) as results:
         noted = results.noted(made_with.NOTE)
     before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
-    name = made_with.changed_file(before, made_with.made_with(parts.config.plain()))
+    name = made_with.changed_file(before, parts.config.plain())
     return [f"{name} is not what it was when the run was made: what does not hold may come from that."] if name else []
 
 

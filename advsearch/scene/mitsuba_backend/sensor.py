@@ -60,7 +60,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         """See `mi.Sensor.sample_ray_differential`; where the lens sees nothing, a ray of weight 0 that hits nothing."""
         ahead, inside = self._looked_up(sample2)
-        ray = mi.RayDifferential3f()
+        ray = dr.zeros(mi.RayDifferential3f)  # all of it, or it would be ragged for derivatives
         ray.time = time
         ray.o = self.pose @ mi.Point3f(self._near * ahead)
         ray.d = self.pose @ mi.Vector3f(ahead)

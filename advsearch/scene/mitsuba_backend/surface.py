@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from advsearch.scene.cameras.model import CameraModel
 from advsearch.scene.mitsuba_backend.lobes import ANGLES, TABLES, Lobes
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.texel_rays import (
@@ -104,6 +105,7 @@ class Views:
         lobes: of each.
         widths: root mean square angles of the blurred maps, each twice the one before, radians.
         photographed: height of the camera of a photographed ground; None where the ground is none.
+        model: the lens of all cameras; None for pinholes, which each have a field of view of their own.
     """
 
     def __init__(
@@ -113,10 +115,12 @@ class Views:
         lobes: Sequence[Lobes],
         widths: Sequence[float],
         photographed: float | None,
+        model: CameraModel | None,
     ) -> None:
         self._scene, self._grids, self._widths, self._photographed = scene, tuple(grids), tuple(widths), photographed
         tables = [np.concatenate([getattr(one, name) for name in TABLES]) for one in lobes]
         self._tables = np.concatenate(tables).astype(np.float32)
+        self._lens = None if model is None else _through(model, *scene.resolution)
         self._recorded: dict[tuple[Any, ...], Any] = {}
         self._recorded_at = (0, 0)
 
@@ -124,8 +128,8 @@ class Views:
         """Look at a lit scene.
 
         Args:
-            cameras: the inputs of each: `camera.to_world` (4, 4), `camera.fov`, `camera.shift_x` and `camera.shift_y`
-                (1,).
+            cameras: the inputs of each: `camera.to_world` (4, 4), and of a pinhole `camera.fov`, `camera.shift_x` and
+                `camera.shift_y` (1,).
             lit: what it looks like.
         """
         with one_at_a_time:
@@ -142,12 +146,13 @@ class Views:
             key = count, lit.sky_shape, lit.blurred_shape
             if key not in self._recorded:
 
-                def look(held: Any, lane: Any, tables: Any, given: Any, texels: Any, sky: Any, blurred: Any) -> Any:
-                    there = Lit(texels, sky, lit.sky_shape, blurred, lit.blurred_shape)
-                    return self._look(held, lane, tables, given, there)
+                def look(held: Any, lane: Any, tables: Any, given: Any, lens: Any, *arrays: Any) -> Any:
+                    there = Lit(arrays[0], arrays[1], lit.sky_shape, arrays[2], lit.blurred_shape)
+                    return self._look(held, lane, tables, given, lens, there)
 
                 self._recorded[key] = recorded(look, [])
-            arrays = [mi.Float(one) for one in (self._tables, rows.ravel())]
+            lens = np.zeros(1, np.float32) if self._lens is None else self._lens
+            arrays = [mi.Float(one) for one in (self._tables, rows.ravel(), lens)]
             lane = dr.arange(mi.UInt32, count * height * width * RAYS)
             dr.eval(lane)  # a recording takes its size from what it is given, the size of the scene's map else
             found = self._recorded[key](self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred)
@@ -162,7 +167,7 @@ class Views:
                 weight=torch.from_numpy(weight[sample]),
             )
 
-    def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lit: Lit) -> list[Any]:
+    def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, lit: Lit) -> list[Any]:
         """The kernel: radiance but for the searched texture, coverage, and where and how much each ray sees of it."""
         mi = mitsuba()
         import drjit as dr
@@ -172,12 +177,17 @@ class Views:
         view, pixel = pixel // (height * width), pixel % (height * width)
         across, down = (_chosen(number, [one[axis] for one in PATTERN]) for axis in (0, 1))
         entry = [dr.gather(mi.Float, cameras, view * CAMERA + k) for k in range(CAMERA)]
-        x = (entry[14] - 2.0 * (mi.Float(pixel % width) + across) / width) * entry[12]
-        y = (entry[15] - 2.0 * (mi.Float(pixel // width) + down) / height) * entry[13]
-        way = dr.normalize(mi.Vector3f(*(entry[k] * x + entry[3 + k] * y + entry[6 + k] for k in range(3))))
+        if self._lens is None:
+            x = (entry[14] - 2.0 * (mi.Float(pixel % width) + across) / width) * entry[12]
+            y = (entry[15] - 2.0 * (mi.Float(pixel // width) + down) / height) * entry[13]
+            z, inside = mi.Float(1.0), mi.Bool(True)
+        else:
+            x, y, z, within = (dr.gather(mi.Float, lens, 4 * (pixel * RAYS + number) + k) for k in range(4))
+            inside = within > 0.0
+        way = dr.normalize(mi.Vector3f(*(entry[k] * x + entry[3 + k] * y + entry[6 + k] * z for k in range(3))))
         ray, wanted = mi.Ray3f(mi.Point3f(*entry[9:12]), way), mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         hit = held.ray_intersect(ray, wanted, coherent=True)
-        valid, to_local = hit.is_valid(), to_map(self._scene)
+        valid, to_local = hit.is_valid() & inside, to_map(self._scene)
         shapes = shapes_of(held, self._grids)
         ons = [valid & (hit.shape == mi.ShapePtr(shape)) for shape in shapes]
         normal = dr.select(dr.dot(hit.sh_frame.n, way) > 0.0, -hit.sh_frame.n, hit.sh_frame.n)
@@ -205,7 +215,7 @@ class Views:
         ground = traced + wide * (blurred * shade - traced)
         reflected = dr.select(second.is_valid(), dr.select(level, ground, texel), blurred)
         radiance += dr.select(glossy, gloss * reflected, 0.0)
-        radiance += dr.select(valid, 0.0, _sky(lit, way, to_local))
+        radiance += dr.select(inside & ~valid, _sky(lit, way, to_local), 0.0)
         covered = dr.select(valid, mi.Float(1.0 / RAYS), 0.0)
         weight = dr.select(ons[0], diffuse / (math.pi * RAYS), 0.0)
         radiance /= RAYS
@@ -261,12 +271,22 @@ class Views:
 def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
     """The 16 numbers of a camera: its axes to the left, up and forward, its place, half its extent, its middle."""
     matrix = inputs["camera.to_world"].detach().double().numpy()
-    half = math.tan(math.radians(float(inputs["camera.fov"])) / 2.0)
+    half = math.tan(math.radians(float(inputs["camera.fov"])) / 2.0) if "camera.fov" in inputs else 0.0
     longer = max(height, width)
     shift = [float(inputs[name]) if name in inputs else 0.0 for name in ("camera.shift_x", "camera.shift_y")]
     extent = [half * width / longer, half * height / longer]
     middle = [1.0 - 2.0 * shift[0], 1.0 - 2.0 * shift[1]]
     return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, middle])
+
+
+def _through(model: CameraModel, height: int, width: int) -> Floats:
+    """Where the rays of each pixel go through a lens, flat: to the left, up, forward, and over 0 where it sees."""
+    row, column, ray = np.meshgrid(np.arange(height), np.arange(width), np.arange(RAYS), indexing="ij")
+    across, down = np.array(PATTERN)[ray.ravel()].T
+    places = np.stack([(column.ravel() + across) / width, (row.ravel() + down) / height], axis=1)
+    directions, inside = model.rays(torch.from_numpy(places))
+    found = torch.cat([directions * torch.tensor([-1.0, -1.0, 1.0]), inside[:, None]], dim=1)
+    return found.float().numpy().ravel()
 
 
 def _chosen(number: Any, values: Sequence[float]) -> Any:

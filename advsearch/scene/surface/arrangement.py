@@ -118,7 +118,10 @@ class Arrangement:
         self._photographed = None if photograph is None else description.number("ground.height")
         self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
         self._below = self._seen_below(middle)
-        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed)
+        model = description.camera_model
+        if model is not None and "camera.lens" in self.inputs:
+            model = model.with_numbers(self.inputs["camera.lens"])
+        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed, model)
 
     def _value(self, name: str) -> Tensor:
         return self.inputs[name] if name in self.inputs else self._scene.base(name)

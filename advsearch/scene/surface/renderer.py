@@ -37,7 +37,7 @@ class SurfaceRenderer(PredictingRenderer):
         vars(self).update(vars(copy.copy(renderer)))
         self.products = self.dropped = 0
         self._lights: OrderedDict[bytes, Light] = OrderedDict()
-        self._base = {name: self.scene.base(name) for name in (*CAMERAS, MAP, COLOR)}
+        self._base = {name: self.scene.base(name) for name in (*CAMERAS, MAP, COLOR) if name in self.scene.names}
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
             self.there = self.color(inputs)
@@ -120,7 +120,7 @@ class SurfaceRenderer(PredictingRenderer):
         return view.radiance(self.arrangement.finer(self.color(inputs)) * light.on_object)
 
     def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {name: inputs.get(name, self._base[name]) for name in CAMERAS}
+        return {name: inputs.get(name, self._base[name]) for name in CAMERAS if name in self._base}
 
     def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """The base colour (h, w, 3) of scene inputs."""

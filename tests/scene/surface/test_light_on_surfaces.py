@@ -83,6 +83,22 @@ def test_pictures_are_those_that_are_traced(traced: Renderer, light: SurfaceRend
             assert levels(light(u), truth) < 1.3 * levels(traced(u, seed=2, spp=8), truth) + 0.5
 
 
+@pytest.mark.parametrize(
+    ("camera", "fixed"), [("fisheye", {}), (None, {"k1": -0.9, "fov": 60.0}), ("fisheye", {"k1": -0.1})]
+)
+def test_pictures_through_a_lens_are_those_that_are_traced(camera: str | None, fixed: dict[str, float]) -> None:
+    """Ray by ray, so that they are far from what a pinhole sees, and black where the lens sees nothing."""
+    scene = load_scene("mug", camera=camera)
+    traced = scene.renderer({"texture": {"resolution": 16}, "camera": {"azimuth": [0, 360], **fixed}}, resolution=SIDE)
+    assert why_not(traced, ["camera"]) is None
+    light = SurfaceRenderer(traced, traced.start, seed=0)
+    u = drawn(traced, 1)
+    with torch.no_grad():
+        truth = traced(u, seed=1, spp=256)
+        assert levels(light(u), truth) < 1.3 * levels(traced(u, seed=2, spp=8), truth) + 0.5
+        assert float(light(u)[:2, :2].max()) == 0.0
+
+
 def test_pictures_of_several_cameras_at_once_are_those_of_each(light: SurfaceRenderer) -> None:
     """Two of them under one light, one under another."""
     first, second = drawn(light, 0), drawn(light, 1)
