@@ -34,13 +34,13 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.sweep import job_of  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.engine.sweeps.answer import SweepResult  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
+from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 from advsearch.scene.surface.plan import why_not  # noqa: E402
 from advsearch.scene.surface.renderer import SurfaceRenderer  # noqa: E402

@@ -12,7 +12,6 @@ import torch
 from stand_ins import rows
 
 import advsearch
-from advsearch.api.sweep import job_of
 from advsearch.attacks.product import Product
 from advsearch.cluster.executor import Done, Workforce
 from advsearch.config import SweepConfig
@@ -23,6 +22,7 @@ from advsearch.engine.sweeps.predicting import Groups
 from advsearch.engine.sweeps.swept_scene import Scenes, SweptScene
 from advsearch.engine.transport import Deviation
 from advsearch.progress import NullProgress
+from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import LinearTransport
 from advsearch.scene.surface import arrangement, texels

@@ -239,7 +239,9 @@ class LinearTransport(Fields):
     """What predicted the pictures of the searches."""
 
     used: bool
-    way: str | None = Field(default=None, description="by what: `matrix`, or `surface light`")
+    way: str | None = Field(
+        default=None, description="by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
+    )
     reason: str | None = Field(
         default=None,
         description="why pictures were rendered, all or from some evaluation on, or not predicted by surface light",

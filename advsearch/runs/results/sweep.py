@@ -202,7 +202,8 @@ class SweepSummary(CountedAnswers, RunResult):
     )
     transport: LinearTransport | None = Field(
         default=None,
-        description="whether [basis pictures](transport.md#light) predicted pictures; absent where no light moves",
+        description="whether [basis pictures](transport.md#light) or [light on surfaces](surface-light.md#sweeps) "
+        "predicted pictures; absent where neither light nor camera moves",
     )
     surface: SurfaceMap | None = Field(
         default=None,
