@@ -118,7 +118,7 @@ class Arrangement:
         self._photographed = None if photograph is None else description.number("ground.height")
         self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
         self._below = self._seen_below(middle)
-        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed)
+        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed, middle)
 
     def _value(self, name: str) -> Tensor:
         return self.inputs[name] if name in self.inputs else self._scene.base(name)
