@@ -18,7 +18,7 @@ from advsearch.scene.transport.matrix import by_rows
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
 
-SIDE = 128
+SIDE = 160
 """Texels a side over the searched object."""
 GROUND = 112
 """Texels a side over the ground."""
