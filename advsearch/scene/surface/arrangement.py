@@ -50,7 +50,7 @@ BURIED = 0.3
 """Share of a texel's rays that meet the back of a surface from which on it lies inside of something."""
 BOUNCES = 4
 """How often light goes from texel to texel: that and the camera's and the sky's segments make a path of `MAX_DEPTH`."""
-FINE = 96
+FINE = 192
 """Least side of the grid on which base colour and light are multiplied."""
 WHITE = 0.95
 """Reflectance that a photographed ground has at most, where light goes from surface to surface."""
@@ -121,7 +121,7 @@ class Arrangement:
         model = description.camera_model
         if model is not None and "camera.lens" in self.inputs:
             model = model.with_numbers(self.inputs["camera.lens"])
-        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed, model)
+        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed, model, middle)
 
     def _value(self, name: str) -> Tensor:
         return self.inputs[name] if name in self.inputs else self._scene.base(name)
