@@ -26,8 +26,8 @@ def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
     """
     description = renderer.scene.made[0]
     thing = description.meshes[OBJECT]
-    if thing.mesh.repeats or thing.surface is not None or thing.opacity is not None:
-        return "the object's surface repeats its texture, has cut-outs, or is one of Mitsuba's own"
+    if thing.mesh.repeats or thing.surface is not None:
+        return "the object's surface repeats its texture, or is one of Mitsuba's own"
     if description.environment is None or description.emits or len(description.parts) > 0:
         return "there is more in the scene than the object, its ground and an environment"
     if renderer.scene.volumetric or description.thin_lens or description.backdrop:

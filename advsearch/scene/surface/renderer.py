@@ -86,21 +86,21 @@ class SurfaceRenderer(PredictingRenderer):
             numbers = [number for number, one in enumerate(lights) if one is light]
             cameras = [self._camera(inputs[number]) for number in numbers]
             seen = self.arrangement.seen(cameras, light)
-            views |= {number: SurfaceView(seen, place, self.arrangement.fine) for place, number in enumerate(numbers)}
+            views |= {number: self.arrangement.view(seen, place) for place, number in enumerate(numbers)}
         fine = self.arrangement.finer(color)
         self.products += len(inputs)
         return torch.stack(
             [
-                self._shown(views[number].radiance(fine * light.on_object), one, wholes[number])
+                self._shown(views[number].radiance(light.reflected(fine)), one, wholes[number])
                 for number, (one, light) in enumerate(zip(inputs, lights, strict=True))
             ]
         )
 
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
         light = self.light(inputs)
-        view = SurfaceView(self.arrangement.seen([self._camera(inputs)], light), 0, self.arrangement.fine)
+        view = self.arrangement.view(self.arrangement.seen([self._camera(inputs)], light), 0)
         self.products += 1
-        return view.radiance(self.arrangement.finer(self.color(inputs)) * light.on_object)
+        return view.radiance(light.reflected(self.arrangement.finer(self.color(inputs))))
 
     def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {name: inputs.get(name, self._base[name]) for name in CAMERAS}
