@@ -16,10 +16,12 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.texel_rays import Floats, TexelGrid, passed
 from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time
 
+Doubles = npt.NDArray[np.float64]
+
 ANGLES = 32
 """Entries of a table over the cosine of the angle of view."""
 LOBE_SAMPLES = 4096
-TABLES = ("diffuse", "gloss", "up", "along", "spread")
+TABLES = ("diffuse", "gloss", "up", "along", "core", "tail")
 """The tables of `Lobes`, in their order."""
 
 
@@ -31,20 +33,22 @@ class Lobes:
         diffuse: (k,) share of even light that it reflects for a base colour of one, without the gloss.
         gloss: (k,) share of even light that it reflects whatever the base colour.
         up, along: (k,) of the gloss's mean direction: its parts along the normal, and away from the viewer.
-        spread: (k,) root mean square angle about that direction, radians.
+        core, tail: (k,) root mean square angle about that direction, radians, of the half of the gloss that is nearest
+            to it and of the other half: a lobe has longer tails than a normal distribution.
     """
 
     diffuse: Floats
     gloss: Floats
     up: Floats
     along: Floats
-    spread: Floats
+    core: Floats
+    tail: Floats
 
     @classmethod
     def matt(cls) -> Lobes:
         """Those of a diffuse surface."""
         one, none = np.ones(ANGLES, dtype=np.float32), np.zeros(ANGLES, dtype=np.float32)
-        return cls(one, none, one, none, none)
+        return cls(one, none, one, none, none, none)
 
     @property
     def mean_shares(self) -> tuple[float, float]:
@@ -86,21 +90,30 @@ def measured(
             sampled, weight = bsdf.sample(mi.BSDFContext(), hit, one, two)
             back = dr.select((sampled.pdf > 0.0) & (sampled.wo.z > 0.0), dr.mean(weight) / opaque, 0.0)
             back = dr.select(dr.isfinite(back), back, 0.0)
-            found += [dr.mean(value), back, back * sampled.wo.x, back * sampled.wo.z]
-    density = (even.z / math.pi).numpy()
-    lit, dark, share, x, z = (
-        _means(one) for one in (found[0].numpy() / density, found[1].numpy() / density, *found[2:])
-    )
-    length = np.sqrt(x * x + z * z)
-    kept = np.maximum(share, 1e-12)
-    spread = np.sqrt(np.maximum(0.0, 2.0 * (1.0 - length / kept)))
+            found += [dr.mean(value), back, sampled.wo.x, sampled.wo.z]
+    lit, dark = (_rows(one.numpy()) / _rows(even.z.numpy() / math.pi) for one in found[:2])
+    weight, x, z = (_rows(one.numpy()) for one in found[2:])
+    share = weight.mean(axis=1)
+    mean = np.stack([(weight * x).mean(axis=1), (weight * z).mean(axis=1)])
+    length = np.linalg.norm(mean, axis=0)
     mirrored = share < 1e-6
-    up = np.where(mirrored, middle, z / np.maximum(length, 1e-12))
-    along = np.where(mirrored, -np.sqrt(1.0 - middle**2), x / np.maximum(length, 1e-12))
-    parts = (np.maximum(lit - dark, 0.0) / 0.5, share, up, -along, np.where(mirrored, 0.0, spread))
-    return Lobes(*(part.astype(np.float32) for part in parts))
+    along = np.where(mirrored, -np.sqrt(1.0 - middle**2), mean[0] / np.maximum(length, 1e-12))
+    up = np.where(mirrored, middle, mean[1] / np.maximum(length, 1e-12))
+    core, tail = _spreads(weight, 2.0 * np.maximum(0.0, 1.0 - x * along[:, None] - z * up[:, None]))
+    diffuse = np.maximum(lit.mean(axis=1) - dark.mean(axis=1), 0.0) / 0.5
+    return Lobes(*(part.astype(np.float32) for part in (diffuse, share, up, -along, core, tail)))
 
 
-def _means(values: Any) -> npt.NDArray[np.float64]:
-    array = values if isinstance(values, np.ndarray) else values.numpy()
-    return np.asarray(array.reshape(ANGLES, LOBE_SAMPLES).mean(axis=1), dtype=np.float64)
+def _spreads(weight: Doubles, apart: Doubles) -> tuple[Doubles, Doubles]:
+    """Root mean squares (k,) of the nearer and of the farther half of weighted samples (k, n), by squares of angles."""
+    order = np.argsort(apart, axis=1)
+    weight, apart = (np.take_along_axis(one, order, axis=1) for one in (weight, apart))
+    total = weight.sum(axis=1, keepdims=True)
+    near = np.clip(0.5 * total - (weight.cumsum(axis=1) - weight), 0.0, weight)
+    half = np.maximum(0.5 * total[:, 0], 1e-12)
+    return np.sqrt((near * apart).sum(axis=1) / half), np.sqrt(((weight - near) * apart).sum(axis=1) / half)
+
+
+def _rows(values: npt.NDArray[Any]) -> Doubles:
+    """Of each angle its samples."""
+    return np.asarray(values, dtype=np.float64).reshape(ANGLES, LOBE_SAMPLES)

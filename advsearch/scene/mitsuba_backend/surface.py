@@ -112,6 +112,7 @@ class Views:
         lobes: of each.
         widths: root mean square angles of the blurred maps, each twice the one before, radians.
         photographed: height of the camera of a photographed ground; None where the ground is none.
+        middle: (3,) of the object, from which the blurred maps are seen.
     """
 
     def __init__(
@@ -121,7 +122,9 @@ class Views:
         lobes: Sequence[Lobes],
         widths: Sequence[float],
         photographed: float | None,
+        middle: Floats,
     ) -> None:
+        self._middle = [float(one) for one in middle]
         self._scene, self._grids, self._widths, self._photographed = scene, tuple(grids), tuple(widths), photographed
         tables = [np.concatenate([getattr(one, name) for name in TABLES]) for one in lobes]
         self._tables = np.concatenate(tables).astype(np.float32)
@@ -216,7 +219,7 @@ class Views:
         table = mi.UInt32(0)
         for number_of, on in enumerate(ons):
             table = dr.select(on, mi.UInt32(number_of * len(TABLES) * ANGLES), table)
-        diffuse, gloss, up, along, spread = self._measured(tables, table, cosine)
+        diffuse, gloss, up, along, core, tail = self._measured(tables, table, cosine)
         shown = self._shown(hit, ons, lit, to_local)
         side = mi.Float(0.0)
         for grid, on in zip(self._grids, ons, strict=True):
@@ -228,13 +231,14 @@ class Views:
         mirrored = dr.normalize(normal * up + beside * along)
         second = stopped(held, mi.Ray3f(hit.p + normal * SHIFT, mirrored), layers, active=glossy)
         seconds = on_grids(held, self._grids, second, mirrored)
-        blurred = _blurred(lit, mirrored, to_local, spread, self._widths)
+        shown_at = self._from_middle(hit.p, mirrored)
+        blurred = 0.5 * sum(_blurred(lit, shown_at, to_local, spread, self._widths) for spread in (core, tail))
         texel = self._texel(second, seconds, lit)
         shade = texel / dr.gather(mi.Color3f, lit.texels, mi.UInt32(self._grids[-1].first + self._grids[-1].count))
         level = mi.Bool(False)
         for grid, on in zip(self._grids, seconds, strict=True):
             level |= on & (grid.warp is not None)
-        wide = dr.clip((spread - SHARP) / (WIDE - SHARP), 0.0, 1.0)
+        wide = dr.clip((dr.sqrt(0.5 * (core * core + tail * tail)) - SHARP) / (WIDE - SHARP), 0.0, 1.0)
         traced = self._shown(second, seconds, lit, to_local)
         ground = traced + wide * (blurred * shade - traced)
         reflected = dr.select(second.is_valid(), dr.select(level, ground, texel), blurred)
@@ -254,6 +258,16 @@ class Views:
             one, other = (dr.gather(mi.Float, tables, first + (number * ANGLES + k) + low) for k in (0, 1))
             found.append(one + share * (other - one))
         return found
+
+    def _from_middle(self, place: Any, way: Any) -> Any:
+        """The direction in which the middle of the object sees the ground that a place sees in a direction."""
+        mi = mitsuba()
+        import drjit as dr
+
+        if all(grid.warp is None for grid in self._grids):
+            return way
+        far = place.z / dr.maximum(-way.z, 1e-3)
+        return dr.select(way.z < -1e-3, dr.normalize(place + way * far - mi.Point3f(*self._middle)), way)
 
     def _shown(self, hit: Any, ons: Sequence[Any], lit: Lit, to_local: Any) -> Any:
         """Diffuse radiance of what was hit."""

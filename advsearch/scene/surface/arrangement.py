@@ -51,7 +51,7 @@ BURIED = 0.3
 """Share of a texel's rays that meet the back of a surface from which on it lies inside of something."""
 BOUNCES = 4
 """How often light goes from texel to texel: that and the camera's and the sky's segments make a path of `MAX_DEPTH`."""
-FINE = 96
+FINE = 192
 """Least side of the grid on which base colour and light are multiplied."""
 WHITE = 0.95
 """Reflectance that a photographed ground has at most, where light goes from surface to surface."""
@@ -129,7 +129,7 @@ class Arrangement:
         self._photographed = None if photograph is None else description.number("ground.height")
         self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
         self._below = self._seen_below(middle)
-        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed)
+        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed, middle)
 
     def _value(self, name: str) -> Tensor:
         return self.inputs[name] if name in self.inputs else self._scene.base(name)

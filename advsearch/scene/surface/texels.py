@@ -18,13 +18,13 @@ from advsearch.scene.transport.matrix import by_rows
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
 
-SIDE = 128
+SIDE = 160
 """Texels a side over the searched object."""
-GROUND = 80
+GROUND = 112
 """Texels a side over the ground."""
 NEAR = 12.0
 """Half the side of the ground that has texels, object sizes; further out there is the light of its border."""
-FINEST = 0.02
+FINEST = 0.01
 """Side of the ground's texels under the middle of the object, object sizes: contact shadows are that sharp."""
 REACH = 2
 """Texels to each side that the light of a place is taken from."""
