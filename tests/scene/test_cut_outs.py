@@ -148,3 +148,31 @@ def test_a_material_file_says_opacity_by_a_number_and_a_picture(mode: str, share
     broken = import_object(tmp_path / "card.obj", up="y")
     assert "the opacity 'holes.png' cannot be read as a picture; it is opaque instead" in " ".join(broken.warnings)
     assert (broken.opacity is None) == (share == 1.0)
+
+
+BOX = trimesh.creation.box((1.0, 1.0, 0.5))
+
+
+def boxes(path: Path, opacity: float) -> Path:
+    """A box with a wider one of glass around its middle; the glass has an opacity."""
+    lines, first = [f"mtllib {path.stem}.mtl"], 1
+    for name, size in (("paint", 1.0), ("glass", 1.5)):
+        lines += ["v {:g} {:g} {:g}".format(*(size * place)) for place in BOX.vertices] + [f"usemtl {name}"]
+        lines += ["f {} {} {}".format(*(face + first)) for face in BOX.faces]
+        first += len(BOX.vertices)
+    path.write_text("\n".join(lines) + "\n")
+    path.with_suffix(".mtl").write_text(f"newmtl paint\nKd 1 0 0\nnewmtl glass\nKd 0 0 1\nd {opacity:g}\n")
+    return path
+
+
+def test_parts_that_let_all_light_through_cost_nothing(tmp_path: Path) -> None:
+    """Windows with `d 0` are left out, and said; so no fast way is lost. With a little opacity they stay."""
+    clear, dim = (import_object(boxes(tmp_path / f"{share}.obj", share), up="z") for share in (0.0, 0.3))
+    assert clear.opacity is None and set(clear.mesh.materials) == {"paint"} and len(clear.mesh.faces) == len(BOX.faces)
+    np.testing.assert_allclose(np.ptp(clear.mesh.vertices, axis=0), [1.0, 1.0, 0.5], atol=1e-6)
+    assert "all light passes through 'glass' (opacity 0): left out" in " ".join(clear.warnings)
+    assert dim.opacity is not None and set(dim.mesh.materials) == {"paint", "glass"} and not dim.warnings[1:]
+    (tmp_path / "all.mtl").write_text("newmtl paint\nd 0\nnewmtl glass\nd 0\n")
+    (tmp_path / "all.obj").write_text((tmp_path / "0.0.obj").read_text().replace("0.0.mtl", "all.mtl"))
+    whole = import_object(tmp_path / "all.obj", up="z")
+    assert whole.opacity is None and "transparent all over; it is shown opaque" in " ".join(whole.warnings)

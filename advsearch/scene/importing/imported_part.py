@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +37,11 @@ class ImportedPart:
     surface: ImportedSurface
     node: int = -1
     flat: bool = False
+
+
+def visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
+    """Return the parts through which not all light passes; all of them where that leaves none."""
+    return [part for part in parts if not part.surface.clear] or list(parts)
 
 
 def placed(part: ImportedPart, matrix: Array) -> ImportedPart:

@@ -17,9 +17,9 @@ from advsearch.files import MESHES
 from advsearch.scene.assets import Material, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.blender import read_mesh_bytes
-from advsearch.scene.importing.files import safe_name
+from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
-from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.imported_part import ImportedPart, visible
 from advsearch.scene.importing.parts import GLTF, read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
 from advsearch.scene.importing.texture import by_material, textured
@@ -52,6 +52,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
       baked, it is turned to the new texture coordinates.
     - Roughness and metallic are those of glTF, and of an .mtl ``Pr`` and ``Pm`` where given, their mean over several
       materials, and else `Material`'s.
+    - Parts with an opacity of 0 everywhere are left out, with a warning, unless the whole object is so.
     - What else a file has is named in the warnings.
 
     The same file gives the same bytes every time.
@@ -87,6 +88,8 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     Raises:
         InputError: the geometry has NaN, infinite, or coincident vertices only.
     """
+    seen = visible(parts)
+    cleared, parts = _cleared(parts, seen), seen
     soup, axis = _upright(parts, file, up)
     soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
@@ -95,7 +98,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     if opacity is not None and not opacity.any():
         opacity, bakes = None, [*bakes, "it is transparent all over; it is shown opaque"]
     material, blends = _material(soup, surfaces)
-    warnings = [*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)]
+    warnings = [*notes, *(f"{file.name}: {note}" for note in cleared + repairs + bakes + blends)]
     kept = warnings[:MOST_WARNINGS]
     more = len(warnings) - len(kept)
     return ObjectAsset(
@@ -110,6 +113,14 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         normal_map=maps.normals,
         emission=_let_out(maps.emission, opacity),
     )
+
+
+def _cleared(parts: list[ImportedPart], kept: list[ImportedPart]) -> list[str]:
+    """Return a warning that names the materials of what was left out."""
+    names = dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in kept)
+    if not names:
+        return []
+    return [f"all light passes through {', '.join(names)} (opacity 0): left out; give it an opacity to see it"]
 
 
 def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path) -> Mesh:

@@ -25,7 +25,7 @@ from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light
 from advsearch.scene.importing.gltf_parts import poses
-from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.imported_part import ImportedPart, visible
 from advsearch.scene.importing.objects import object_of
 from advsearch.scene.importing.parts import GLTF, read_parts
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
@@ -233,7 +233,7 @@ class FileFrame:
 def _frame(parts: Sequence[ImportedPart]) -> FileFrame:
     """The frame in which the parts have a largest extent of 1, stand on z = 0 and are centred in x and y."""
     corners = []
-    for part in parts:
+    for part in visible(parts):
         triangles = part.vertices[part.faces]
         area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
         extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())

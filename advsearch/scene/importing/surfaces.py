@@ -50,6 +50,12 @@ class ImportedSurface:
         glow = None if self.emission is None or self.emission.shape == (1, 1, 3) else self.emission
         return tuple(one for one in (self.texture, self.normal_map, glow) if one is not None)
 
+    @property
+    def clear(self) -> bool:
+        """Whether all light passes through it, everywhere."""
+        color = self.color if self.texture is None else self.texture
+        return color is not None and color.shape[-1] == 4 and not color[..., 3].any()
+
     def same_maps(self, other: ImportedSurface) -> bool:
         """Tell whether two surfaces have the same base colour, normal map and emission everywhere."""
         ours = (self.color, self.texture, self.normal_map, self.emission)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.texel_rays import Floats, TexelGrid
+from advsearch.scene.mitsuba_backend.texel_rays import Floats, TexelGrid, passed
 from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time
 
 Doubles = npt.NDArray[np.float64]
@@ -82,12 +82,13 @@ def measured(
             hit = held.ray_intersect(dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, ANGLES * LOBE_SAMPLES)))
             bsdf = hit.bsdf()
             hit.wi = towards
-            value = bsdf.eval(mi.BSDFContext(), hit, even)
+            opaque = dr.maximum(1.0 - passed(hit, True), 1e-3)  # of cut-outs, what stops light
+            value = bsdf.eval(mi.BSDFContext(), hit, even) / opaque
             if level:
                 found.append(dr.mean(value))
                 continue
             sampled, weight = bsdf.sample(mi.BSDFContext(), hit, one, two)
-            back = dr.select((sampled.pdf > 0.0) & (sampled.wo.z > 0.0), dr.mean(weight), 0.0)
+            back = dr.select((sampled.pdf > 0.0) & (sampled.wo.z > 0.0), dr.mean(weight) / opaque, 0.0)
             back = dr.select(dr.isfinite(back), back, 0.0)
             found += [dr.mean(value), back, sampled.wo.x, sampled.wo.z]
     lit, dark = (_rows(one.numpy()) / _rows(even.z.numpy() / math.pi) for one in found[:2])

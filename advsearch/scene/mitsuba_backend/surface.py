@@ -23,8 +23,11 @@ from advsearch.scene.mitsuba_backend.texel_rays import (
     Floats,
     TexelGrid,
     grid_place,
+    layers_of,
     map_place,
-    shapes_of,
+    on_grids,
+    passed,
+    stopped,
     to_map,
 )
 from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time, population, recorded
@@ -36,6 +39,8 @@ CAMERA = 16
 PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
 """Where the rays of a pixel go through it: a turned grid, which sees upright and level edges at four places."""
 RAYS = len(PATTERN)
+LEAST = 1e-3
+"""Share of a ray's light under which what is behind a cut-out does not count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +89,11 @@ class Seen:
     Attributes:
         rest: (n, H, W, 3) radiance but for what the searched texture reflects diffusely.
         covered: (n, H, W, 1) share of each pixel that shows surfaces.
-        sample: (k,) int64, the rays that see the searched texture, ascending; `samples` a pixel, row by row.
+        sample: (k,) int64, the rays that see the searched texture, ascending; `RAYS` a pixel, row by row. One that
+            goes through cut-outs sees it several times.
         uv: (k, 2) where; as Mitsuba has them.
         weight: (k,) the diffuse share over pi, and over the rays of a pixel.
+        back: (k,) bool, whether it is seen from behind.
     """
 
     rest: Tensor
@@ -94,6 +101,7 @@ class Seen:
     sample: Tensor
     uv: Tensor
     weight: Tensor
+    back: Tensor
 
 
 class Views:
@@ -159,15 +167,16 @@ class Views:
             lane = dr.arange(mi.UInt32, count * height * width * RAYS)
             dr.eval(lane)  # a recording takes its size from what it is given, the size of the scene's map else
             found = self._recorded[key](self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred)
-            *rest, covered, u, v, weight = (one.numpy() for one in found)
+            rest, covered, (u, v, weight) = found[:3], found[3], (_by_ray(found[k::3]) for k in (4, 5, 6))
             size = (count, height, width)
-            (sample,) = np.nonzero(weight)
+            (met,) = np.nonzero(weight)
             return Seen(
-                rest=torch.from_numpy(np.stack(rest, axis=-1)).reshape(*size, 3),
-                covered=torch.from_numpy(covered.copy()).reshape(*size, 1),
-                sample=torch.from_numpy(sample),
-                uv=torch.from_numpy(np.stack([u[sample], v[sample]], axis=1)),
-                weight=torch.from_numpy(weight[sample]),
+                rest=torch.from_numpy(np.stack([one.numpy() for one in rest], axis=-1)).reshape(*size, 3),
+                covered=torch.from_numpy(covered.numpy().copy()).reshape(*size, 1),
+                sample=torch.from_numpy(met // (len(weight) // len(lane))),
+                uv=torch.from_numpy(np.stack([u[met], v[met]], axis=1)),
+                weight=torch.from_numpy(np.abs(weight[met])),
+                back=torch.from_numpy(weight[met] < 0.0),
             )
 
     def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, lit: Lit) -> list[Any]:
@@ -189,10 +198,32 @@ class Views:
             inside = within > 0.0
         way = dr.normalize(mi.Vector3f(*(entry[k] * x + entry[3 + k] * y + entry[6 + k] * z for k in range(3))))
         ray, wanted = mi.Ray3f(mi.Point3f(*entry[9:12]), way), mi.RayFlags.UV | mi.RayFlags.ShadingFrame
-        hit = held.ray_intersect(ray, wanted, coherent=True)
-        valid, to_local = hit.is_valid() & inside, to_map(self._scene)
-        shapes = shapes_of(held, self._grids)
-        ons = [valid & (hit.shape == mi.ShapePtr(shape)) for shape in shapes]
+        layers, found = layers_of(self._scene), []
+        radiance, covered, share = mi.Color3f(0.0), mi.Float(0.0), mi.Float(1.0)
+        active: Any = inside
+        for layer in range(layers + 1):
+            hit = held.ray_intersect(ray, wanted, layer == 0, active)
+            stops = active & hit.is_valid()
+            part = share * (1.0 - passed(hit, stops)) if layer < layers else share
+            shown, diffuse, side = self._shaded(held, hit, stops, way, tables, lit)
+            radiance += dr.select(stops, part * shown, 0.0)
+            radiance += dr.select(active & ~hit.is_valid(), share * _sky(lit, way, to_map(self._scene)), 0.0)
+            covered += dr.select(stops, part / RAYS, 0.0)
+            found += [hit.uv.x, hit.uv.y, side * part * diffuse / (math.pi * RAYS)]
+            share, active = share - part, stops & (share - part > LEAST)
+            ray = hit.spawn_ray(way)
+        radiance /= RAYS
+        dr.eval(radiance, covered, found)  # a sum of its own kernel each would send all rays again
+        return [*(dr.block_sum(one, RAYS) for one in (*radiance, covered)), *found]
+
+    def _shaded(self, held: Any, hit: Any, valid: Any, way: Any, tables: Any, lit: Lit) -> tuple[Any, Any, Any]:
+        """What was hit: its radiance, but for what the searched texture reflects diffusely; its diffuse share; and 1 on
+        the front of the searched texture, -1 on its back, 0 elsewhere."""
+        mi = mitsuba()
+        import drjit as dr
+
+        to_local, layers = to_map(self._scene), layers_of(self._scene)
+        ons = [on & valid for on in on_grids(held, self._grids, hit, way)]
         normal = dr.select(dr.dot(hit.sh_frame.n, way) > 0.0, -hit.sh_frame.n, hit.sh_frame.n)
         cosine = -dr.dot(normal, way)
         table = mi.UInt32(0)
@@ -200,13 +231,16 @@ class Views:
             table = dr.select(on, mi.UInt32(number_of * len(TABLES) * ANGLES), table)
         diffuse, gloss, up, along, core, tail = self._measured(tables, table, cosine)
         shown = self._shown(hit, ons, lit, to_local)
-        radiance = dr.select(ons[0], 0.0, shown * dr.select(valid, diffuse, 1.0))
+        side = mi.Float(0.0)
+        for grid, on in zip(self._grids, ons, strict=True):
+            side = dr.select(on, -1.0 if grid.side < 0 else 1.0, side) if grid.warp is None else side
+        radiance = dr.select(side != 0.0, 0.0, shown * dr.select(valid, diffuse, 1.0))
         # the gloss: a ray in the mean direction of the lobe says what is there, the blurred map how bright it is
         glossy = valid & (gloss > 1e-4)
         beside = dr.normalize(way + normal * cosine + 1e-8)
         mirrored = dr.normalize(normal * up + beside * along)
-        second = held.ray_intersect(mi.Ray3f(hit.p + normal * SHIFT, mirrored), mi.RayFlags.UV, False, glossy)
-        seconds = [second.is_valid() & (second.shape == mi.ShapePtr(shape)) for shape in shapes]
+        second = stopped(held, mi.Ray3f(hit.p + normal * SHIFT, mirrored), layers, active=glossy)
+        seconds = on_grids(held, self._grids, second, mirrored)
         shown_at = self._from_middle(hit.p, mirrored)
         blurred = 0.5 * sum(_blurred(lit, shown_at, to_local, spread, self._widths) for spread in (core, tail))
         texel = self._texel(second, seconds, lit)
@@ -219,12 +253,7 @@ class Views:
         ground = traced + wide * (blurred * shade - traced)
         reflected = dr.select(second.is_valid(), dr.select(level, ground, texel), blurred)
         radiance += dr.select(glossy, gloss * reflected, 0.0)
-        radiance += dr.select(inside & ~valid, _sky(lit, way, to_local), 0.0)
-        covered = dr.select(valid, mi.Float(1.0 / RAYS), 0.0)
-        weight = dr.select(ons[0], diffuse / (math.pi * RAYS), 0.0)
-        radiance /= RAYS
-        dr.eval(radiance, covered, hit.uv, weight)  # a sum of its own kernel each would send all rays again
-        return [*(dr.block_sum(one, RAYS) for one in (*radiance, covered)), hit.uv.x, hit.uv.y, weight]
+        return radiance, diffuse, side
 
     def _measured(self, tables: Any, first: Any, cosine: Any) -> list[Any]:
         """The entries of the tables at a cosine."""
@@ -301,6 +330,11 @@ def _through(model: CameraModel, height: int, width: int) -> Floats:
     directions, inside = model.rays(torch.from_numpy(places))
     found = torch.cat([directions * torch.tensor([-1.0, -1.0, 1.0]), inside[:, None]], dim=1)
     return found.float().numpy().ravel()
+
+
+def _by_ray(layers: Sequence[Any]) -> Floats:
+    """Arrays (n,) of all layers as one (n x layers,), ray by ray."""
+    return np.stack([one.numpy() for one in layers], axis=1).ravel()
 
 
 def _chosen(number: Any, values: Sequence[float]) -> Any:

@@ -23,6 +23,10 @@ SHIFT = 1e-4
 """How far from a surface rays begin, object sizes."""
 PASS = 1 << 20
 """Rays of one launch of `gather`."""
+LAYERS = 4
+"""Cut-outs that a ray goes through; what comes after them is taken for opaque."""
+FROM_BEHIND = 0.02
+"""Share of what is seen of a shape from outside, from which on the backs of its faces count."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +39,14 @@ class TexelGrid:
         shape: rows and columns.
         warp: None where it lies over texture coordinates; else (middle x, middle y, scale, rate) of a level plane whose
             cells are small about its middle: coordinate = middle + scale sinh(rate s), s in [-1, 1].
+        side: of the faces that it lies on: 1 the front, -1 the back, 0 both.
     """
 
     name: str
     first: int
     shape: tuple[int, int]
     warp: tuple[float, float, float, float] | None = None
+    side: int = 0
 
     @property
     def count(self) -> int:
@@ -72,7 +78,7 @@ def gather(
     mi = mitsuba()
     import drjit as dr
 
-    held, to_local = scene._scene, to_map(scene)
+    held, to_local, layers = scene._scene, to_map(scene), layers_of(scene)
     count, texels = len(places), grids[-1].first + grids[-1].count
     steps = (np.arange(1, rays + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])) % 1.0
     points = mi.Point2f(mi.Float(steps[:, 0].astype(np.float32)), mi.Float(steps[:, 1].astype(np.float32)))
@@ -88,13 +94,13 @@ def gather(
         normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals[some]), texel)
         place = dr.gather(mi.Point3f, _points(mi.Point3f, places[some]), texel)
         way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
-        hit = held.ray_intersect(mi.Ray3f(place + normal * SHIFT, way))
+        hit = stopped(held, mi.Ray3f(place + normal * SHIFT, way), layers, _chance(layers, len(lane), (seed, begin)))
         column, row = map_place(way, to_local)
         across, down = mi.UInt32(column * cells[1]) % cells[1], mi.UInt32(dr.minimum(row * cells[0], cells[0] - 1))
         seen = dr.select(hit.is_valid(), mi.Int32(-1), mi.Int32(texels + down * cells[1] + across))
-        front = dr.dot(hit.n, way) < 0.0
-        for grid, shape in zip(grids, shapes_of(held, grids), strict=True):
-            on = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (front | (grid.warp is not None))
+        for grid, on in zip(grids, on_grids(held, grids, hit, way), strict=True):
+            if grid.warp is None and grid.side == 0:
+                on &= dr.dot(hit.n, way) < 0.0
             y, x = grid_place(grid, hit.p, hit.uv)
             nearest = mi.Int32(grid.first + _cell(y, grid.shape[0]) * grid.shape[1] + _cell(x, grid.shape[1]))
             seen = dr.select(on, nearest, seen)
@@ -121,9 +127,100 @@ def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) 
     way = dr.gather(mi.Vector3f, _points(mi.Vector3f, world), number)
     cosine = dr.dot(normal, way)
     above = cosine > 0.0
-    hidden = scene._scene.ray_test(mi.Ray3f(place + normal * SHIFT, way), above)
-    found: Floats = dr.select(above & ~hidden, cosine, 0.0).numpy().reshape(len(places), len(world))
+    ray = mi.Ray3f(place + normal * SHIFT, way)
+    found: Floats = (
+        dr.select(above, cosine * _passing(scene._scene, ray, layers_of(scene), above), 0.0)
+        .numpy()
+        .reshape(len(places), len(world))
+    )
     return found
+
+
+def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
+    """Whether backs of a shape's faces are seen from outside, as through an open window.
+
+    Args:
+        scene: with its inputs set.
+        name: of the shape.
+        places: (n, 3) on it.
+    """
+    mi = mitsuba()
+    import drjit as dr
+
+    generator = np.random.default_rng(0)
+    ways = generator.standard_normal((PASS >> 7, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    ways[:, 2] = np.abs(ways[:, 2])
+    targets = places[generator.integers(len(places), size=len(ways))]
+    reach = 2.0 * float(np.ptp(places, axis=0).max())
+    way = _points(mi.Vector3f, (-ways).astype(np.float32))
+    ray = mi.Ray3f(_points(mi.Point3f, (targets + reach * ways).astype(np.float32)), way)
+    layers = layers_of(scene)
+    hit = stopped(scene._scene, ray, layers, _chance(layers, len(ways), (0,)))
+    (on,) = on_grids(scene._scene, [TexelGrid(name, 0, (1, 1))], hit, way)
+    behind = np.asarray((on & (dr.dot(hit.n, way) > 0.0)).numpy())
+    return bool(behind.sum() > FROM_BEHIND * np.asarray(on.numpy()).sum())
+
+
+# ---- cut-outs -------------------------------------------------------------------------------------------------------
+
+
+def layers_of(scene: MitsubaScene) -> int:
+    """How many cut-outs its rays go through; 0 where it has none."""
+    return LAYERS if scene.made[0].cut_out else 0
+
+
+def stopped(held: Any, ray: Any, layers: int, chance: Any = 0.5, active: Any = True) -> Any:
+    """Return the first hits of rays that light does not pass.
+
+    Args:
+        held: Mitsuba's scene.
+        ray: of each lane.
+        layers: see `layers_of`.
+        chance: in [0, 1]; a ray goes on as long as the share of light that passes all it has met is larger.
+        active: which lanes count.
+    """
+    mi = mitsuba()
+    import drjit as dr
+
+    hit = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
+    share = mi.Float(1.0)
+    for _ in range(layers):
+        share *= passed(hit, active)
+        active = active & hit.is_valid() & (share > chance)
+        following = held.ray_intersect(hit.spawn_ray(ray.d), mi.RayFlags.UV, False, active)
+        hit = dr.select(active, following, hit)
+    return hit
+
+
+def passed(hit: Any, active: Any) -> Any:
+    """The share of light that passes what was hit."""
+    import drjit as dr
+
+    return dr.mean(hit.bsdf().eval_null_transmission(hit, active & hit.is_valid()))
+
+
+def _passing(held: Any, ray: Any, layers: int, active: Any) -> Any:
+    """The share of light that passes all that is in the way of rays."""
+    mi = mitsuba()
+    import drjit as dr
+
+    share = mi.Float(1.0)
+    for _ in range(layers):
+        hit = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
+        active = active & hit.is_valid()
+        share = dr.select(active, share * passed(hit, active), share)
+        active = active & (share > 0.0)
+        ray = hit.spawn_ray(ray.d)
+    return dr.select(held.ray_test(ray, active), 0.0, share)
+
+
+def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
+    """A number in [0, 1] for each ray."""
+    mi = mitsuba()
+    if not layers:
+        return 0.5
+    return mi.Float(np.random.default_rng([*seed, 1]).random(count, dtype=np.float32))
 
 
 # ---- places ---------------------------------------------------------------------------------------------------------
@@ -133,6 +230,19 @@ def shapes_of(held: Any, grids: Sequence[TexelGrid]) -> list[Any]:
     """Mitsuba's shapes of grids."""
     by_name = {one.id(): one for one in held.shapes()}
     return [by_name[grid.name] for grid in grids]
+
+
+def on_grids(held: Any, grids: Sequence[TexelGrid], hit: Any, way: Any) -> list[Any]:
+    """Whether hits of rays in a direction lie on each grid."""
+    mi = mitsuba()
+    import drjit as dr
+
+    front = dr.dot(hit.n, way) < 0.0
+    found = []
+    for grid, shape in zip(grids, shapes_of(held, grids), strict=True):
+        on = hit.is_valid() & (hit.shape == mi.ShapePtr(shape))
+        found.append(on & (front if grid.side > 0 else ~front) if grid.side else on)
+    return found
 
 
 def to_map(scene: MitsubaScene) -> Any:

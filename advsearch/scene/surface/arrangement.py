@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.lobes import Lobes, measured
 from advsearch.scene.mitsuba_backend.surface import Lit, Seen, Views, lit_arrays
-from advsearch.scene.mitsuba_backend.texel_rays import gather, to_map, towards
+from advsearch.scene.mitsuba_backend.texel_rays import Ints, gather, seen_from_behind, to_map, towards
 from advsearch.scene.photograph import irradiance as unshadowed
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.light import (
@@ -40,7 +41,7 @@ from advsearch.scene.surface.light import (
     sky_of,
 )
 from advsearch.scene.surface.texels import SIDE, Texels, between, on_ground, on_mesh, smoothed, together
-from advsearch.scene.surface.view import SparseProduct
+from advsearch.scene.surface.view import SparseProduct, SurfaceView
 from advsearch.scene.surface_map import rasterised
 from advsearch.scene.transport.matrix import bilinear
 
@@ -65,7 +66,7 @@ class Light:
     """Light on the surfaces.
 
     Attributes:
-        on_object: (cells of the fine grid, 3) irradiance.
+        on_object: (cells of the fine grid, 3) irradiance; of the front and then of the back where that has its own.
         lit: the rest, for look-ups.
     """
 
@@ -76,6 +77,10 @@ class Light:
     def bytes(self) -> int:
         """Memory."""
         return 4 * (self.on_object.numel() + self.lit.numbers)
+
+    def reflected(self, fine: Tensor) -> Tensor:
+        """Return what a base colour (cells of the fine grid, 3) reflects, on each side; differentiable."""
+        return fine.repeat(len(self.on_object) // len(fine), 1) * self.on_object
 
 
 class Arrangement:
@@ -97,11 +102,15 @@ class Arrangement:
         mesh = description.meshes[OBJECT].mesh
         charts = rasterised(mesh, SIDE)
         some = [on_mesh(OBJECT, charts, vertices, normals)]
+        if seen_from_behind(scene, OBJECT, some[0].places):
+            some = [on_mesh(OBJECT, charts, vertices, side * normals, side) for side in (1, -1)]
+        self.sides = len(some)
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         photograph = description.photograph
         if description.number("ground.size") > 0.0:
             reach = math.inf if photograph is not None else description.number("ground.size") / 2.0
             some.append(on_ground(GROUND, 0.0, reach, (float(middle[0]), float(middle[1]))))
+        self._has_ground = len(some) > self.sides
         self.texels: Texels = together(some)
         factor = max(1, math.ceil(FINE / min(texture)))
         self.fine = texture[0] * factor, texture[1] * factor
@@ -109,12 +118,14 @@ class Arrangement:
         places, facing = self.texels.places, self.texels.normals
         seen = gather(scene, self.texels.grids, CELLS, places, facing, GATHERED, seed)
         self._sees = seen_of(seen, self.texels.of_cell, len(places))
-        buried = np.asarray((seen[self.texels.of(0)] < 0).mean(axis=1) > BURIED)
-        self._between = between(self.texels, charts, self.fine, vertices, normals, buried)
-        if len(some) > 1:
-            above = np.asarray((seen[self.texels.of(1)] >= len(self.texels.of_cell)).any(axis=1))
-            self._smooth = smoothed(some[1], above)
-        self.lobes = [self._measured(0), *(Lobes.matt() for _ in some[1:])]
+        self._between = [
+            between(some[side], charts, self.fine, vertices, (1 - 2 * side) * normals, self._buried(seen, side))
+            for side in range(self.sides)
+        ]
+        if self._has_ground:
+            above = np.asarray((seen[self.texels.of(self.sides)] >= len(self.texels.of_cell)).any(axis=1))
+            self._smooth = smoothed(some[-1], above)
+        self.lobes = [self._measured()] * self.sides + [Lobes.matt()] * (len(some) - self.sides)
         self._photographed = None if photograph is None else description.number("ground.height")
         self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
         self._below = self._seen_below(middle)
@@ -126,12 +137,27 @@ class Arrangement:
     def _value(self, name: str) -> Tensor:
         return self.inputs[name] if name in self.inputs else self._scene.base(name)
 
-    def _measured(self, number: int) -> Lobes:
-        here = self.texels.of(number)
-        at = here.start + (here.stop - here.start) // 2
-        return measured(
-            self._scene, self.inputs, self.texels.grids[number], self.texels.places[at], self.texels.normals[at]
-        )
+    def _buried(self, seen: Ints, side: int) -> npt.NDArray[np.bool_]:
+        """Which texels of a side of the object lie inside of something: they see nothing but backs, or much of them
+        and no sky where backs have light of their own."""
+        here = seen[self.texels.of(side)]
+        if self.sides == 1:
+            return np.asarray((here < 0).mean(axis=1) > BURIED)
+        back = self.texels.grids[1]
+        inside = (here >= back.first) & (here < back.first + back.count)
+        return np.asarray((inside.mean(axis=1) > BURIED) & ~(here >= len(self.texels.of_cell)).any(axis=1))
+
+    def _measured(self) -> Lobes:
+        """Those of the object, at the texel in the middle of those that least light passes."""
+        here, opacity = self.texels.of(0), self._scene.made[0].meshes[OBJECT].opacity
+        every = np.arange(here.start, here.stop)
+        if opacity is not None:
+            rows, columns = self.texels.grids[0].shape
+            row, column = np.divmod(self.texels.cells[here], columns)
+            found = opacity[row * opacity.shape[0] // rows, column * opacity.shape[1] // columns]
+            every = every[found >= found.max()]
+        at = every[len(every) // 2]
+        return measured(self._scene, self.inputs, self.texels.grids[0], self.texels.places[at], self.texels.normals[at])
 
     def _enlarging(self, texture: tuple[int, int]) -> scipy.sparse.csr_matrix:
         """From the texels of a small texture to the fine grid."""
@@ -148,7 +174,7 @@ class Arrangement:
         (h, w, 3) in the map's axes in which its photograph has what is seen there."""
         ways = directions(BLURRED)
         world = ways @ self.to_map
-        if len(self.texels.grids) == 1:
+        if not self._has_ground:
             return torch.zeros(BLURRED, dtype=torch.bool), ways
         far = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
         places = torch.from_numpy(middle).float() + world * far[..., None]
@@ -160,7 +186,7 @@ class Arrangement:
     @property
     def entries(self) -> int:
         """Of all matrices, for one colour channel."""
-        return sum(int(one.values().numel()) for one in (*self._sees, self._between))
+        return sum(int(one.values().numel()) for one in (*self._sees, *self._between))
 
     @property
     def bytes(self) -> int:
@@ -171,6 +197,10 @@ class Arrangement:
         """Return what cameras see under a light; see `Views`."""
         self._stand()
         return self._views(cameras, light.lit)
+
+    def view(self, seen: Seen, number: int) -> SurfaceView:
+        """Return what one of several cameras sees."""
+        return SurfaceView(seen, number, self.fine, self.sides)
 
     def _stand(self) -> None:
         """Put object and surroundings back where they stand, if something has moved them since."""
@@ -197,8 +227,8 @@ class Arrangement:
             arriving = irradiance(self._sees, sky, direct, reflectance, BOUNCES)
             leaving = reflectance * arriving / math.pi
             shown, unhidden = sky.map, torch.ones(1, 3)
-            if len(self.texels.grids) > 1:
-                ground, (hidden, below) = self.texels.of(1), self._below
+            if self._has_ground:
+                ground, (hidden, below) = self.texels.of(self.sides), self._below
                 if self._photographed is not None:
                     leaving[ground] = arriving[ground] / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
                 leaving[ground] = self._smooth @ leaving[ground]
@@ -207,13 +237,13 @@ class Arrangement:
                 if self._photographed is not None:
                     seen = unhidden * looked_up(padded, below.reshape(-1, 3)).reshape(*BLURRED, 3)
                 shown = torch.where(hidden[..., None], seen, shown)
-            on_object = self._between @ arriving[self.texels.of(0)]
+            on_object = torch.cat([one @ arriving[self.texels.of(side)] for side, one in enumerate(self._between)])
             cells = torch.cat([leaving[torch.from_numpy(self.texels.of_cell)], unhidden])
             return Light(on_object, lit_arrays(cells, padded, blurred(shown)))
 
     def _border(self, ground: Tensor) -> Tensor:
         """The mean (1, 3) of a ground's light at its border, where the object hides little of it."""
-        cells = ground.reshape(*self.texels.grids[1].shape, 3)
+        cells = ground.reshape(*self.texels.grids[-1].shape, 3)
         return torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]]).mean(dim=0, keepdim=True).clamp_min(1e-9)
 
     def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
@@ -221,9 +251,9 @@ class Arrangement:
         rows, columns = self.texels.grids[0].shape
         fine = self.finer(color).reshape(*self.fine, 3).permute(2, 0, 1)[None]
         pooled = functional.adaptive_avg_pool2d(fine, (rows, columns))[0].permute(1, 2, 0).reshape(-1, 3)
-        found = [pooled[torch.from_numpy(self.texels.cells[self.texels.of(0)])]]
-        if len(self.texels.grids) > 1:
-            ground = self.texels.places[self.texels.of(1)]
+        found = [pooled[torch.from_numpy(self.texels.cells[self.texels.of(0)])]] * self.sides
+        if self._has_ground:
+            ground = self.texels.places[self.texels.of(self.sides)]
             if self._photographed is None:
                 found.append(srgb_to_linear(torch.tensor(self._scene.made[0].ground_color)).expand(len(ground), 3))
             else:

@@ -43,12 +43,10 @@ def why_not_kept(renderer: Renderer) -> str | None:
     """Why light cannot be kept on the surfaces of a renderer's scene, in words; None if it may be."""
     description = renderer.scene.made[0]
     thing = description.meshes[OBJECT]
-    if thing.mesh.repeats or thing.surface is not None or thing.opacity is not None:
-        return "the object's surface repeats its texture, has cut-outs, or is one of Mitsuba's own"
+    if thing.mesh.repeats or thing.surface is not None:
+        return "the object's surface repeats its texture, or is one of Mitsuba's own"
     if description.environment is None or description.emits or len(description.parts) > 0:
         return "there is more in the scene than the object, its ground and an environment"
-    if description.camera_model is not None:
-        return "the camera has a lens that bends the picture"
     if renderer.scene.volumetric or description.thin_lens or description.backdrop:
         return "there is haze, a lens with an aperture, or a plain background"
     if renderer.formation.denoiser != "oidn":

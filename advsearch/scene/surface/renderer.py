@@ -12,7 +12,6 @@ from torch import Tensor
 from advsearch.files import scaled
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light
-from advsearch.scene.surface.view import SurfaceView
 from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
 
 
@@ -104,20 +103,20 @@ class SurfaceRenderer(PredictingRenderer):
     ) -> Tensor:
         """Return the pictures under one light, in one launch; arguments as of `pictures`."""
         seen = self.arrangement.seen([self._camera(one) for one in inputs], light)
-        reflected = self.arrangement.finer(color) * light.on_object
+        reflected = light.reflected(self.arrangement.finer(color))
         self.products += len(inputs)
         return torch.stack(
             [
-                self._shown(SurfaceView(seen, place, self.arrangement.fine).radiance(reflected), one, wholes[place])
+                self._shown(self.arrangement.view(seen, place).radiance(reflected), one, wholes[place])
                 for place, one in enumerate(inputs)
             ]
         )
 
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
         light = self.light(inputs)
-        view = SurfaceView(self.arrangement.seen([self._camera(inputs)], light), 0, self.arrangement.fine)
+        view = self.arrangement.view(self.arrangement.seen([self._camera(inputs)], light), 0)
         self.products += 1
-        return view.radiance(self.arrangement.finer(self.color(inputs)) * light.on_object)
+        return view.radiance(light.reflected(self.arrangement.finer(self.color(inputs))))
 
     def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {name: inputs.get(name, self._base[name]) for name in CAMERAS if name in self._base}

@@ -75,19 +75,20 @@ def together(some: Sequence[Texels]) -> Texels:
     )
 
 
-def on_mesh(name: str, charts: Charts, vertices: Floats, normals: Floats) -> Texels:
+def on_mesh(name: str, charts: Charts, vertices: Floats, normals: Floats, side: int = 0) -> Texels:
     """Return the texels over a mesh.
 
     Args:
         name: of the shape.
         charts: its texture coordinates, rasterised.
         vertices, normals: (V, 3) in world space.
+        side: of its faces, as `TexelGrid` has it.
     """
     place, normal = _surface(charts, vertices, normals)
     number = np.cumsum(charts.covered.ravel()) - 1
     rows, columns = np.nonzero(charts.covered)
     return Texels(
-        grids=(TexelGrid(name, 0, charts.covered.shape),),
+        grids=(TexelGrid(name, 0, charts.covered.shape, None, side),),
         places=place[rows, columns],
         normals=normal[rows, columns],
         cells=np.flatnonzero(charts.covered),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.engine.loading import Scene, load_scene
+from advsearch.scene.library import load_object
 from advsearch.scene.mitsuba_backend.lobes import measured
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import arrangement, renderer, texels
@@ -250,3 +252,24 @@ def test_what_it_cannot_predict_has_a_reason() -> None:
     assert "pose.yaw" in str(why_not(mug.renderer({"pose": {"yaw": [0, 9]}}, resolution=8), []))
     undenoised = mug.renderer({"camera": {"azimuth": [0, 9]}}, resolution=8, denoise="none")
     assert "denoiser" in str(why_not(undenoised, ["camera"]))
+
+
+def cut(opacity: float) -> Renderer:
+    """A ball with a band cut out, which lets light through to its inside and to what is behind it."""
+    ball = load_object("ball")
+    share = np.ones((32, 32), np.float32)
+    share[10:22] = opacity
+    return renderer_of(load_scene(replace(ball, opacity=share)))
+
+
+@pytest.mark.parametrize("opacity", [0.0, 0.4])
+def test_light_passes_cut_outs(opacity: float) -> None:
+    """What is behind them is seen, with the light that comes in; without that a picture is much further off."""
+    of, whole = cut(opacity), SurfaceRenderer(cut(1.0), cut(1.0).start, seed=0)
+    made = SurfaceRenderer(of, of.start, seed=0)
+    assert why_not(of, VARYING) is None and made.arrangement.sides == 2 and whole.arrangement.sides == 1
+    with torch.no_grad():
+        for number in range(2):
+            u = drawn(of, number)
+            truth = of(u, seed=1, spp=256)
+            assert levels(made(u), truth) < min(5.0, 0.5 * levels(whole(u), truth))
