@@ -47,6 +47,9 @@ class Restarts(Raced):
     def uses_gradient(self) -> bool:
         return self.policy.uses_gradient
 
+    def takes_differences(self, domain: Domain, steps: int) -> bool:
+        return self.policy.takes_differences(domain, steps)
+
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
         seed = draw_seed(generator)
         each = 1 + (domain.gradient_cost if self.policy.uses_gradient else 0)
