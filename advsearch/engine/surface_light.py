@@ -57,10 +57,10 @@ def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise
         return f"light on surfaces pays from {WORTH} pictures on"
     if policy.takes_differences(problem.domain, steps):
         return f"{policy.name} takes derivatives that need rendered pictures"
-    forced = [
-        one.name for one in problem.plan.groups if "forced" in one.reason and one.estimator not in ("none", "image")
-    ]
-    return f"the estimator of {forced[0]} is forced" if forced else plan.why_not(problem.renderer, names)
+    for group in problem.plan.groups:
+        if "forced" in group.reason and group.estimator not in ("none", "image"):
+            return f"the estimator of {group.name} is forced"
+    return plan.why_not(problem.renderer, names)
 
 
 @dataclass

@@ -11,7 +11,8 @@ import pytest
 from stand_ins import Impatient, rows, shared
 
 import advsearch
-from advsearch.api.attack import _policy, attack_once, parts_of, problem_of_parts
+from advsearch.api.attack import attack_once, parts_of, problem_of_parts
+from advsearch.attacks import make_policy
 from advsearch.config import AttackConfig
 from advsearch.engine import surface_light
 from advsearch.engine.attack_result import AttackResult
@@ -157,7 +158,9 @@ def test_a_search_for_a_viewpoint_that_renders_says_why(settings: dict[str, Any]
     """In words; nothing is measured."""
     parts = parts_of(AttackConfig(object="mug", **{**CAMERA, **settings}))
     problem, _ = problem_of_parts(parts)
-    against = surface_light.reason_against(problem, problem.steps, _policy(parts, problem), True)
+    against = surface_light.reason_against(
+        problem, problem.steps, make_policy(str(settings.get("policy", "auto"))), True
+    )
     assert reason in str(against)
 
 
