@@ -11,13 +11,14 @@ import pytest
 from stand_ins import Impatient, rows, shared
 
 import advsearch
-from advsearch.api.attack import attack_once, parts_of, problem_of_parts
 from advsearch.attacks import make_policy
 from advsearch.config import AttackConfig
 from advsearch.engine import surface_light
+from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.engine.transport import Deviation
+from advsearch.questions.attack.carry_out import attack_once
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels
