@@ -112,6 +112,10 @@ class Bank(Predictor):
         return self._wanted(0) * SPP
 
     @property
+    def drawn(self) -> bool:
+        return True
+
+    @property
     def conditions(self) -> Conditions:
         gap = self.gaps[-1] if self.gaps else None
         return Conditions(self._wanted(self._last), self._dropped, len(self.grown), gap)
@@ -158,7 +162,8 @@ class Bank(Predictor):
 
     def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
         wholes = [torch.cat([u, one.numbers]) for one in chosen]
-        return self.problem.mean_under(lambda some, at: self._pictures(chosen[some], at), wholes, u, gradient, TOGETHER)
+        found = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
+        return replace(found, predicted=True)
 
     def _pictures(self, chosen: Sequence[Condition], u: Tensor) -> Tensor:
         """Predicted pictures (N, H, W, 3) of u under conditions, with a graph."""

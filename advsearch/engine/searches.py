@@ -22,15 +22,15 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.evaluation import Query
 from advsearch.config import AttackConfig
+from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.journal import Journal
 from advsearch.engine.print_terms import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason_against, remark, varying
+from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason_against, remark
 from advsearch.report.wording import count
-from advsearch.scene.surface import plan as surface_light
 from advsearch.scene.transport.renderer import TransportTooLargeError
 
 MOST_FRAMES = 60
@@ -66,20 +66,27 @@ class Searches:
     def collect_transport(self) -> None:
         """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
         problem, steps, findings = self.problem, self.problem.steps, self.findings
-        self._renders_because(reason_against(problem, steps, self.config.specialise) or "")
-        if findings.rendered_because:
-            return
-        if problem.conditions is None:
+        matrix, surface = reason_against(problem, steps, self.config.specialise), self.against_surface_light()
+        if matrix is None and problem.conditions is None:
             self._prepare(Transport(problem, steps, clean=self.clean), "collecting light transport")
             return
-        if surface_light.why_not(problem.renderer, varying(problem)) is None:
+        if surface is None:
             light = SurfaceLight(problem, steps)
             self._prepare(light, "finding the light on surfaces")
-            findings.surface_refused = light.too_far_off or ""
-            if not findings.surface_refused:
+            surface = light.too_far_off
+            if surface is None:
                 return
-            self.stages.progress.message(f"Pictures are predicted by matrices: {findings.surface_refused}.")
-        self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
+            findings.transport, findings.surface_refused = None, surface
+            others = "rendered" if matrix else "predicted by matrices"
+            self.stages.progress.message(f"Pictures are {others}: {surface}.")
+        if matrix is None:
+            self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
+            return
+        self._renders_because(matrix if surface == surface_light.NO_CAMERA else surface)
+
+    def against_surface_light(self) -> str | None:
+        """Why light on surfaces does not predict the search, in words; None if it may."""
+        return surface_light.reason_against(self.problem, self.problem.steps, self.policy, self.config.specialise)
 
     def _prepare(self, predictor: Predictor, title: str) -> None:
         """Make what predicts pictures; where its matrix would be too large, pictures are rendered."""
@@ -149,10 +156,10 @@ class Searches:
 
         domain = self.problem.domain if domain is None else domain
         transport = self.findings.transport
-        drawn = isinstance(transport, (Bank, SurfaceLight)) and policy.uses_gradient
+        exact, drawn = (transport.exact, transport.drawn) if transport is not None else (False, False)
         found = search(
             answers,
-            replace(domain, exact=isinstance(transport, Transport), drawn=drawn),
+            replace(domain, exact=exact, drawn=drawn and policy.uses_gradient),
             policy,
             steps=steps,
             seed=seed,
@@ -170,10 +177,9 @@ class Searches:
 
     def _evaluated(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Have queries of one search answered: predicted where something predicts, and traced otherwise."""
-        transport, predicted = self.findings.transport, bool(queries) and queries[0].phase == "search"
-        answers = (
-            self.journal.traced(queries) if transport is None or not predicted else map(transport.evaluate, queries)
-        )
+        transport, traced = self.findings.transport, self.journal.traced
+        predicted = transport is not None and bool(queries) and queries[0].phase == "search"
+        answers = transport.answered(queries, traced) if transport is not None and predicted else traced(queries)
         for query, answer in zip(queries, answers, strict=True):
             printed = self.config.printable and query.kind != UNPRINTED
             yield penalised(answer, self.problem.searched_space, query.u) if printed else answer

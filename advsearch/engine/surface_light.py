@@ -1,9 +1,9 @@
-"""Searches over base colours under cameras and environments that vary by chance, by light kept on surfaces.
+"""Searches in which cameras move, by light kept on surfaces: cameras are searched, or vary by chance.
 
-Every evaluation looks through cameras that no evaluation has had before, under environments of a bank. Before the
-search, and every `EVERY` evaluations, pictures are traced beside predicted ones. Where these are further off than two
-levels, and than a rendered evaluation's own noise, the light is found anew for the present base colours; where that was
-so the time before, too, or before the search, pictures are traced from there on, or predicted by matrices instead.
+Where environments vary by chance, too, they are those of a bank. Before the search, and every `EVERY` evaluations,
+pictures are traced beside predicted ones. Where these are further off than two levels, and than a rendered evaluation's
+own noise, the light is found anew for the present base colours, if these are searched; where that was so the time
+before, too, or before the search, pictures are traced from there on, or predicted by matrices instead.
 """
 
 from __future__ import annotations
@@ -11,37 +11,62 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from functools import cached_property
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluation
+from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
 from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
-from advsearch.engine.transport import BOUND, CHECK_SPP, Conditions, Deviation, Predictor, Tick
+from advsearch.engine.transport import BOUND, Conditions, Deviation, Predictor, Tick
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.arrangement import MAP
-from advsearch.scene.surface.plan import varied
+from advsearch.scene.surface import plan
+from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
 from advsearch.scene.surface.renderer import SurfaceRenderer
 
+WORTH = 32
+"""Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones
+(`benchmarks/surface_light.py`)."""
+NO_CAMERA = "no camera moves"
+"""The reason where light on surfaces has no advantage."""
 LIGHTS = 64
 """Environments in the bank, where they vary."""
 EVERY = 100
 COMPARED = 2
 """Pictures of a comparison."""
+CHECK_SPP = 16
+"""Samples a pixel of each of the two traced pictures beside one."""
 TOGETHER = 8
 """Pictures that the model is asked about at once."""
 
 
+def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise: bool) -> str | None:
+    """Why light on surfaces does not predict a search, in words; None if it may: how far it is off is measured then."""
+    names = [one.name for one in problem.space.controls]
+    if not plan.varied(problem.renderer, names) & CAMERAS:
+        return NO_CAMERA
+    if not specialise:
+        return "nothing is left out"
+    if steps * problem.draws < WORTH:
+        return f"light on surfaces pays from {WORTH} pictures on"
+    if policy.takes_differences(problem.domain, steps):
+        return f"{policy.name} takes derivatives that need rendered pictures"
+    for group in problem.plan.groups:
+        if "forced" in group.reason and group.estimator not in ("none", "image"):
+            return f"the estimator of {group.name} is forced"
+    return plan.why_not(problem.renderer, names)
+
+
 @dataclass
 class SurfaceLight(Predictor):
-    """The light on surfaces of a run whose searches look at conditions that vary by chance.
+    """The light on surfaces of a run whose searches look through many cameras.
 
     Attributes:
         problem: what is searched.
@@ -68,8 +93,14 @@ class SurfaceLight(Predictor):
         return LIGHTS
 
     @property
-    def conditions(self) -> Conditions:
+    def conditions(self) -> Conditions | None:
+        if self.problem.conditions is None:
+            return None
         return Conditions(len(self._lights), self._renderer.dropped if self._renderer else 0, 0, None)
+
+    @property
+    def drawn(self) -> bool:
+        return self.problem.conditions is not None and self._colored
 
     @property
     def renewed(self) -> int:
@@ -86,32 +117,54 @@ class SurfaceLight(Predictor):
         return f"pictures are rendered from evaluation {self.ended} on: predicted ones were too far off"
 
     def predicted(self, kind: str, evaluations: int) -> int:
-        return evaluations if self.ended is None else min(evaluations, self.ended)
+        return evaluations if (end := self._end(kind)) is None else min(evaluations, end)
+
+    def _end(self, kind: str) -> int | None:
+        """The evaluation of a search from which on pictures are traced: the first, where an earlier search gave up."""
+        return self.ended if kind == "search" or self.ended is None else 0
 
     def size(self) -> tuple[int, int]:
         return self.renderer.entries, self.renderer.bytes
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
-        """Find the light under every environment of the bank, and see how far its pictures are off."""
+        """Find the light, under every environment of the bank, and see how far its pictures are off."""
         begun, problem = time.perf_counter(), self.problem
-        assert problem.conditions is not None
         start = problem.whole(problem.domain.start)
         self._renderer = SurfaceRenderer(problem.renderer, start, seeds.stream(problem.seed, "surface light"))
-        self._conditions = replace(problem.space, controls=problem.space.controls[problem.searched :])
-        names = [one.name for one in self._conditions.controls]
-        of_light = [name for name in names if MAP in varied(problem.renderer, [name])]
-        self._of_light = torch.zeros(len(problem.conditions.start), dtype=torch.bool)
-        for group in self._conditions.groups:
-            if group.control in of_light:
-                self._of_light[group.coordinates] = True
-        seed = seeds.stream(problem.seed, "bank")
-        self._lights = [stratified(problem.conditions, number, seed) for number in range(LIGHTS if of_light else 1)]
+        self._lights = [start[problem.domain.dim :]]
+        if problem.conditions is not None:
+            seed, count = seeds.stream(problem.seed, "bank"), LIGHTS if bool(self._of_light.any()) else 1
+            self._lights = [stratified(problem.conditions, number, seed) for number in range(count)]
         with torch.no_grad():
             for numbers in self._lights:
-                self.renderer.light(self._inputs(numbers))
+                self.renderer.light(self._inputs(torch.cat([problem.domain.start, numbers])))
                 tick(LIGHTS // len(self._lights))
         self.seconds += time.perf_counter() - begun
         self._compare(problem.domain.start, 0)
+
+    @cached_property
+    def _moving(self) -> Tensor:
+        """(d,) which numbers of u are those of cameras and environments."""
+        return self._changing(CAMERAS | {MAP})[: self.problem.domain.dim]
+
+    @cached_property
+    def _colored(self) -> bool:
+        """Whether the object's base colour is searched."""
+        return bool(self._changing(frozenset({COLOR}))[: self.problem.domain.dim].any())
+
+    @cached_property
+    def _of_light(self) -> Tensor:
+        """(k,) which numbers of the conditions are those of environments."""
+        return self._changing(frozenset({MAP}))[self.problem.domain.dim :]
+
+    def _changing(self, inputs: frozenset[str]) -> Tensor:
+        """Which numbers of the whole space belong to controls that change some inputs of the scene."""
+        space = self.problem.space
+        found = torch.zeros(len(space.start), dtype=torch.bool)
+        names = {one.name for one in space.controls if inputs & plan.varied(self.problem.renderer, [one.name])}
+        for group in space.groups:
+            found[group.coordinates] = group.control in names
+        return found
 
     @property
     def renderer(self) -> SurfaceRenderer:
@@ -132,14 +185,23 @@ class SurfaceLight(Predictor):
     def passed(self, query: Query) -> None:
         self._come_to(query)
 
+    def answered(self, queries: Sequence[Query], traced: Evaluate) -> Iterator[Evaluation]:
+        """Answer queries of one search, by what else answers them from the first that is not predicted."""
+        for place, query in enumerate(queries):
+            self._come_to(query)
+            end = self._end(query.kind)
+            differences = query.gradient is True and self.problem.domain.gradient_cost > 0
+            if differences or (end is not None and query.number >= end):
+                yield from traced(queries[place:])
+                return
+            yield self.evaluate(query)
+
     def evaluate(self, query: Query) -> Evaluation:
-        self._come_to(query)
-        if self.ended is not None and query.number >= self.ended:
-            return self.problem.evaluate(query)
-        wholes = [torch.cat([query.u, numbers]) for numbers in self._drawn(query)]
+        wholes = [torch.cat([query.u, numbers]) for numbers in self._drawn(query, self.problem.draws)]
         answer = self.problem.mean_under(
             lambda some, at: self._pictures(wholes[some], at), wholes, query.u, query.gradient, TOGETHER
         )
+        answer = replace(answer, cost=query.samples, predicted=True)
         if not query.keep:
             return answer
         with torch.no_grad():
@@ -147,26 +209,27 @@ class SurfaceLight(Predictor):
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 
-    def _drawn(self, query: Query) -> list[Tensor]:
+    def _drawn(self, query: Query, count: int) -> list[Tensor]:
         """The conditions of an evaluation: fresh cameras under environments of the bank."""
-        problem, count = self.problem, self.problem.draws
-        assert problem.conditions is not None
+        problem = self.problem
+        if problem.conditions is None:
+            return self._lights * count
         generator = torch.Generator().manual_seed(seeds.stream(problem.seed, f"surface {query.kind}", query.number))
         order = torch.randint(len(self._lights), (count,), generator=generator).tolist()
         fresh = problem.conditions.sample(generator, count)
         lights = [self._lights[number] for number in order]
         return [torch.where(self._of_light, *both) for both in zip(lights, fresh, strict=True)]
 
-    def _inputs(self, numbers: Tensor) -> dict[str, Tensor]:
-        """What conditions set in the scene."""
+    def _inputs(self, whole: Tensor) -> dict[str, Tensor]:
+        """What a configuration of the whole space sets in the scene."""
         with torch.no_grad():
-            return self.problem.renderer.scene.assembly(self._conditions.inputs(numbers))
+            return self.problem.renderer.scene.assembly(self.problem.space.inputs(whole))
 
     def _pictures(self, wholes: Sequence[Tensor], u: Tensor) -> Tensor:
         """Predicted pictures (n, H, W, 3) of u under conditions, with a graph."""
-        own = self.problem.searched_space.inputs(u)
-        given = [self._inputs(whole[len(u) :]) for whole in wholes]
-        return self.renderer.pictures(given, self.renderer.color(own), [torch.cat([u, w[len(u) :]]) for w in wholes])
+        color = self.renderer.color(self.problem.searched_space.inputs(u))
+        places = [torch.cat([u, whole[len(u) :]]) for whole in wholes]
+        return self.renderer.pictures([self._inputs(one) for one in wholes], color, places)
 
     # ---- comparisons ------------------------------------------------------------------------------------------------
 
@@ -179,8 +242,9 @@ class SurfaceLight(Predictor):
             found = self._compare(query.u, query.number)
             if found.levels <= found.most:
                 return
-            if before.levels > before.most and self.renewals and self.renewals[-1] == query.number - EVERY:
+            if before.levels > before.most:
                 self.ended = query.number
+            if self.ended is not None or not self._colored:
                 return
             begun = time.perf_counter()
             self.renderer.renew(self.problem.whole(query.u))
@@ -192,18 +256,21 @@ class SurfaceLight(Predictor):
         problem, renderer = self.problem, self.problem.renderer
         with torch.no_grad():
             predicted, rendered = self.renderer(whole), renderer(whole, seeds.stream(seed, "rendered"), problem.spp)
-            shown = renderer(whole, seeds.stream(seed, "shown"), CHECK_SPP)
         off, good = levels_off(renderer, (predicted, rendered), whole, seed, CHECK_SPP)
-        values = [problem.judge(one, whole).objective or 0.0 for one in (predicted, shown)]
-        return Deviation(off, values[0] - values[1], max(BOUND, good), pictures=4)
+        values = [problem.judge(one, whole).objective or 0.0 for one in (predicted, rendered)]
+        return Deviation(off, values[0] - values[1], max(BOUND, good), pictures=3)
 
     def _compare(self, u: Tensor, index: int) -> Deviation:
-        """Compare predicted pictures with traced ones under conditions, and keep what was found."""
+        """Compare predicted pictures with traced ones, and keep what was found. The first is that of u; in the others,
+        searched cameras and environments are anywhere."""
         begun, problem = time.perf_counter(), self.problem
         query = Query(u, 0, kind="surface check", number=index)
-        wholes = [torch.cat([u, one]) for one in self._drawn(query)[:COMPARED]]
-        found = [self._deviation(whole, seeds.stream(problem.seed, query.kind, index)) for whole in wholes]
-        self.deviations.append(over_all(found))
+        seed = seeds.stream(problem.seed, query.kind, index)
+        elsewhere = problem.domain.sample(torch.Generator().manual_seed(seed), COMPARED)
+        places = torch.where(self._moving, elsewhere, u)
+        places[0] = u
+        wholes = [torch.cat(both) for both in zip(places, self._drawn(query, COMPARED), strict=True)]
+        self.deviations.append(over_all([self._deviation(whole, seed) for whole in wholes]))
         self.seconds += time.perf_counter() - begun
         return self.deviations[-1]
 

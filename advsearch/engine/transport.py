@@ -11,15 +11,15 @@ import math
 import statistics
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluation
+from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.engine.problem import Problem
 from advsearch.scene.formation import to_8_bit
@@ -134,6 +134,14 @@ class Predictor(ABC):
     deviations: list[Deviation]
     seconds: float
 
+    exact: ClassVar[bool] = False
+    """Whether equal configurations have equal objectives."""
+
+    @property
+    def drawn(self) -> bool:
+        """Whether the search climbs under conditions that each evaluation draws anew; see `Domain.drawn`."""
+        return False
+
     @property
     @abstractmethod
     def samples(self) -> int:
@@ -150,6 +158,10 @@ class Predictor(ABC):
     @abstractmethod
     def evaluate(self, query: Query) -> Evaluation:
         """Answer one query of the search itself."""
+
+    def answered(self, queries: Sequence[Query], traced: Evaluate) -> Iterator[Evaluation]:
+        """Answer queries of a search itself, each when it is asked for; `traced` answers what is not predicted."""
+        return map(self.evaluate, queries)
 
     @abstractmethod
     def size(self) -> tuple[int, int]:
@@ -218,6 +230,7 @@ class Transport(Predictor):
         seconds: spent on making matrices and on comparing.
     """
 
+    exact: ClassVar[bool] = True
     problem: Problem
     steps: int
     renewals: dict[str, list[int]] = field(default_factory=dict)
@@ -294,7 +307,7 @@ class Transport(Predictor):
         renderer = self._compared(query)
         if renderer is None:
             return self.problem.evaluate(query)
-        return self.problem.evaluated(query, query.u, query.seed, renderer)[0]
+        return replace(self.problem.evaluated(query, query.u, query.seed, renderer)[0], predicted=True)
 
     def likely(self, u: Tensor) -> bool:
         """Whether the picture that is predicted from the start would pass its trials, as far as those of the last

@@ -45,7 +45,7 @@ class Row:
         kind: what it was evaluated for: ``"search"``, ``"baseline"``, ``"verification"``, ``"control"``.
         step: step of the search or number of the trial, from 0.
         seed: of the render.
-        spp: samples per pixel of the render.
+        spp: samples per pixel of the render; None of a search where the picture was predicted.
         objective: what is maximised, of this picture; stored as None when it is not a number, or nothing is maximised.
         score: what the run's task says of the answer: over 0 where it is what is sought; stored as None when it is not
             a number.
@@ -59,7 +59,7 @@ class Row:
         payload: what the run's task keeps of the answer beside its words, as JSON values; None where there is nothing.
         values: parameter to ``{"value": ..., "unit": ...}``.
         seconds: that the evaluation took.
-        renders: pictures that it took; None where that was not counted.
+        renders: pictures that it took; 0 where they were predicted, None where that was not counted.
         phase: of a search: ``"search"``, or ``"ranking"`` where a candidate was rendered again at the end; None of
             trials, and in rows of older runs.
         metrics: numbers that the run's metrics say of the picture, by name; None where one is not a number.

@@ -8,13 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stand_ins import Impatient, rows
+from stand_ins import Impatient, rows, shared
 
 import advsearch
+from advsearch.attacks import make_policy
+from advsearch.config import AttackConfig
 from advsearch.engine import surface_light
+from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.engine.transport import Deviation
+from advsearch.questions.attack.carry_out import attack_once
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels
 
 SMALL: dict[str, Any] = {
@@ -94,3 +100,73 @@ def test_matrices_predict_what_light_on_surfaces_cannot(monkeypatch: pytest.Monk
     off(monkeypatch, 9.0)
     told = advsearch.attack("mug", **{**SMALL, "steps": 16}).summary.transport
     assert told is not None and told.way == "matrix" and "9.0 levels of 255 off" in str(told.reason)
+
+
+CAMERA: dict[str, Any] = SMALL | {"controls": "camera", "over": (), "draws": None, "steps": 40, "baseline": True}
+
+
+@pytest.fixture(scope="module")
+def viewpoints(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AttackResult]:
+    """A search for a camera that nobody disturbed, and its result."""
+    run = tmp_path_factory.mktemp("viewpoints") / "run"
+    return run, advsearch.attack("mug", run=run, **CAMERA)
+
+
+def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoints: tuple[Path, AttackResult]) -> None:
+    """Two searches of 40 pictures, eight traced ones of each ranking; seven comparisons of two places. Rows say which
+    pictures were traced."""
+    told, renders = viewpoints[1].summary.transport, viewpoints[1].summary.renders
+    assert told is not None and (told.way, told.reason, told.conditions) == ("surface light", None, None)
+    assert (renders["products"], renders["baseline"]) == (80, 8)
+    assert renders["search"] == 8 + 7 * surface_light.COMPARED * 3
+    with Store(viewpoints[0] / STORE, read_only=True) as store:
+        spp = {(row.phase, row.spp, row.renders) for kind in ("search", "baseline") for row in store.rows(kind)}
+    assert spp == {("search", None, 0), ("ranking", 8, 1)}
+
+
+def test_a_search_for_a_viewpoint_goes_on_with_the_same_rows(
+    viewpoints: tuple[Path, AttackResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the middle of pictures that were asked for at once; and with workers, who trace."""
+    ready = shared(monkeypatch, {"object": "mug", **CAMERA})
+    folder = tmp_path / "parts"
+    config = AttackConfig(**CAMERA, object="mug", workers=2, run=str(folder))
+    stopped = attack_once(config, progress=Impatient(9))
+    assert stopped.summary.ending == "interrupted"
+    attack_once(config, resumed=folder)
+    assert ready.given and rows(folder) == rows(viewpoints[0])
+
+
+def test_a_viewpoint_is_rendered_once_predictions_are_too_far_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After two comparisons in a row: nothing is to be found anew. The random search is rendered, too."""
+    off(monkeypatch, 1.0, 9.0, 9.0)
+    summary = advsearch.attack("mug", **CAMERA).summary
+    assert summary.transport is not None and summary.transport.renewed == 0
+    assert "from evaluation 12 on" in str(summary.transport.reason)
+    assert (summary.renders["products"], summary.renders["baseline"]) == (12, 48)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"policy": "pgd"}, "pgd takes derivatives"),
+        ({"steps": 31}, "pays from 32"),
+        ({"controls": ["camera", "pose"]}, "object.vertices"),
+        ({"estimators": {"camera": "differences"}}, "forced"),
+    ],
+)
+def test_a_search_for_a_viewpoint_that_renders_says_why(settings: dict[str, Any], reason: str) -> None:
+    """In words; nothing is measured."""
+    parts = parts_of(AttackConfig(object="mug", **{**CAMERA, **settings}))
+    problem, _ = problem_of_parts(parts)
+    against = surface_light.reason_against(
+        problem, problem.steps, make_policy(str(settings.get("policy", "auto"))), True
+    )
+    assert reason in str(against)
+
+
+def test_a_texture_and_its_viewpoint_are_searched_together() -> None:
+    """The derivative of the texture is predicted, too; the camera is found without one."""
+    summary = advsearch.attack("mug", **CAMERA | {"controls": {"texture": {"resolution": 8}, "camera": {}}}).summary
+    assert summary.transport is not None and summary.transport.way == "surface light"
+    assert (summary.renders["products"], summary.renders["gradient"]) == (80, 0)

@@ -172,6 +172,10 @@ class Auto(Policy[AutoState]):
             return replace(state, ascent=ascent, last=evaluation.objective)
         return replace(state, seen=state.seen.extended(evaluated))
 
+    def takes_differences(self, domain: Domain, steps: int) -> bool:
+        plan = make_plan(domain, box_coordinates(domain), steps)
+        return domain.gradient_cost > 0 and plan.until < steps and plan.gradient is True
+
     def counts(self, state: AutoState) -> Counts:
         return NO_COUNTS if state.ascent is None else _pgd(state.domain).counts(state.ascent)
 

@@ -127,6 +127,10 @@ class Policy(ABC, Generic[State]):
         with another seed gives another value, and a maximum over many is biased upwards.
         """
 
+    def takes_differences(self, domain: Domain, steps: int) -> bool:
+        """Return whether, in `steps` renders, it may ask for gradients of a domain that cost renders."""
+        return self.uses_gradient and domain.gradient_cost > 0
+
     def counts(self, state: State) -> Counts:
         """Return what the policy did about the evaluations so far; nothing where it takes them as they come."""
         return NO_COUNTS

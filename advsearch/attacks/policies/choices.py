@@ -83,6 +83,9 @@ class Choices(Policy[ChoicesState]):
     def uses_gradient(self) -> bool:
         return self.policy.uses_gradient
 
+    def takes_differences(self, domain: Domain, steps: int) -> bool:
+        return self.policy.takes_differences(domain, steps)
+
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ChoicesState:
         seed = draw_seed(generator)
         discrete = torch.cat([torch.full((block.size,), block.options > 0) for block in domain.blocks])

@@ -91,6 +91,9 @@ class Portfolio(Raced):
     def uses_gradient(self) -> bool:
         return any(policy.uses_gradient for policy in self.policies)
 
+    def takes_differences(self, domain: Domain, steps: int) -> bool:
+        return any(policy.takes_differences(domain, steps) for policy in self.policies)
+
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
         seed = draw_seed(generator)
         searches, errors = [], []
