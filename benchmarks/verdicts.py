@@ -4,14 +4,16 @@
 
 *Before* is how verdicts were taken at first: samples until the margin moves by less than half of itself, and then 20
 trials of which 19 have to succeed. *Now* samples stop where more of them leave the margin on its side, and trials
-stop with the verdict. Four tables:
+stop with the verdict. Five tables:
 
 - trials: how often a rate is found, exactly, and how many trials it takes; how often intervals cover the rate;
+- trials over many conditions: the same, where 200 were tried before;
 - sample counts: how often a margin passes for settled on the wrong side, where noise lifts it over zero;
 - close calls, drawn: how often what is `found` before and now, and the samples that both take;
 - close calls, rendered: searches at several epsilons; for each both verdicts, pictures x samples, and CPU seconds.
 
-Exits with 1 where an interval covers too seldom, a rate of 75 % is found more often than before, a margin passes on the
+Exits with 1 where an interval covers too seldom, a rate of 75 % is found more often than before, one of 85 % over
+conditions in more than 3.3 %, a margin passes on the
 wrong side in more than 5 % of all cases, or noise aside (two standard errors) more is found at a limit that is none.
 """
 
@@ -26,6 +28,7 @@ from functools import partial
 from itertools import product
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from scipy import stats
 from scipy.special import stdtrit
@@ -46,16 +49,27 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.evaluation import Evaluate
 from advsearch.attacks.sample_count import LADDER, MarginsOf, margins_of
-from advsearch.attacks.trials import clopper_pearson
-from advsearch.attacks.verification import TRIAL_LOOKS, WORST_CASE
+from advsearch.attacks.trials import Trials, clopper_pearson
+from advsearch.attacks.verification import (
+    OVER_CONDITIONS,
+    OVER_CONFIDENCE,
+    OVER_LOOKS,
+    TRIAL_LOOKS,
+    WORST_CASE,
+)
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import problem_from_config
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Judgement
 
+Array = npt.NDArray[np.float64]
+
 RATES = (0.5, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 0.97, 0.99, 1.0)
 WEAK = 0.75
 """The rate at which the interval of 19 of 20 begins."""
+OVER_RATES = (0.5, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 1.0)
+WEAK_OVER = 0.85
+"""The rate at which the interval of 180 of 200 begins."""
 CALLS = (-0.5, -0.1, 0.0, 0.1, 0.25, 0.5, 1.0, 3.0)
 """Margins of the answer without noise; over 0 is a success."""
 
@@ -110,6 +124,57 @@ def rule_table() -> int:
     least = min(coverage(rate) for rate in np.linspace(0.005, 0.995, 199))
     print(f"intervals cover the rate in {100 * least:.1f} % of all cases at least\n")
     return int(least < 0.95) + int(found(WEAK) > found_before(WEAK))
+
+
+# ---- over conditions, exactly
+
+
+def over_outcomes(rates: Array, counting: int) -> dict[tuple[int, int], tuple[Array, bool]]:
+    """Return how often trials over conditions end with (successes, trials) for rates (n,), and whether that is found;
+    of `OVER_LOOKS[-1]` trials so many count."""
+    last, lost = min(counting, OVER_LOOKS[-1]), OVER_CONDITIONS.allowed(OVER_LOOKS[-1])
+    failing, ended = {0: np.ones_like(rates)}, dict[tuple[int, int], tuple[Array, bool]]()
+    for n in range(1, last + 1):
+        went = {
+            failures: failing.get(failures, 0.0) * rates + failing.get(failures - 1, 0.0) * (1.0 - rates)
+            for failures in range(max(failing) + 2)
+        }
+        failing = {}
+        for failures, chance in went.items():
+            early = n in OVER_LOOKS and n < last
+            found = (early or n == last) and n - failures >= OVER_CONDITIONS.needed(n, early=early)
+            if found or n == last or failures > lost:
+                ended[n - failures, n] = chance, found
+            else:
+                failing[failures] = chance
+        if not failing:
+            break
+    return ended
+
+
+def over_coverage(rates: Array, counting: int) -> Array:
+    """Return how often the interval that is printed covers rates (n,)."""
+    covered = np.zeros_like(rates)
+    for (successes, trials), (chance, _) in over_outcomes(rates, counting).items():
+        low, high = Trials(successes, trials, 1, OVER_CONFIDENCE).interval
+        covered += chance * ((low <= rates) & (rates <= high))
+    return covered
+
+
+def over_table() -> int:
+    """Print how the rule over conditions does; return how many things are wrong with it."""
+    print("| rate | found by 200, % | now, % | trials before | now |\n| --- | --- | --- | --- | --- |")
+    rates = np.array(OVER_RATES)
+    ends = over_outcomes(rates, OVER_LOOKS[-1])
+    chances = sum(chance for chance, found in ends.values() if found)
+    trials = sum(chance * n for (_, n), (chance, _) in ends.items())
+    for rate, chance, count in zip(rates, chances, trials, strict=True):
+        before = stats.binom.sf(OVER_CONDITIONS.needed(200) - 1, 200, rate)
+        print(f"| {rate:.2f} | {100 * before:.2f} | {100 * chance:.2f} | 200 | {count:.0f} |")
+    fine = np.linspace(0.001, 0.999, 999)
+    least = min(float(over_coverage(fine, counting).min()) for counting in range(1, OVER_LOOKS[-1] + 1))
+    print(f"intervals cover the rate in {100 * least:.1f} % of all cases at least, however many conditions count\n")
+    return int(least < 0.95) + int(chances[OVER_RATES.index(WEAK_OVER)] > 0.033)
 
 
 # ---- the sample count
@@ -289,7 +354,7 @@ def main() -> int:
     parser.add_argument("--label")
     args = parser.parse_args()
     threads.configure(None)
-    wrong = rule_table() + sample_table(args.runs) + drawn_table(args.runs)
+    wrong = rule_table() + over_table() + sample_table(args.runs) + drawn_table(args.runs)
     given = {name: getattr(args, name) for name in ("object", "environment", "model", "labels", "label")}
     given = {name: value for name, value in given.items() if value is not None}
     size = (args.resolution, args.resolution)

@@ -117,11 +117,13 @@ class Trials:
         successes: from 0 to `trials`.
         trials: at least 1.
         spp: samples per pixel of every trial.
+        confidence: of the Clopper-Pearson interval; larger than 95 % where trials might have ended at several looks.
     """
 
     successes: int
     trials: int
     spp: int
+    confidence: float = CONFIDENCE
 
     @property
     def rate(self) -> float:
@@ -130,8 +132,8 @@ class Trials:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % Clopper-Pearson interval of the rate."""
-        return clopper_pearson(self.successes, self.trials)
+        """Interval that covers the rate in 95 % of all cases, by Clopper and Pearson."""
+        return clopper_pearson(self.successes, self.trials, self.confidence)
 
 
 def trial_seed(seed: int, number: int) -> int:

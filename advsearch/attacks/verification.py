@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluate, Query
-from advsearch.attacks.trials import Trials, clopper_pearson, trial_seed
+from advsearch.attacks.trials import CONFIDENCE, Trials, clopper_pearson, trial_seed
 from advsearch.errors import InputError
 from advsearch.tasks import Judgement
 
@@ -64,6 +64,16 @@ TRIAL_LOOKS = 14, 23
 What holds in 75 % or less is found in 2.4 % of all cases at most, as by 19 of 20, and the interval of what is found
 begins at 77 %, by 19 of 20 at 75 %. `benchmarks/verdicts.py` has both exactly."""
 
+EARLY_PERCENT = 97
+OVER_LOOKS = 30, 60, 100, 200
+"""Trials over many conditions after which a verdict may stand, where nobody asked for a number: of those that count at
+all but the last, where `EARLY_PERCENT` must succeed (30 of 30, 59 of 60, 97 of 100), and of all at the last.
+
+What holds in 85 % or less is found in 3.3 % of all cases at most, and in 2.6 % by 180 of 200 alone."""
+OVER_CONFIDENCE = 0.97
+"""Confidence of a Clopper-Pearson interval after `OVER_LOOKS`, so that it covers the rate in 95 % of all cases
+(`benchmarks/verdicts.py`): somebody who looks four times is lucky more often than somebody who looks once."""
+
 LEAST_RATE = 0.5
 """Where the 95 % interval of a claim's rate may begin: what is called found holds more often than not. So 6 trials are
 the fewest that can verify anything (54 to 100 %); 5 of 5 begin at 48 %."""
@@ -84,9 +94,12 @@ class Rule:
     control: bool = True
     conditional: bool = False
 
-    def needed(self, trials: int) -> int:
-        """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`."""
-        return max(self.share(trials), self.fewest)
+    def needed(self, trials: int, *, early: bool = False) -> int:
+        """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`.
+
+        Of conditions, `early` asks for `EARLY_PERCENT`: more of them could follow."""
+        share = -(-EARLY_PERCENT * trials // 100) if early and self.conditional else self.share(trials)
+        return max(share, self.fewest)
 
     def allowed(self, trials: int) -> int:
         """Return how many of `trials` may fail."""
@@ -268,7 +281,7 @@ def verify(
     See `Rule` for what counts as a success, and for the ending. KeyboardInterrupt passes through.
 
     Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the first at which the answer is
-    found.
+    found. Over conditions, those that count are looked at (`OVER_LOOKS`), and the last look is at all.
 
     Curtailed trials end with the first failure that is one more than the rule allows of all of them. The verdict is
     that of all trials, whatever the rest would have said, and the Clopper-Pearson interval of those that were made
@@ -313,25 +326,44 @@ def verify(
         allowed = rule.allowed(rule.counted(beside) if len(looks) == 1 else looks[-1])
         return len(made) >= least and tried(made).count(False) > allowed
 
-    for count in looks:
-        missing = run_trials(evaluate, domain.start, spp=spp, seed=seed, trials=count, first=len(beside), kind=control)
-        beside += missing
+    def clean_until(counted: int) -> int:
+        """Try the clean configuration until so many trials count, or all are made; return how many that takes."""
+        nonlocal renders
+        count = counted
+        while True:
+            missing = run_trials(
+                evaluate, domain.start, spp=spp, seed=seed, trials=count, first=len(beside), kind=control
+            )
+            beside.extend(missing)
+            renders += len(missing)
+            short = counted - rule.counted(beside[:count])
+            if short <= 0 or count == looks[-1]:
+                return count
+            count = min(count + short, looks[-1])
+
+    for look in looks:
+        count = clean_until(look)
         until = lost if curtailed or len(looks) > 1 else None
         made = run_trials(
             evaluate, u, spp=spp, seed=seed, trials=count, first=len(done), kind=kind, keep=keep, until=until
         )
-        done, renders = [*done, *made], renders + len(missing) + len(made)
-        if len(done) < count or lost(()) or tried(done).count(True) >= rule.needed(count):
+        done, renders = [*done, *made], renders + len(made)
+        early = count < looks[-1]
+        needed = rule.needed(rule.counted(beside[:count]), early=early)
+        enough = tried(done).count(True) >= needed and not rule.already_wrong(count_right(beside[:count], spp))
+        if len(done) < count or lost(()) or enough or not early:
             break
     outcomes = tried(done)
     right = count_right(beside, spp)
     counted = max(1, len(outcomes) - outcomes.count(None))
     successes = outcomes.count(True)
-    verified = Trials(successes, counted, spp)
+    confidence = OVER_CONFIDENCE if rule.conditional and len(looks) > 1 else CONFIDENCE
+    verified = Trials(successes, counted, spp, confidence)
     ending = rule.verdict(claim, right, verified)
     reason = (
-        f"{ending.explanation} A success in {successes} of {counted} trials, {rule.needed(counted)} are needed; clean "
-        f"right in {right.successes} of {right.trials}."
+        f"{ending.explanation} A success in {successes} of {counted} trials, "
+        f"{rule.needed(counted, early=enough and early)} are needed; clean right in {right.successes} of "
+        f"{right.trials}."
     )
     stopped = "asked for" if len(looks) == 1 and len(done) == looks[0] else "decided"
     return Verification(ending, reason, u, right, verified, tuple(beside), tuple(done), renders, stopped, outcomes)

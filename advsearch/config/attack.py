@@ -20,9 +20,10 @@ TRIALS, TRIALS_OVER = 20, 200
 STEPS = 40
 """Of a search about one picture."""
 
-OVER_PREDICTED, OVER_RENDERED, OVER_NUMBERS = (400, 8), (150, 4), (STEPS, 4)
+OVER_PREDICTED, OVER_ONE, OVER_RENDERED, OVER_NUMBERS = (400, 8), (100, 4), (150, 4), (STEPS, 4)
 """Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
-pictures (`benchmarks/bank.py`), where each is rendered, and where only a few numbers are searched (a pose)."""
+pictures (`benchmarks/bank.py`), where that is so and conditions are one number (docs/drives.md), where each is
+rendered, and where only a few numbers are searched (a pose)."""
 
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
@@ -112,7 +113,7 @@ class AttackConfig(DerivativeConfig):
     steps: int | None = setting(
         None, "search", "number of search steps, each of which evaluates one configuration",
         otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} where pictures are predicted, "
-        f"{OVER_RENDERED[0]} where they are rendered",
+        f"{OVER_ONE[0]} where one number varies, as along a path, and {OVER_RENDERED[0]} where they are rendered",
         ge=1, le=1_000_000,
     )
     seconds: float | None = setting(
@@ -158,7 +159,8 @@ class AttackConfig(DerivativeConfig):
     )
     draws: int | None = setting(
         None, "search", "how many random conditions each step looks at, with --over",
-        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted, otherwise {OVER_RENDERED[1]}", ge=1, le=1000,
+        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted and more than one number varies, otherwise "
+        f"{OVER_RENDERED[1]}", ge=1, le=1000,
     )
     average: int = setting(
         0, "search", "also evaluate this many random configurations, to tell how often the model is wrong on average",
@@ -176,8 +178,8 @@ class AttackConfig(DerivativeConfig):
     trials: int | None = setting(
         None, "verification", "fresh renders that verify the answer, and as many of the clean scene",
         f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be called found)",
-        otherwise=f"14, or 23 where one fails; {TRIALS_OVER} with --over, {TRIALS} with --smallest", unit="renders",
-        ge=FEWEST_TRIALS, le=100_000,
+        otherwise=f"14, or 23 where one fails; with --over 30, or up to {TRIALS_OVER} where some fail; {TRIALS} with "
+        "--smallest", unit="renders", ge=FEWEST_TRIALS, le=100_000,
     )
 
     workers: int | None = setting(

@@ -21,7 +21,7 @@ from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, SceneConfig
-from advsearch.config.attack import OVER_NUMBERS, OVER_PREDICTED, OVER_RENDERED, STEPS
+from advsearch.config.attack import OVER_NUMBERS, OVER_ONE, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
@@ -292,9 +292,10 @@ def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
     one picture, or for many conditions: predicted, rendered, or rendered where only a few numbers are searched."""
     if problem.conditions is None:
         return config.steps or STEPS, 1
-    predicted = reason_against(problem, config.steps or OVER_PREDICTED[0], config.specialise) is None
+    usual = OVER_ONE if problem.conditions.dim == 1 else OVER_PREDICTED
+    predicted = reason_against(problem, config.steps or usual[0], config.specialise) is None
     balls = any(block.norm != "box" for block in problem.domain.blocks)
-    steps, draws = OVER_PREDICTED if predicted else OVER_RENDERED if balls else OVER_NUMBERS
+    steps, draws = usual if predicted else OVER_RENDERED if balls else OVER_NUMBERS
     return config.steps or steps, config.draws or draws
 
 

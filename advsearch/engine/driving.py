@@ -65,8 +65,9 @@ def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory
             whole[: len(at)] = at
             with torch.no_grad():
                 picture = to_8_bit(problem.renderer(whole, seed=seeds.stream(problem.seed, "drive", number), spp=spp))
-            counts[name] += problem.judge(picture, whole).right
-            pictures.append(np.asarray(marked(picture.numpy(), problem.marks(picture, whole)), dtype=np.float32))
+            right, marks = problem.seen(picture, whole)
+            counts[name] += right
+            pictures.append(np.asarray(marked(picture.numpy(), marks), dtype=np.float32))
         if run is not None:
             write_drive(run, name, pictures, seconds)
     return AnswerAlongDrive(

@@ -22,6 +22,7 @@ from advsearch.engine.answers import Described, Looked
 from advsearch.engine.asked import Asked
 from advsearch.engine.domains import domain_of
 from advsearch.engine.metrics import Metrics, judgements, mean_metrics
+from advsearch.engine.truths import KnownTruths
 from advsearch.models import Model
 from advsearch.runs.results.derivatives import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
@@ -99,7 +100,8 @@ class Problem:
 
     def __post_init__(self) -> None:
         self.plan = self.renderer.plan
-        self._start_truth = self.task.truth(self._facts(self.whole(self.domain.start)))
+        self._truths = KnownTruths(self.task, self.space, self.renderer, self.facts)
+        self._start_truth = self._truths.at(self.whole(self.domain.start))
 
     @property
     def plan(self) -> GradientPlan:
@@ -191,21 +193,22 @@ class Problem:
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
         """Return what shows the model's answer to a picture (H, W, 3) of the whole space at `whole`."""
+        return self.seen(picture, whole)[1]
+
+    def seen(self, picture: Tensor, whole: Tensor) -> tuple[bool, list[Mark]]:
+        """Return whether the model's answer to a picture (H, W, 3) of the whole space at `whole` is right, and what
+        shows it."""
         with torch.no_grad():
-            return self.task.marks(self.model(picture), self.truth(whole))[0]
+            output, truth = self.model(picture), self.truth(whole)
+            return self.task.judge(output, truth)[0].right, self.task.marks(output, truth)[0]
 
     def truth(self, whole: Tensor | None = None) -> Truth:
         """Return what is true of the scene at a configuration of the whole space; None for the start."""
-        if whole is None or not self.task.varies:
-            return self._start_truth
-        return self.task.truth(self._facts(whole))
+        return self._start_truth if whole is None or not self.task.varies else self._truths.at(whole)
 
     def asked(self, *wholes: Tensor) -> Asked:
         """Return what gives the objective more than pictures, at configurations of the whole space."""
         return Asked(self.space, self.searched_space, wholes)
-
-    def _facts(self, whole: Tensor) -> Facts:
-        return self.facts(lambda: self.space.describe(whole), lambda: self.renderer.surfaces(whole))
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
         """Say a configuration of the searched controls in named values with units, under the conditions of a draw.

@@ -13,7 +13,7 @@ from advsearch import seeds
 from advsearch.attacks import Ending, Evaluation, Policy, SearchResult, Verification, count_right, run_trials
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.smallest import scaled
-from advsearch.attacks.verification import TRIAL_LOOKS
+from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
 from advsearch.config import AttackConfig
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
 from advsearch.engine.failures import check_failures
@@ -61,8 +61,9 @@ class Attack:
         self.problem = self.journal.problem
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
         ladder = ladder_of(self.config)
-        unasked = self.config.trials is None and not self.config.over
-        looks = TRIAL_LOOKS if unasked and not self.config.smallest else (self.config.trial_count,)
+        asked = self.config.trials is not None or self.config.smallest
+        unasked = TRIAL_LOOKS if self.problem.conditions is None else OVER_LOOKS
+        looks = (self.config.trial_count,) if asked else unasked
         self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, looks)
         kept = (self.stages, self.findings, self.clean)
         self._searches = Searches(self.journal, self.config, self.policy, *kept)

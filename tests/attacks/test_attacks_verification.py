@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import runpy
 from collections.abc import Iterator, Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,13 +30,23 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.sample_count import LOOKS, MarginsOf, most_samples
 from advsearch.attacks.trials import paired_difference
-from advsearch.attacks.verification import EASIER, LEAST_RATE, OVER_CONDITIONS, TRIAL_LOOKS, WORST_CASE, Rule
+from advsearch.attacks.verification import (
+    EASIER,
+    LEAST_RATE,
+    OVER_CONDITIONS,
+    OVER_LOOKS,
+    TRIAL_LOOKS,
+    WORST_CASE,
+    Rule,
+)
 from advsearch.config import FEWEST_TRIALS
 from advsearch.errors import InputError
 from advsearch.questions.region.growing import GrownBox
 from advsearch.questions.region.settings import FEWEST_SAMPLES
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Judgement
+
+STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "verdicts.py"
 
 DOMAIN = Domain(torch.full((4,), 0.5), (Block(4, "linf", 0.1),))
 WORST = DOMAIN.start + 0.1
@@ -464,6 +476,52 @@ def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[
     assert (found.ending, found.stopped) == (ending, "decided")
     clean = 23 if made[1] > 14 else 14
     assert (len(found.clean_trials), found.renders) == (clean, clean + made[1])
+
+
+@pytest.mark.parametrize(
+    ("told", "made", "clean", "ending"),
+    [
+        ("1" * 200, (30, 30), 30, Ending.FOUND),
+        ("-1" * 100, (30, 30), 60, Ending.FOUND),
+        ("0" + "1" * 199, (59, 60), 60, Ending.FOUND),
+        ("000" + "1" * 197, (97, 100), 100, Ending.FOUND),
+        ("0000" + "1" * 196, (196, 200), 200, Ending.FOUND),
+        ("-000" + "1" * 197, (97, 100), 101, Ending.FOUND),
+        ("1" * 20 + "0" * 180, (20, 41), 60, Ending.NOT_VERIFIED),
+        ("--1" * 67, (66, 66), 200, Ending.ALREADY_WRONG),
+        ("-1" * 10 + "-" * 180, (10, 10), 200, Ending.ALREADY_WRONG),
+    ],
+)
+def test_trials_over_conditions_end_with_the_verdict(
+    told: str, made: tuple[int, int], clean: int, ending: Ending
+) -> None:
+    """As above; those count in which the clean scene is right."""
+    rule = OVER_CONDITIONS
+    found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)
+    assert (found.adversarial.successes, found.adversarial.trials, found.ending) == (*made, ending)
+    assert len(found.clean_trials) == clean
+    assert found.adversarial.interval[0] < clopper_pearson(*made)[0], "it allows for four looks"
+
+
+def test_an_answer_over_conditions_goes_on_where_a_control_group_of_another_has_more_trials() -> None:
+    """A random search beside it is tried last; what is looked at first are 30 that count all the same."""
+    rule, told = OVER_CONDITIONS, "0" + "1" * 199
+    first = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)
+    again = partial(verify, scripted("1" * 200), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, rule=rule)
+    found = again(trials=OVER_LOOKS, clean=first.clean_trials)
+    assert (found.adversarial.trials, len(found.clean_trials), found.renders) == (30, 60, 30)
+
+
+@pytest.mark.parametrize("counting", [29, 45, 101, 200])
+def test_intervals_over_conditions_cover_as_often_as_they_say(counting: int) -> None:
+    """Exactly, by the probability of every outcome, if so many of all trials count; the study takes all numbers."""
+    study = runpy.run_path(str(STUDY))
+    rates = np.linspace(0.01, 0.99, 197)
+    assert study["over_coverage"](rates, counting).min() >= 0.95
+    chances = study["over_outcomes"](np.array([0.85]), counting)
+    assert sum(chance for chance, _ in chances.values()) == pytest.approx(1.0)
+    if counting == 200:
+        assert sum(chance for chance, found in chances.values() if found) < 0.033
 
 
 def test_trials_that_were_asked_for_are_all_made() -> None:

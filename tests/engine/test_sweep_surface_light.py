@@ -164,7 +164,6 @@ def test_a_group_whose_pictures_are_too_far_off_is_rendered(monkeypatch: pytest.
             {"controls": {"camera": {"aperture": 0.1}}, "samples": 1},
             "haze, a lens with an aperture",
         ),
-        ({"controls": {"camera": {"k1": -0.1}}, "samples": 1}, "a lens that bends the picture"),
         ({"controls": "haze", "samples": 1}, "more in the scene than the object, its ground and an environment"),
         ({"grid": {"pose.yaw": [0, 90]}}, None),
     ],
