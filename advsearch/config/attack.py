@@ -38,6 +38,7 @@ class AttackConfig(DerivativeConfig):
     several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
 
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "log", "workers", "cluster")
+    now_options: ClassVar[Mapping[str, str]] = {"step_size": "policy"}
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
         Clash(
