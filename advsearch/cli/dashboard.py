@@ -20,11 +20,7 @@ HELP = "show the pages of runs in a browser on this machine"
 MORE = ". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C"
 
 PORT = 8265
-EXAMPLES = (
-    "dashboard",
-    "dashboard mug-sweep-001 mug-sweep-002",
-    "dashboard --host 0.0.0.0",
-)
+EXAMPLES = ("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -162,12 +162,7 @@ def _run(given: list[str]) -> int:
 
 
 def _parse(given: list[str], command: str | None) -> argparse.Namespace:
-    """Return the arguments of a known command.
-
-    Raises:
-        InputError: an argument is unknown, misses its value, or is missing.
-        SystemExit: help or the version was asked for and printed.
-    """
+    """Return the arguments of a known command."""
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",

@@ -155,15 +155,11 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
     try:
         yield
     finally:
-        _flush_c()
+        # write out what the C library holds back, before its descriptor changes
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).fflush(None)
         os.dup2(kept, source)
         os.close(kept)
-
-
-def _flush_c() -> None:
-    """Write out what the C library holds back, before its descriptor changes."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).fflush(None)
 
 
 def as_notes(texts: Sequence[str]) -> str:

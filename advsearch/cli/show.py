@@ -43,7 +43,14 @@ def run(args: argparse.Namespace) -> int:
         case ["policy" | "task" as kind, name]:
             return _show_options(kind, name, args.json)
         case ["recipe", name]:
-            return _show_recipe(name, args.json)
+            from advsearch.questions.recipe.description import read_recipe, recipe_yaml
+
+            text = recipe_yaml(name)
+            if args.json:
+                output.print_json({"schema": 1, "recipe": name, **read_recipe(name).model_dump(mode="json")})
+            else:
+                print(text, end="")
+            return 0
         case [name]:
             return show_run(name, args.json, picture=args.picture)
     kinds = "control NAME, policy NAME, task NAME, recipe NAME"
@@ -175,17 +182,6 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
     print(f"{name}: {first_doc_line(entry)}\n")
     rows = [{"name": one, "type": options[one][0], "default": _cell(defaults[one])} for one in options]
     print(f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(rows)}" if rows else "It has no options.")
-    return 0
-
-
-def _show_recipe(name: str, as_json: bool) -> int:
-    from advsearch.questions.recipe.description import read_recipe, recipe_yaml
-
-    text = recipe_yaml(name)
-    if as_json:
-        output.print_json({"schema": 1, "recipe": name, **read_recipe(name).model_dump(mode="json")})
-    else:
-        print(text, end="")
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
-from advsearch.attacks.distribution import Distribution
+from advsearch.attacks.domain import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_result import AttackResult

@@ -400,7 +400,7 @@ def test_the_verdict_says_what_is_known_and_no_more(fields: dict[str, Any], sent
 
 @pytest.mark.parametrize("goal", [ANY, TARGET, EASIER], ids=["wrong", "target", "easier"])
 def test_every_ending_has_a_verdict(goal: dict[str, Any]) -> None:
-    from advsearch.attacks.ending import Ending
+    from advsearch.attacks.verification import Ending
 
     said = [wording.attack_verdict(attack(ending=ending.value, **goal)) for ending in Ending]
     assert len(set(said)) == len(said)

@@ -261,11 +261,7 @@ def _curve(data: RunData) -> Html:
     zero = f"above: {above}" if objective in SUCCESS_ABOVE_ZERO else ""
     charts = [objective_chart(curves, objective_label(objective), zero, width) for width in (WIDE, NARROW)]
     note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
-    return join_html(
-        element("h2", "The search"),
-        element("div", *charts),
-        element("p", note, class_="soft"),
-    )
+    return join_html(element("h2", "The search"), element("div", *charts), element("p", note, class_="soft"))
 
 
 def _cost(summary: AttackSummary) -> Html:

@@ -16,7 +16,7 @@ from advsearch import seeds
 from advsearch.api.subruns import carry_out_part
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.attacks.sequential import ConfidenceSequence
+from advsearch.attacks.trials import ConfidenceSequence
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.attack_parts import executor_for, parts_of, problem_of
 from advsearch.engine.journal import Journal
