@@ -210,7 +210,7 @@ class RunDirectory:
 
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
-        before, now = self._begun_with(), config.deciding()
+        before, now = config.of_this_version(self._begun_with()), config.deciding()
         changed = [
             f"{name} was {value!r} and is {now[name]!r}"
             for name, value in before.items()

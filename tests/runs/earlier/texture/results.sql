@@ -1,0 +1,64 @@
+BEGIN TRANSACTION;
+CREATE TABLE evaluations (
+        id          INTEGER PRIMARY KEY, -- grows by one
+        kind        TEXT    NOT NULL,    -- what it was for: search, baseline, verification, control, ...
+        step        INTEGER NOT NULL,    -- step or trial within its kind, from 0
+        seed        INTEGER,             -- of the render
+        spp         INTEGER,             -- samples per pixel of the render
+        objective   REAL,                -- what was maximised; NULL when it was not a number
+        success     INTEGER,             -- 1 when the model was wrong, 0 when right, NULL when not judged
+        label       TEXT,                -- the class that the model answered
+        label_index INTEGER,             -- its number
+        probability REAL,                -- the model's probability for it, in [0, 1]
+        values_json TEXT    NOT NULL,    -- {"camera.azimuth": {"value": 130.0, "unit": "degrees"}, ...}
+        seconds     REAL,                -- that the evaluation took
+        time        REAL    NOT NULL     -- when the row was written, seconds since 1970 (UTC)
+    , renders INTEGER, correct INTEGER, margin REAL, payload_json TEXT, machine TEXT);
+INSERT INTO "evaluations" VALUES(1,'search',0,2353253374,1,2.71711254119873046875e+00,1,'dumbbell',6,4.11630064249038696289e-01,'{"texture.linf": {"value": 0.0, "unit": "sRGB"}, "texture.rms": {"value": 0.0, "unit": "sRGB"}}',5.26112700994417537003e-01,1.79575706050135684016e+09,1,0,2.71711254119873046875e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(2,'search',1,2074994147,1,5.5873394012451171875e+00,1,'teapot',11,4.48853313922882080078e-01,'{"texture.linf": {"value": 0.025000005960464478, "unit": "sRGB"}, "texture.rms": {"value": 0.017906352877616882, "unit": "sRGB"}}',3.75222439979552291333e-02,1.79575706056171393396e+09,1,0,5.5873394012451171875e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(3,'search',2,3461149051,1,4.66208934783935546875e+00,1,'hammer',8,8.87647390365600585937e-01,'{"texture.linf": {"value": 0.050000011920928955, "unit": "sRGB"}, "texture.rms": {"value": 0.030870061367750168, "unit": "sRGB"}}',4.58869399881223216652e-03,1.79575706056705379489e+09,1,0,4.66208934783935546875e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(4,'search',3,3408124434,1,-6.03124260902404785156e-01,0,'mug',10,2.82974153757095336914e-01,'{"texture.linf": {"value": 0.025000005960464478, "unit": "sRGB"}, "texture.rms": {"value": 0.017906352877616882, "unit": "sRGB"}}',3.94629599759355187416e-03,1.79575706057139730456e+09,1,1,-6.03124260902404785156e-01,NULL,NULL);
+INSERT INTO "evaluations" VALUES(5,'search',4,1622688641,1,2.85261893272399902343e+00,1,'teapot',11,8.87272357940673828125e-01,'{"texture.linf": {"value": 0.025000005960464478, "unit": "sRGB"}, "texture.rms": {"value": 0.017906352877616882, "unit": "sRGB"}}',3.47835799766471609473e-03,1.79575706057515859601e+09,1,0,2.85261893272399902343e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(6,'search',5,3408124434,1,-6.39116466045379638671e-01,0,'mug',10,3.03223401308059692382e-01,'{"texture.linf": {"value": 0.050000011920928955, "unit": "sRGB"}, "texture.rms": {"value": 0.030870061367750168, "unit": "sRGB"}}',3.7550510023720562458e-03,1.79575706057920646665e+09,1,1,-6.39116466045379638671e-01,NULL,NULL);
+INSERT INTO "evaluations" VALUES(7,'search',6,1622688641,1,2.87649822235107421875e+00,1,'teapot',11,8.87387096881866455078e-01,'{"texture.linf": {"value": 0.050000011920928955, "unit": "sRGB"}, "texture.rms": {"value": 0.030870061367750168, "unit": "sRGB"}}',3.40811299975030124187e-03,1.79575706058289885514e+09,1,0,2.87649822235107421875e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(8,'search',7,3408124434,1,-0.604938805103302,0,'mug',10,3.04689943790435791015e-01,'{"texture.linf": {"value": 0.0, "unit": "sRGB"}, "texture.rms": {"value": 0.0, "unit": "sRGB"}}',3.57147699833149090409e-03,1.79575706058678674702e+09,1,1,-0.604938805103302,NULL,NULL);
+INSERT INTO "evaluations" VALUES(9,'search',8,1622688641,1,2.81545972824096679687e+00,1,'teapot',11,8.98927092552185058593e-01,'{"texture.linf": {"value": 0.0, "unit": "sRGB"}, "texture.rms": {"value": 0.0, "unit": "sRGB"}}',3.20845600072061643004e-03,1.79575706059023118025e+09,1,0,2.81545972824096679687e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(10,'baseline',0,454193433,1,6.04238986968994140625e+00,1,'teapot',11,5.09536206722259521484e-01,'{"texture.linf": {"value": 0.10000002384185791, "unit": "sRGB"}, "texture.rms": {"value": 0.09887991845607758, "unit": "sRGB"}}',3.55214800219982862472e-03,1.79575706059457874301e+09,1,0,6.04238986968994140625e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(11,'baseline',1,2504780351,1,4.18266916275024414062e+00,1,'teapot',11,9.32190716266632080078e-01,'{"texture.linf": {"value": 0.09987366199493408, "unit": "sRGB"}, "texture.rms": {"value": 0.057152483612298965, "unit": "sRGB"}}',3.4638959987205453217e-03,1.79575706059847164152e+09,1,0,4.18266916275024414062e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(12,'baseline',2,4154817118,1,4.21292972564697265625e+00,1,'hammer',8,8.50525736808776855468e-01,'{"texture.linf": {"value": 0.10000002384185791, "unit": "sRGB"}, "texture.rms": {"value": 0.09871963411569595, "unit": "sRGB"}}',3.78249099594540894031e-03,1.79575706060274410246e+09,1,0,4.21292972564697265625e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(13,'baseline',3,1820783620,1,5.05848264694213867187e+00,1,'teapot',11,0.391161173582077,'{"texture.linf": {"value": 0.10000002384185791, "unit": "sRGB"}, "texture.rms": {"value": 0.09887991845607758, "unit": "sRGB"}}',3.65202699322253465652e-03,1.7957570606067521572e+09,1,0,5.05848264694213867187e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(14,'baseline',4,3160775798,1,4.01419878005981445312e+00,1,'teapot',11,5.92859387397766113281e-01,'{"texture.linf": {"value": 0.10000002384185791, "unit": "sRGB"}, "texture.rms": {"value": 0.09887991845607758, "unit": "sRGB"}}',3.45233899861341342329e-03,1.79575706061047315597e+09,1,0,4.01419878005981445312e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(15,'baseline',5,1820783620,1,5.34475374221801757812e+00,1,'teapot',11,4.4436746835708618164e-01,'{"texture.linf": {"value": 0.10000002384185791, "unit": "sRGB"}, "texture.rms": {"value": 0.09871963411569595, "unit": "sRGB"}}',3.71719399845460429787e-03,1.79575706061444926265e+09,1,0,5.34475374221801757812e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(16,'baseline',6,3160775798,1,4.19031524658203125e+00,1,'bowl',4,0.73164302110672,'{"texture.linf": {"value": 0.10000002384185791, "unit": "sRGB"}, "texture.rms": {"value": 0.09871963411569595, "unit": "sRGB"}}',3.50011100090341642498e-03,1.79575706061821198464e+09,1,0,4.19031524658203125e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(17,'baseline',7,1820783620,1,6.135448455810546875e+00,1,'teapot',11,0.666337788105011,'{"texture.linf": {"value": 0.09987366199493408, "unit": "sRGB"}, "texture.rms": {"value": 0.057152483612298965, "unit": "sRGB"}}',3.78404399816645309329e-03,1.7957570606222746372e+09,1,0,6.135448455810546875e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(18,'baseline',8,3160775798,1,3.8801059722900390625e+00,1,'bowl',4,6.03427827358245849609e-01,'{"texture.linf": {"value": 0.09987366199493408, "unit": "sRGB"}, "texture.rms": {"value": 0.057152483612298965, "unit": "sRGB"}}',3.38650100457016378641e-03,1.79575706062591338154e+09,1,0,3.8801059722900390625e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(19,'control',0,1183407759,1,2.63294243812561035156e+00,1,'dumbbell',6,8.78548145294189453125e-01,'{}',NULL,1.79575706063004302982e+09,1,0,2.63294243812561035156e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(20,'control',1,353134922,1,6.51193952560424804687e+00,1,'teapot',11,8.70610475540161132812e-01,'{}',NULL,1.79575706063354110716e+09,1,0,6.51193952560424804687e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(21,'control',2,3646371988,1,3.50333833694458,1,'dumbbell',6,5.71454524993896484375e-01,'{}',NULL,1.79575706063705897328e+09,1,0,3.50333833694458,NULL,NULL);
+INSERT INTO "evaluations" VALUES(22,'control',3,4090813060,1,-2.93631911277771,0,'mug',10,9.0279865264892578125e-01,'{}',NULL,1.79575706064210724836e+09,1,1,-2.93631911277771,NULL,NULL);
+INSERT INTO "evaluations" VALUES(23,'control',4,956892838,1,-7.50261020660400390625e+00,0,'mug',10,9.98613953590393066406e-01,'{}',NULL,1.79575706064799761772e+09,1,1,-7.50261020660400390625e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(24,'control',5,3833130434,1,2.8384304046630859375e+00,1,'teapot',11,8.91209840774536132812e-01,'{}',NULL,1.79575706065387797356e+09,1,0,2.8384304046630859375e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(25,'verification',0,1183407759,1,2.62081503868103027343e+00,1,'dumbbell',6,8.71757268905639648437e-01,'{}',NULL,1.7957570606593749523e+09,1,0,2.62081503868103027343e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(26,'verification',1,353134922,1,6.24076080322265625e+00,1,'teapot',11,0.842526912689209,'{}',NULL,1.79575706066334891321e+09,1,0,6.24076080322265625e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(27,'verification',2,3646371988,1,3.63849925994873046875e+00,1,'dumbbell',6,6.27745926380157470703e-01,'{}',NULL,1.79575706066697955137e+09,1,0,3.63849925994873046875e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(28,'verification',3,4090813060,1,-2.8968334197998046875e+00,0,'mug',10,8.97867500782012939453e-01,'{}',NULL,1.79575706067047786715e+09,1,1,-2.8968334197998046875e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(29,'verification',4,956892838,1,-7.90485811233520507812e+00,0,'mug',10,9.9901103973388671875e-01,'{}',NULL,1.79575706067378950119e+09,1,1,-7.90485811233520507812e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(30,'verification',5,3833130434,1,2.918666839599609375e+00,1,'teapot',11,9.05138492584228515625e-01,'{}',NULL,1.79575706067709469793e+09,1,0,2.918666839599609375e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(31,'baseline verification',0,1183407759,1,2.63550829887390136718e+00,1,'dumbbell',6,8.75514864921569824218e-01,'{}',NULL,1.79575706068099188797e+09,1,0,2.63550829887390136718e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(32,'baseline verification',1,353134922,1,6.95433378219604492187e+00,1,'teapot',11,0.878594160079956,'{}',NULL,1.79575706068428897856e+09,1,0,6.95433378219604492187e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(33,'baseline verification',2,3646371988,1,3.66279840469360351562e+00,1,'dumbbell',6,5.89673399925231933593e-01,'{}',NULL,1.79575706068757653239e+09,1,0,3.66279840469360351562e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(34,'baseline verification',3,4090813060,1,-3.27283740043640136718e+00,0,'mug',10,9.23830807209014892578e-01,'{}',NULL,1.79575706069080257409e+09,1,1,-3.27283740043640136718e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(35,'baseline verification',4,956892838,1,-7.44531297683715820312e+00,0,'mug',10,9.9843603372573852539e-01,'{}',NULL,1.79575706069401311876e+09,1,1,-7.44531297683715820312e+00,NULL,NULL);
+INSERT INTO "evaluations" VALUES(36,'baseline verification',5,3833130434,1,1.64135146141052246093e+00,1,'teapot',11,7.49306261539459228515e-01,'{}',NULL,1.79575706069729876517e+09,1,0,1.64135146141052246093e+00,NULL,NULL);
+CREATE TABLE meta (
+        key   TEXT PRIMARY KEY,
+        value TEXT NOT NULL
+    ) WITHOUT ROWID;
+INSERT INTO "meta" VALUES('created','2026-11-27T05:24:19Z');
+INSERT INTO "meta" VALUES('gradient plan','{"plan": {"renders_per_gradient": 0, "spp": null, "groups": [{"control": "texture", "parameter": "texels", "size": 768, "estimator": "adjoint", "valid": ["adjoint"], "step": 0.05000000074505806, "step_reason": "", "reason": "the only valid estimator", "variance_x_seconds": {}}]}, "spp": 1, "search_depth": null}');
+INSERT INTO "meta" VALUES('made with','[{"python": "3.11.7", "advsearch": "0.1.0", "mitsuba": "3.9.1", "drjit": "1.5.0", "torch": "2.13.0+cpu", "numpy": "2.4.6"}]');
+INSERT INTO "meta" VALUES('settings','{"object": "mug", "environment": null, "up": null, "camera": null, "set": {}, "exposure": 0.0, "resolution": [16, 16], "model": "reference", "labels": null, "task": "classification", "label": null, "controls": {"texture": {}}, "texture_resolution": 16, "spp": 1, "denoise": "none", "pixel_sampler": "multijitter", "seed": 0, "deterministic": false, "epsilon": null, "norm": null, "estimator": {}, "objective": null, "specialise": true, "ensemble": null, "measure": "no", "policy": "pgd", "steps": 3, "seconds": null, "step_size": 0.25, "target": null, "minimise": false, "smallest": false, "printable": false, "aov": null, "over": {}, "draws": 4, "average": 0, "baseline": true, "verify_spp": 1, "trials": 6}');
+CREATE UNIQUE INDEX evaluations_step ON evaluations (kind, step);
+COMMIT;
+PRAGMA user_version = 5;
+PRAGMA application_id = 1094997587;
