@@ -32,7 +32,6 @@ from scipy.special import stdtrit
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.api.attack import problem_from_config
 from advsearch.attacks import (
     Block,
     Domain,
@@ -50,6 +49,7 @@ from advsearch.attacks.sample_count import LADDER, MarginsOf, margins_of
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.attacks.verification import TRIAL_LOOKS, WORST_CASE
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Judgement
 
