@@ -447,7 +447,7 @@ def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value:
     Path("folder").mkdir()
     Path(file).write_text("one")
     open_regular(Path(file), "what is opened for a control", 10).close()
-    over = {"over": {"path": {}}} if setting == "path" else {}
+    over: dict[str, Any] = {"over": {"path": {}}} if setting == "path" else {}
     config = AttackConfig(object="mug", run="first", **over, **{setting: value})
     for wanted in ("one", "another", "one"):
         Path(file).write_text(wanted)

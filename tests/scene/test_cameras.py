@@ -17,6 +17,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.engine.loading import Scene, framed
+from advsearch.engine.rendering import sight_of
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.cameras.files import read_camera
 from advsearch.scene.cameras.model import NUMBERS, CameraModel, bundled, pinhole
@@ -24,6 +25,7 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.renderer import LinearRenderer
+from advsearch.tasks import Depth, Facts
 
 HERE = Path(__file__).parent
 TABLE: dict[str, Any] = json.loads((HERE / "camera_reference.json").read_text("utf-8"))
@@ -200,6 +202,7 @@ HOSTILE = {
     "another projection of COLMAP": ("1 THIN_PRISM_FISHEYE 9 9 1 1 1 1 0 0 0 0 0 0 0 0\n", "got THIN_PRISM_FISHEYE"),
     "a short line": ("1 PINHOLE 9 9 1 1\n", "expected width height fx fy cx cy"),
     "several": ("1 SIMPLE_PINHOLE 9 9 9 4 4\n2 SIMPLE_PINHOLE 9 9 9 4 4\n", "has 2 cameras, 1, 2: say which"),
+    "a part of the picture": (GOOD + "roi: {x_offset: 100, y_offset: 0, width: 9, height: 9}\n", "whole pictures"),
     "no numbers": (GOOD.replace("902.5", "[]"), "numbers, got"),
 }
 
@@ -292,6 +295,58 @@ def test_a_searched_lens_is_the_fixed_one_and_has_a_derivative() -> None:
     u = torch.tensor([0.25], requires_grad=True)
     searched(u, 3, 16).mean().backward()
     assert u.grad is not None and float(u.grad.abs()) > 0.0
+
+
+BARREL = "barrel of a file"
+BOXED = {
+    BARREL: {"camera.distance": 1.05},
+    "fisheye": {"camera.distance": 0.85},
+    "equirectangular": {"camera.distance": 0.85},
+}
+
+
+@pytest.mark.parametrize("camera", list(BOXED))
+def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> None:
+    """The mask and the box that a detector is judged by are where the object's paint shows, and no pinhole's."""
+    path = tmp_path / "camera.yaml"
+    path.write_text(ros("plumb_bob", [-0.6, 0.0, 0.0, 0.0], [500.0, 0.0, 760.0, 0.0, 280.0, 300.0, 0.0, 0.0, 1.0]))
+    scene = advsearch.load_scene("mug", camera=str(path) if camera == BARREL else camera, settings=BOXED[camera])
+    one = scene.renderer({"texture": {"resolution": 2, "epsilon": 1.0}}, resolution=48, denoise="none")
+    with torch.no_grad():
+        white, black = (one.radiance(torch.full_like(one.start, value), 1, 32) for value in (1.0, 0.0))
+    painted = (white - black).mean(dim=-1) > 0.15 * float((white - black).mean(dim=-1).max())
+    truth = sight_of(one.surfaces(one.start))
+    seen = Facts("mug", look=lambda: truth)
+    shown = Facts("mug", look=lambda: replace(truth, mask=painted))
+    assert seen.box is not None and shown.box is not None
+    assert max(abs(a - b) for a, b in zip(seen.box, shown.box, strict=True)) <= 1
+    assert float((seen.mask & painted).sum()) > 0.85 * float((seen.mask | painted).sum())
+    plain = replace(scene.description, camera_model=None)
+    pose = camera_to_world(scene.description)
+    flat = (plain.base_vertices - pose[:3, 3]) @ pose[:3, :3] * (-1.0, -1.0, 1.0)
+    model = scene.description.camera_model
+    assert model is not None
+    fx, fy, cx, cy = model.numbers[:4]
+    straight = 48 * (flat[:, :2] / flat[:, 2:] * (fx, fy) + (cx, cy))
+    ends = (*straight.min(axis=0), *straight.max(axis=0))
+    assert max(abs(a - b) for a, b in zip(seen.box, ends, strict=True)) > 2.5, "a pinhole's box is another one"
+
+
+def test_what_a_lens_shows_has_a_derivative_in_the_texture(through_fisheye: Renderer) -> None:
+    exact = through_fisheye.like(denoiser="none")
+    u = through_fisheye.start.clone().requires_grad_()
+    exact(u, 1, 16)[14:18, 14:18].mean().backward()
+    assert u.grad is not None
+    with torch.no_grad():
+        way = u.grad / u.grad.norm()
+        ends = [exact(u + sign * 0.1 * way, 1, 64)[14:18, 14:18].mean() for sign in (1.0, -1.0)]
+    assert float(u.grad @ way) == pytest.approx(float(ends[0] - ends[1]) / 0.2, rel=0.1)
+
+
+def test_depth_refuses_a_lens_that_sees_far_aside(through_fisheye: Renderer) -> None:
+    truth = sight_of(through_fisheye.surfaces(through_fisheye.start))
+    with pytest.raises(InputError, match="sees things more than 84 degrees from its axis"):
+        Depth().truth(Facts("mug", look=lambda: truth))
 
 
 # ---- as users name it -----------------------------------------------------------------------------------------------

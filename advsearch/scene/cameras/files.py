@@ -57,7 +57,7 @@ OF_DISTORTION = {
 """The distortion models of ROS and Kalibr that are one of ours."""
 
 MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1")
-DISTORTION = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "d", "dist")
+DISTORTION = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoeff", "distortion", "d", "dist")
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SIZE = ("imagesize", "resolution")
 
@@ -174,6 +174,9 @@ def _of_opencv(spec: str, data: Mapping[str, Any]) -> CameraModel:
         kind = FISHEYE
     if kind == EQUIRECTANGULAR:
         return _made(spec, kind, _size(path, data), {})
+    roi = data.get("roi")
+    if isinstance(roi, Mapping) and any(roi.get(side) for side in ("x_offset", "y_offset", "width", "height")):
+        raise FileFormatError(f"{path}: expected a camera_info of whole pictures, got one of a part (roi); set it to 0")
     matrix = _numbers(path, "camera_matrix", _there(path, data, MATRIX, "camera_matrix"), (9,))
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got other numbers")
