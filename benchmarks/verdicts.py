@@ -166,8 +166,8 @@ def over_table() -> int:
     print("| rate | found by 200, % | now, % | trials before | now |\n| --- | --- | --- | --- | --- |")
     rates = np.array(OVER_RATES)
     ends = over_outcomes(rates, OVER_LOOKS[-1])
-    chances = sum(chance for chance, found in ends.values() if found)
-    trials = sum(chance * n for (_, n), (chance, _) in ends.items())
+    chances = sum((chance for chance, found in ends.values() if found), np.zeros_like(rates))
+    trials = sum((chance * n for (_, n), (chance, _) in ends.items()), np.zeros_like(rates))
     for rate, chance, count in zip(rates, chances, trials, strict=True):
         before = stats.binom.sf(OVER_CONDITIONS.needed(200) - 1, 200, rate)
         print(f"| {rate:.2f} | {100 * before:.2f} | {100 * chance:.2f} | 200 | {count:.0f} |")

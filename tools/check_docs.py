@@ -245,7 +245,7 @@ MADE_BY_HAND = [
         "questions.md",
         f"What counts on the way is {FEWEST_TRIALS} trials without a failure, or, after one, {TRIALS} in all",
     ),
-    ("questions.md", f"**Verified** on {TRIALS_OVER} conditions"),
+    ("questions.md", f"**Verified** on up to {TRIALS_OVER} conditions"),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
     ("questions.md", {8: "as long as eight random pictures"}[region.PROBES]),
