@@ -2,6 +2,7 @@
 
     python benchmarks/surface_light.py [SCENE ...] [--views 5] [--truth 1024] [--repeats 5] [--sizes 128,224]
     python benchmarks/surface_light.py [SCENE ...] --sweep [--rows 1000]
+    python benchmarks/surface_light.py [SCENE ...] --rule [--views 20]
 
 A SCENE is OBJECT@ENVIRONMENT, each a bundled name or a file; the default is the bundled mug, bottle and bowl. The model
 is the reference model, for scenes whose object has a class of it. For each scene and size, over random cameras within
@@ -16,6 +17,9 @@ their whole ranges:
 With `--sweep`, of a sweep over azimuth, elevation and distance that is predicted, and two that are rendered with other
 seeds: rows a second, light and comparisons included, and how often that is of the rendered ones (asked for: 5); the
 accuracy; and in how many rows the verdict is not that of the rendered ones, and how many differ between these.
+
+With `--rule`, how often the comparison before a search accepts predictions: as they are, and with mistakes planted in
+them. Each of `--views` searches compares two pictures. Beside it: how far the pictures are off, by 16 times the samples.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ import itertools
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -36,8 +41,10 @@ threads.configure()
 
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.engine.surface_light import CHECK_SPP, COMPARED, levels_off, over_all  # noqa: E402
 from advsearch.engine.sweeps.answer import SweepResult  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
+from advsearch.engine.transport import BOUND, Deviation  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
@@ -60,7 +67,13 @@ def main() -> None:
     parser.add_argument("--label", help="what the object is, for a file")
     parser.add_argument("--sweep", action="store_true", help="rows of a sweep")
     parser.add_argument("--rows", type=int, default=1000, help="of it, about (default 1000)")
+    parser.add_argument("--rule", action="store_true", help="how often predictions are accepted, right and wrong ones")
     args = parser.parse_args()
+    if args.rule:
+        for scene in args.scenes:
+            with torch.no_grad():
+                ruled(scene, args.views)
+        return
     if args.sweep:
         for scene in args.scenes:
             swept(scene, args.rows, args.label)
@@ -143,6 +156,35 @@ def swept(scene: str, rows: int, label: str | None) -> None:
     assert told is not None
     error = "" if told.error is None else f"{told.error.levels:.2f} levels off, {told.error.logits:+.2f} logits; "
     print(f"  {error}{told.reason or 'all predicted'}", flush=True)
+
+
+def ruled(scene: str, searches: int) -> None:
+    """Print how often the comparison accepts predictions, and wrong ones."""
+    thing, _, environment = scene.partition("@")
+    renderer = load_scene(thing, environment or None).renderer(["camera", "environment"], resolution=128)
+    light = SurfaceRenderer(renderer, renderer.start, seed=0)
+    names = ("as predicted", "object 10 % too bright", "object 25 % too bright", "one pixel aside", "two pixels aside")
+    accepted, off = [0] * len(names), [list[float]() for _ in names]
+    wholes = views(renderer, COMPARED * searches)
+    for search in range(searches):
+        found: list[list[Deviation]] = [[] for _ in names]
+        for number, whole in enumerate(wholes[COMPARED * search :][:COMPARED], start=COMPARED * search):
+            inputs = renderer.scene.assembly(renderer.space.inputs(whole))
+            color, lit = light.color(inputs), light.light(inputs)
+            brighter = [replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)]
+            pictures = [light.under(one, [inputs], color, [whole])[0] for one in brighter]
+            pictures += [pictures[0].roll(shift, dims=1) for shift in (1, 2)]
+            shown = [*pictures, renderer(whole, seed=number, spp=SPP)]
+            *levels, rendered = levels_off(renderer, shown, whole, search, CHECK_SPP)
+            for kind, one in enumerate(levels):
+                found[kind].append(Deviation(one, 0.0, max(BOUND, rendered), pictures=3))
+            for kind, one in enumerate(levels_off(renderer, pictures, whole, number, 16 * CHECK_SPP)):
+                off[kind].append(one)
+        for kind, both in enumerate(map(over_all, found)):
+            accepted[kind] += both.levels <= both.most
+    print(f"{scene}: accepted in {searches} searches, and levels off")
+    for name, count, levels in zip(names, accepted, off, strict=True):
+        print(f"  {name:24s} {count:3d}   {statistics.fmean(one**2 for one in levels) ** 0.5:.2f}", flush=True)
 
 
 def views(renderer: Renderer, count: int) -> list[Tensor]:
