@@ -8,6 +8,9 @@ ARGS ?=
 # Tests that run side by side; most of them keep one processor busy.
 JOBS ?= 2
 
+# The tests start many processes, and each would compile the package again.
+unexport PYTHONDONTWRITEBYTECODE
+
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up

@@ -15,29 +15,29 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from advsearch import losses as losses
     from advsearch import testing as testing
-    from advsearch.api.attack import attack as attack
-    from advsearch.api.gap import gap as gap
     from advsearch.api.load_run import load_run as load_run
     from advsearch.api.model import load_model as load_model
-    from advsearch.api.photos import photo_agreement as photo_agreement
     from advsearch.api.render import Rendering as Rendering
     from advsearch.api.render import render as render
-    from advsearch.api.sweep import sweep as sweep
     from advsearch.engine.attack_result import AttackResult as AttackResult
     from advsearch.engine.loading import Scene as Scene
     from advsearch.engine.loading import load_scene as load_scene
     from advsearch.engine.sweeps.answer import SweepResult as SweepResult
     from advsearch.models import Model as Model
+    from advsearch.questions.attack.carry_out import attack as attack
     from advsearch.questions.check.carry_out import check as check
     from advsearch.questions.compare.carry_out import compare as compare
     from advsearch.questions.explain.carry_out import explain as explain
+    from advsearch.questions.gap.carry_out import gap as gap
     from advsearch.questions.harden.carry_out import harden as harden
+    from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
     from advsearch.questions.plan.carry_out import plan as plan
     from advsearch.questions.precision.carry_out import precision as precision
     from advsearch.questions.recipe.carry_out import recipe as recipe
     from advsearch.questions.region.carry_out import region as region
     from advsearch.questions.replay.carry_out import replay as replay
     from advsearch.questions.stability.carry_out import stability as stability
+    from advsearch.questions.sweep.carry_out import sweep as sweep
 
 __version__ = "0.1.0"
 
@@ -47,16 +47,16 @@ _HOMES = {
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
     "SweepResult": "advsearch.engine.sweeps.answer",
-    "attack": "advsearch.api.attack",
+    "attack": "advsearch.questions.attack.carry_out",
     "check": "advsearch.questions.check.carry_out",
     "compare": "advsearch.questions.compare.carry_out",
     "explain": "advsearch.questions.explain.carry_out",
-    "gap": "advsearch.api.gap",
+    "gap": "advsearch.questions.gap.carry_out",
     "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.model",
     "load_run": "advsearch.api.load_run",
     "load_scene": "advsearch.engine.loading",
-    "photo_agreement": "advsearch.api.photos",
+    "photo_agreement": "advsearch.questions.photographs.carry_out",
     "plan": "advsearch.questions.plan.carry_out",
     "precision": "advsearch.questions.precision.carry_out",
     "recipe": "advsearch.questions.recipe.carry_out",
@@ -64,7 +64,7 @@ _HOMES = {
     "render": "advsearch.api.render",
     "replay": "advsearch.questions.replay.carry_out",
     "stability": "advsearch.questions.stability.carry_out",
-    "sweep": "advsearch.api.sweep",
+    "sweep": "advsearch.questions.sweep.carry_out",
 }
 """The public names, and the module of each."""
 

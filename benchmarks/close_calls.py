@@ -22,9 +22,9 @@ from typing import Any
 from torch import Tensor
 
 from advsearch import seeds, threads
-from advsearch.api.attack import problem_from_config
 from advsearch.attacks import Query, make_policy, search
 from advsearch.config import CLOSE_LOOKS, AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.problem import Problem
 
 TRIALS, TRIAL_SPP = 8, 64

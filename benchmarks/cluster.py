@@ -42,7 +42,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from simulated_cluster import Simulated, coordinator  # noqa: E402
 from sweep import ConstantRenderer, resident  # noqa: E402
 
-from advsearch.api.sweep import job_of  # noqa: E402
 from advsearch.attacks import Evaluation  # noqa: E402
 from advsearch.cluster.coordinator import DEPTH  # noqa: E402
 from advsearch.cluster.pool import Event  # noqa: E402
@@ -52,6 +51,7 @@ from advsearch.engine.sweeps import swept_scene  # noqa: E402
 from advsearch.engine.sweeps.job import KIND  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
+from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.runs.store import NAME, Store  # noqa: E402
 from advsearch.tasks import Answer, Judgement  # noqa: E402

@@ -33,9 +33,9 @@ import torch
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.api.attack import problem_from_config
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, StepRecord, make_policy, search
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.problem import Problem
 from advsearch.seeds import stream
 

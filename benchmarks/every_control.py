@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from advsearch.attacks.ending import Ending
+from advsearch.attacks.verification import Ending
 from advsearch.controls import CONTROLS
 
 MIXTURES = ("pose,light", "camera,environment", "texture,pose", "geometry,material")

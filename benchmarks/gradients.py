@@ -29,8 +29,8 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.attack import problem_from_config  # noqa: E402
 from advsearch.config import AttackConfig  # noqa: E402
+from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.scene.gradients.group import Group  # noqa: E402

@@ -24,8 +24,8 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import problem_from_config
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.bounces import bounces_of
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.problem import Problem

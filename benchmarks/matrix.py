@@ -22,8 +22,8 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.cli.main import main as advsearch  # noqa: E402
-from advsearch.report.transfer import matrix_heads, matrix_rows  # noqa: E402
-from advsearch.runs.results.matrix import MatrixResult  # noqa: E402
+from advsearch.questions.attack.answer import MatrixResult  # noqa: E402
+from advsearch.report.shown import shown  # noqa: E402
 from advsearch.runs.summary import read_result  # noqa: E402
 
 
@@ -43,9 +43,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             result = read_result(run)
             if not isinstance(result, MatrixResult):
                 raise SystemExit("expected several models: --model A,B")
-            heads = ["control", *matrix_heads(result)]
+            table = shown(result).sections[0]
+            heads = ["control", *table.heads]
             lines = [heads, ["---"] * len(heads)] if not number else []
-            for cells in [*lines, *([control, *row] for row in matrix_rows(result))]:
+            for cells in [*lines, *([control, *row] for row in table.rows)]:
                 print(f"| {' | '.join(cells)} |", flush=True)
     return 0
 

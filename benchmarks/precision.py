@@ -19,7 +19,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.attack import problem_from_config  # noqa: E402
+from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
 from advsearch.questions.precision.answer import Recommended  # noqa: E402
 from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402

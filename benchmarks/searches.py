@@ -34,9 +34,9 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds, threads
-from advsearch.api.attack import problem_from_config
 from advsearch.attacks import Evaluation, Query, make_policy, search
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Transport
 

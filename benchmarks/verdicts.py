@@ -35,7 +35,6 @@ from scipy.special import stdtrit
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.api.attack import problem_from_config
 from advsearch.attacks import (
     Block,
     Domain,
@@ -59,6 +58,7 @@ from advsearch.attacks.verification import (
     WORST_CASE,
 )
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Judgement
 

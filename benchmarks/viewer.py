@@ -144,14 +144,15 @@ def of_attack(folder: Path) -> dict[str, float]:
     from playwright.sync_api import sync_playwright
 
     import advsearch
-    from advsearch.viewer.attack_page import write_report
+    from advsearch.runs.summary import attack_of
+    from advsearch.viewer.pages import write_page
 
     scene = advsearch.load_scene("teapot")
     advsearch.attack(scene, controls=["texture"], steps=STEPS, resolution=SIDE, run=folder)
     seconds = []
     for _ in range(REPEATS):
         begun = time.perf_counter()
-        report = write_report(folder)
+        report = write_page(folder, attack_of(folder))
         seconds.append(time.perf_counter() - begun)
     found = {"page made [s]": statistics.median(seconds), "page [MB]": report.stat().st_size / 1e6}
     with sync_playwright() as playwright:

@@ -26,8 +26,10 @@ from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
+from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.compare.answer import CompareResult
 from advsearch.questions.explain.answer import ExplainResult
+from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.harden.answer import HardenResult
 from advsearch.questions.recipe.description import recipe_names as recipe_names
 from advsearch.questions.region.answer import RegionResult
@@ -36,8 +38,6 @@ from advsearch.questions.stability.answer import CaseRow
 from advsearch.questions.test.answer import SuiteResult
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
-from advsearch.runs.results.gap import CurveResult, GapResult
-from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import Setting, settings

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from advsearch.cli.attack import answer
+from advsearch.cli.output import shown_text as answer
 from advsearch.report.phrases import CLASSIFICATION, answer_text
 from advsearch.runs.directory import default_name
 from advsearch.runs.results.attack import AttackSummary, PicturedAnswer

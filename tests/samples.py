@@ -9,14 +9,16 @@ import numpy as np
 import OpenEXR
 
 from advsearch.config import AttackConfig
+from advsearch.questions.attack.answer import CurveResult, MatrixResult
+from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region.answer import RegionResult
 from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.gap import CurveResult, GapResult
-from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
+from advsearch.runs.summary import attack_of
+from advsearch.viewer.pages import write_page
 
 
 def exr(path: Path) -> np.ndarray:
@@ -251,3 +253,8 @@ def keep_object(run: Path) -> None:
     )
     (run / OBJECT_FILE).parent.mkdir(parents=True, exist_ok=True)
     (run / OBJECT_FILE).write_bytes(web_glb([painted], [clean], camera, "It has fewer faces here."))
+
+
+def written_page(run: Path) -> Path:
+    """Write the page of an attack and return its path."""
+    return write_page(run, attack_of(run))

@@ -15,10 +15,10 @@ from samples import sweep
 from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.files import JsonValue
+from advsearch.questions.photographs.serving import PhotoTaker
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
-from advsearch.viewer.photographing import PhotoTaker
 from advsearch.viewer.server import Dashboard
 from advsearch.viewer.sweep_page import write_sweep_page
 

@@ -331,8 +331,8 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
     """torch's compilers take two seconds, and only files of `torch.export` need them; a quarter of one goes to
     scipy.stats, which draws from nets."""
     code = (
-        "import sys, advsearch.api.attack, advsearch.models.reference\n"
-        "advsearch.api.attack.load_scene('mug', 'studio')\n"
+        "import sys, advsearch.questions.attack.carry_out, advsearch.models.reference\n"
+        "advsearch.questions.attack.carry_out.load_scene('mug', 'studio')\n"
         "print([m for m in ('torch._dynamo', 'networkx', 'scipy.stats') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

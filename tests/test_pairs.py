@@ -14,10 +14,10 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.attack import problem_from_config
 from advsearch.attacks import Query
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, NumberControl, compose, make_control, make_space
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.problem import Problem

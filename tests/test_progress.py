@@ -13,7 +13,6 @@ import torch
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.api import carry_out as answered
-from advsearch.api.sweep import sweep_from_config
 from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.attacks.sample_count import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
@@ -26,6 +25,7 @@ from advsearch.questions.plan.settings import PlanConfig
 from advsearch.questions.precision.settings import PrecisionConfig
 from advsearch.questions.region import growing as region
 from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config
 

@@ -34,15 +34,16 @@ from advsearch.engine import stages
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
+from advsearch.questions.attack.answer import CurveResult, MatrixResult
+from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region import carry_out as mapping
 from advsearch.questions.region import growing as region
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs import directory, export, store
-from advsearch.runs.results import KEPT
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.gap import CurveResult
-from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.render import RenderResult
+from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene import environments, exposure, library
 from advsearch.scene.description import FRAME_FILL
 from advsearch.scene.importing.images import TEXTURE_LIMIT
@@ -183,7 +184,7 @@ PLAIN = set(
 
 def results() -> Iterator[str]:
     """Fields of results say what they hold; columns and files of a run are in the page about runs."""
-    kinds: list[type[Result]] = [*KEPT, CurveResult, MatrixResult, RenderResult]
+    kinds: list[type[Result]] = [AttackSummary, SweepSummary, GapResult, CurveResult, MatrixResult, RenderResult]
     for kind in kinds:
         silent = {name for name, field in kind.model_fields.items() if not script("make_figures")._field(field)}
         if not (kind.__doc__ and kind.command) or silent - PLAIN:
@@ -244,7 +245,7 @@ MADE_BY_HAND = [
         "questions.md",
         f"What counts on the way is {FEWEST_TRIALS} trials without a failure, or, after one, {TRIALS} in all",
     ),
-    ("questions.md", f"**Verified** on {TRIALS_OVER} conditions"),
+    ("questions.md", f"**Verified** on up to {TRIALS_OVER} conditions"),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
     ("questions.md", {8: "as long as eight random pictures"}[region.PROBES]),

@@ -12,8 +12,8 @@ from torch import Tensor
 
 import advsearch
 from advsearch import seeds
-from advsearch.api.attack import judged_alone, problem_from_config
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import judged_alone, problem_from_config
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import kept_answer
 from advsearch.errors import InputError

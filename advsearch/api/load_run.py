@@ -9,18 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.api.attack import parts_in
+from advsearch.engine.attack_parts import parts_in
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.errors import InputError
 from advsearch.files import read_bytes
-from advsearch.report.tables import CurveTable, GapTable
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.images import read_png
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.scene.importing.exr import read_exr
@@ -30,9 +28,9 @@ from advsearch.scene.importing.files import LARGEST_FILE
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
     """Return the answer of a run from its folder, of the type that the function of its question returns.
 
-    An attack's is an `AttackResult`, a sweep's a `SweepResult`, `gap`'s a `GapTable`, and so on; of several epsilons or
-    models, which only a command attacks, it is the table of them. `search` of a loaded attack is None: `rows("search")`
-    has its steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
+    An attack's is an `AttackResult`, a sweep's a `SweepResult`, `gap`'s a `GapResult`, and so on; of several epsilons
+    or models, which only a command attacks, it is the table of them. `search` of a loaded attack is None:
+    `rows("search")` has its steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
 
     Args:
         run: its name, which stands for runs/NAME, or its folder.
@@ -50,9 +48,6 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
         return _attack(path, result)
     if isinstance(result, SweepSummary):
         return SweepResult(result, path)
-    for plain, table in ((GapResult, GapTable), (CurveResult, CurveTable)):
-        if isinstance(result, plain):
-            return table.of(result)
     return result
 
 

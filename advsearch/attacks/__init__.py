@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import Block, Domain
-from advsearch.attacks.ending import Ending
+from advsearch.attacks.domain import Block, Distribution, Domain
 from advsearch.attacks.evaluation import Evaluate, Evaluation, Query, WhichGradient
-from advsearch.attacks.objectives import (
-    OBJECTIVES,
-    Objective,
-    cross_entropy,
-    get_objective,
-    margin,
-)
+from advsearch.attacks.objectives import OBJECTIVES, Objective, cross_entropy, get_objective, margin
 from advsearch.attacks.policies import (
     CMAES,
     NES,
@@ -36,12 +28,7 @@ from advsearch.attacks.policies import (
 from advsearch.attacks.sample_count import Rung, SampleCount, choose_spp
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
 from advsearch.attacks.trials import Trials, clopper_pearson
-from advsearch.attacks.verification import (
-    Verification,
-    count_right,
-    run_trials,
-    verify,
-)
+from advsearch.attacks.verification import Ending, Verification, count_right, run_trials, verify
 
 __all__ = [
     "CMAES",

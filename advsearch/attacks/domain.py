@@ -9,7 +9,6 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from advsearch.attacks.projections import project_l2_box
 from advsearch.errors import InputError
 
 Norm = Literal["linf", "l2", "box"]
@@ -72,15 +71,12 @@ class Block:
                 f"block{where}: expected a reach over 0 and norm 'box', got {self.reach} and {self.norm!r}"
             )
         if self.options:
-            self._check_choice(where)
-
-    def _check_choice(self, where: str) -> None:
-        whole = (self.size, self.norm, self.low, self.high, self.periodic) == (1, "box", 0.0, 1.0, False)
-        if self.options < 0 or not whole:
-            raise InputError(
-                f"block{where}: expected a discrete choice to have at least one option, size 1, norm 'box' and bounds "
-                f"[0, 1], got {self}"
-            )
+            whole = (self.size, self.norm, self.low, self.high, self.periodic) == (1, "box", 0.0, 1.0, False)
+            if self.options < 0 or not whole:
+                raise InputError(
+                    f"block{where}: expected a discrete choice to have at least one option, size 1, norm 'box' and "
+                    f"bounds [0, 1], got {self}"
+                )
 
     @property
     def radius(self) -> float:
@@ -308,3 +304,115 @@ def _l2_offset(noise: Tensor, radius: float, generator: torch.Generator, extreme
     direction = torch.randn(size, generator=generator)
     length = radius * math.pow(float(noise[0]), 1.0 / size)
     return direction * (length / max(float(torch.linalg.vector_norm(direction)), 1e-30))
+
+
+CHUNK = 32768
+"""Elements worked on at once: small enough for a core's cache, and torch uses one thread below it."""
+
+SLACK = 1e-6
+"""A norm at most this fraction over the radius counts as inside, so that projecting twice changes nothing."""
+
+_MAX_ITERATIONS = 100
+
+
+def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, high: float = 1.0) -> Tensor:
+    """Project onto the intersection of an l2 ball and a box.
+
+    The result is the one nearest point, argmin_p ||p - u|| subject to ||p - centre|| <= radius and low <= p <= high.
+    Clipping and then rescaling is not that point, and for a box that cuts deep it is far from it.
+
+    The optimality conditions give p(t) = clip(centre + t (u - centre), low, high) with one multiplier t in (0, 1],
+    t = 1 if p(1) lies in the ball. Otherwise t solves ||p(t) - centre|| = radius. In s = t^2 the squared norm is
+
+        g(s) = sum_i min(s v_i^2, room_i^2),     v = u - centre, room_i = distance to the bound that v_i points at,
+
+    concave, increasing and piecewise linear, so Newton's method from the left never overshoots and stops at the exact
+    root after finitely many steps (two to six in practice). It is the scheme known from continuous quadratic knapsack
+    problems (Cominetti, Mascarenhas, Silva 2014, "A Newton's method for the continuous quadratic knapsack problem").
+
+    Args:
+        u: (d,) float32, finite.
+        centre: (d,) float32 inside the box.
+        radius: radius of the ball, over 0.
+        low, high: the box's bounds.
+
+    Returns:
+        (d,) float32. Points inside come back bit for bit; projecting again changes at most the last bits.
+    """
+    squares, rooms = [], []
+    full = inside = 0.0
+    for part, middle in zip(torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True):
+        squares.append((part - middle).square_())
+        rooms.append(part.clamp(low, high).sub_(middle).square_())
+        full += float(squares[-1].sum())
+        inside += float(rooms[-1].sum())
+    if inside <= (radius * (1.0 + SLACK)) ** 2:
+        return u.clamp(low, high)
+    t = math.sqrt(_multiplier(squares, rooms, radius**2, radius**2 / full))
+    projected = torch.empty_like(u)
+    for out, part, middle in zip(
+        torch.split(projected, CHUNK), torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True
+    ):
+        torch.lerp(middle, part, t, out=out).clamp_(low, high)
+    return projected
+
+
+def _multiplier(squares: list[Tensor], rooms: list[Tensor], target: float, s: float) -> float:
+    """Solve sum_i min(s squares_i, rooms_i) = target for s by Newton's method, from an s that is not too large."""
+    for _ in range(_MAX_ITERATIONS):
+        value = slope = 0.0
+        for square, room in zip(squares, rooms, strict=True):
+            scaled = square * s
+            slope += float(torch.dot(square, (scaled < room).to(square.dtype)))
+            value += float(torch.minimum(scaled, room).sum())
+        better = s + (target - value) / slope if slope > 0.0 else s
+        if better <= s * (1.0 + 1e-7):
+            break
+        s = better
+    return s
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """A normal distribution with independent elements, projected onto the domain.
+
+    Attributes:
+        mean: (d,) float32, inside the domain.
+        deviation: (d,) float32, at least 0.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def sample(self, generator: torch.Generator, n: int, domain: Domain) -> Tensor:
+        """Return (n, d) float32 configurations P(mean + deviation * z), z standard normal, P the projection.
+
+        Args:
+            generator: source of randomness; advances.
+            n: how many, at least 1.
+            domain: the one that was searched.
+        """
+        noise = torch.randn(n, domain.dim, generator=generator)
+        return torch.stack([domain.project(self.mean + self.deviation * one) for one in noise])
+
+
+def half_widths(domain: Domain) -> Tensor:
+    """Return (d,) float32, over 0: how far each element may go while all others go as far.
+
+    - "box": half of the bounds' distance, or the block's reach over the square root of its size if that is given;
+    - "linf": half of what bounds and ball leave;
+    - "l2": epsilon over the square root of the block's size, at most half of the bounds' distance.
+    """
+    half = (domain.upper - domain.lower) / 2.0
+    for block, part in domain.parts():
+        if block.norm == "l2" or block.reach is not None:
+            half[part] = min(block.radius / math.sqrt(block.size), (block.high - block.low) / 2.0)
+    return half.clamp_(min=torch.finfo(torch.float32).tiny)
+
+
+def wraps(domain: Domain) -> Tensor:
+    """Return (d,) bool: the elements that may leave their bounds, because there they come round again."""
+    around = torch.zeros(domain.dim, dtype=torch.bool)
+    for block, part in domain.parts():
+        around[part] = block.periodic
+    return around

@@ -70,15 +70,12 @@ class Draws:
         while first < end:
             number, begin = divmod(first, self._rows)
             size = min(self._rows - begin, end - first)
-            parts.append(self._block_of(number)[begin : begin + size])
+            if number != self._number:
+                self._block = self._sobol(number) if self._sampler == "sobol" else self._random(number)
+                self._number = number
+            parts.append(self._block[begin : begin + size])
             first += size
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _block_of(self, number: int) -> Doubles:
-        if number != self._number:
-            self._block = self._sobol(number) if self._sampler == "sobol" else self._random(number)
-            self._number = number
-        return self._block
 
     def _random(self, number: int) -> Doubles:
         return np.random.default_rng(stream(self._seed, self._name, number)).random((self._rows, self.dimensions))

@@ -155,11 +155,7 @@ def usable(evaluation: Evaluation) -> Evaluation:
     if not evaluation.finite:
         zero = None if gradient is None else torch.zeros_like(gradient)
         return replace(
-            evaluation,
-            objective=-math.inf,
-            gradient=zero,
-            success=False,
-            non_finite=evaluation.non_finite + bad,
+            evaluation, objective=-math.inf, gradient=zero, success=False, non_finite=evaluation.non_finite + bad
         )
     if bad:
         return replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)

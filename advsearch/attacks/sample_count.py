@@ -100,11 +100,7 @@ class SampleCount:
 
 
 def choose_spp(
-    margins: Mapping[str, MarginsOf],
-    *,
-    seed: int,
-    ladder: Sequence[int] = LADDER,
-    trials: int = 0,
+    margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = LADDER, trials: int = 0
 ) -> SampleCount:
     """Climb a ladder of sample counts with each configuration until more of them would not change the verdict; return
     the highest rung that one of them needed.

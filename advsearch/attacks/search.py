@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.candidates import Candidate, admit, best, contenders, with_last
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import TOLERANCE, Domain
-from advsearch.attacks.ending import Ending
+from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
 from advsearch.attacks.evaluation import Evaluate, Evaluation, Phase, Query, most_at_once, usable
 from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable
 from advsearch.attacks.policies.choices import with_choices
+from advsearch.attacks.verification import Ending
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.seeds import stream

@@ -10,15 +10,47 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.ending import Ending
 from advsearch.attacks.evaluation import Evaluate, Query
 from advsearch.attacks.trials import CONFIDENCE, Trials, clopper_pearson, trial_seed
 from advsearch.errors import InputError
 from advsearch.tasks import Judgement
+
+
+class Ending(Enum):
+    """Why a search or a run stopped. The value is what JSON holds; `explanation` is one sentence for a person.
+
+    A search ends with a claim at most; only `verify` makes it `FOUND` (docs/design.md, "Verification").
+    """
+
+    FOUND = "found"
+    BUDGET_SPENT = "budget spent"
+    NOT_VERIFIED = "not verified"
+    ALREADY_WRONG = "already wrong"
+    STALLED = "stalled"
+    NON_FINITE = "non-finite objective"
+    INTERRUPTED = "interrupted"
+
+    @property
+    def explanation(self) -> str:
+        """One sentence that says what happened."""
+        return _EXPLANATIONS[self]
+
+
+_EXPLANATIONS = {
+    Ending.FOUND: "A configuration inside the budget makes the model answer wrongly.",
+    Ending.BUDGET_SPENT: "All renders were spent and no configuration made the model answer wrongly.",
+    Ending.NOT_VERIFIED: "The search claimed a wrong answer, but it did not hold in the trials with fresh seeds.",
+    Ending.ALREADY_WRONG: "The model is wrong on the clean configuration already, so there is nothing to attack.",
+    Ending.STALLED: "The policy had nothing more to propose before the budget was spent.",
+    Ending.NON_FINITE: "The objective was NaN or infinite several times in a row.",
+    Ending.INTERRUPTED: "The search was interrupted; the best configuration so far was kept.",
+}
+
 
 PASS_PERCENT = 95
 """What a claim must hold in, in per cent of the trials, and what the clean control must pass: 14 of 14, 19 of 20."""

@@ -13,18 +13,14 @@ from advsearch.errors import InputError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from advsearch.api.photos import Photographs
-    from advsearch.runs.results.photos import PhotoAgreement
+    from advsearch.questions.photographs.answer import PhotoAgreement
+    from advsearch.questions.photographs.carry_out import Photographs
 
 HELP = "show the pages of runs in a browser on this machine"
 MORE = ". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C"
 
 PORT = 8265
-EXAMPLES = (
-    "dashboard",
-    "dashboard mug-sweep-001 mug-sweep-002",
-    "dashboard --host 0.0.0.0",
-)
+EXAMPLES = ("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
+    from advsearch.questions.photographs.page import NO_QR, qr_text
     from advsearch.runs.directory import find_run
-    from advsearch.viewer.align_page import NO_QR, qr_text
     from advsearch.viewer.server import Dashboard
 
     if not 0 <= args.port <= 65535:
@@ -74,11 +70,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _LoadedLater:
-    """`advsearch.api.photos.Photographs`, which needs PyTorch: loaded when a page of photographs is first opened."""
+    """`Photographs`, which needs PyTorch: loaded when a page of photographs is first opened."""
 
     @cached_property
     def _loaded(self) -> Photographs:
-        from advsearch.api.photos import Photographs
+        from advsearch.questions.photographs.carry_out import Photographs
 
         return Photographs()
 

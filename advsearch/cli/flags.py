@@ -79,12 +79,7 @@ def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: 
 
 
 def _inside(scene: str) -> str:
-    """Return the names of what can be the object in a scene file, as a message lists them.
-
-    Raises:
-        FileFormatError: the file cannot be read.
-        InputError: there is nothing.
-    """
+    """Return the names of what can be the object in a scene file, as a message lists them."""
     from advsearch.scene.importing.files import shown
     from advsearch.scene.importing.scenes import MITSUBA_FILE, node_names
     from advsearch.scene.mitsuba_backend.files.scene import contents
@@ -136,11 +131,7 @@ def _choices(given: Sequence[str], flag: str) -> dict[str, object]:
 
 
 def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return parameter to values from ``PARAMETER=VALUES``, which YAML would take for numbers to the base of 60.
-
-    Raises:
-        InputError: a parameter is given twice.
-    """
+    """Return parameter to values from ``PARAMETER=VALUES``, which YAML would take for numbers to the base of 60."""
     names = [text.partition("=")[0].strip() for text in given]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -150,11 +141,7 @@ def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
 
 
 def _controls(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose={...},texture={...}``.
-
-    Raises:
-        InputError: a control is given twice, or settings in braces cannot be read.
-    """
+    """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose={...},x={...}``."""
     controls: list[tuple[str, Any]] = []
     for part in (part for text in given for part in _parts(text) if part.strip()):
         name, settings = parse_assignment(part, flag) if "=" in part else (part.strip(), {})

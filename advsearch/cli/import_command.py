@@ -18,12 +18,7 @@ if TYPE_CHECKING:
 
 HELP = "show what advsearch reads from a mesh or scene file, as text or as a picture"
 MORE = ". Nothing is written but the picture"
-EXAMPLES = (
-    "import mug.obj",
-    "import room.glb --json",
-    "import room.glb --out room.png",
-    "import box.xml --json",
-)
+EXAMPLES = ("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json")
 VIEWS, SIDE = 4, 192
 """Views of the picture, and the side of each in pixels."""
 
@@ -93,11 +88,7 @@ def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
         if len(found.nodes) > 1:
             print(f"Another one moves with it: --control pose,pose:{found.nodes[0].mesh}")
     paint = "materials (--control 'texture={materials: [NAME]}')"
-    for what, names in (
-        (paint, materials),
-        ("lights", found.lights),
-        ("cameras (--camera NAME)", found.cameras),
-    ):
+    for what, names in ((paint, materials), ("lights", found.lights), ("cameras (--camera NAME)", found.cameras)):
         if names:
             print(f"{what}: {', '.join(names)}")
     for note in (*whole.warnings, *slow):

@@ -9,11 +9,7 @@ from advsearch.errors import InputError
 
 HELP = "find the names of a model's classes, as --label takes them"
 MORE = ". With --labels the model itself is not loaded. What stands for no thing, such as background, is left out"
-EXAMPLES = (
-    "labels",
-    "labels mug --labels labels.json",
-    "labels mug --model model.pt2 --labels labels.json --json",
-)
+EXAMPLES = ("labels", "labels mug --labels labels.json", "labels mug --model model.pt2 --labels labels.json --json")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -28,9 +28,9 @@ from advsearch.rooms import there
 
 GROUPS = {
     "ask: what does a model get wrong?": {
-        "attack": "advsearch.cli.attack",
-        "sweep": "advsearch.cli.sweep",
-        "gap": "advsearch.cli.gap",
+        "attack": "advsearch.questions.attack.command",
+        "sweep": "advsearch.questions.sweep.command",
+        "gap": "advsearch.questions.gap.command",
         "region": "advsearch.questions.region.command",
         "explain": "advsearch.questions.explain.command",
         "compare": "advsearch.questions.compare.command",
@@ -162,12 +162,7 @@ def _run(given: list[str]) -> int:
 
 
 def _parse(given: list[str], command: str | None) -> argparse.Namespace:
-    """Return the arguments of a known command.
-
-    Raises:
-        InputError: an argument is unknown, misses its value, or is missing.
-        SystemExit: help or the version was asked for and printed.
-    """
+    """Return the arguments of a known command."""
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",

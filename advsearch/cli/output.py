@@ -124,7 +124,7 @@ def shown_text(result: Result) -> str:
     given, run = shown(result), getattr(result, "run", None)
     parts = [given.said]
     for one in given.sections:
-        if one.only == "page" or one.empty:
+        if one.only not in ("", "text") or one.empty:
             continue
         table = aligned([one.heads, *one.rows] if one.heads else one.rows)
         pictures = [[picture.file, picture.caption] for group in one.pictures for picture in group]
@@ -155,15 +155,11 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
     try:
         yield
     finally:
-        _flush_c()
+        # write out what the C library holds back, before its descriptor changes
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).fflush(None)
         os.dup2(kept, source)
         os.close(kept)
-
-
-def _flush_c() -> None:
-    """Write out what the C library holds back, before its descriptor changes."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).fflush(None)
 
 
 def as_notes(texts: Sequence[str]) -> str:

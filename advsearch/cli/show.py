@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from advsearch.controls import Choice, Parameter
+    from advsearch.questions.photographs.answer import PhotoAgreement
     from advsearch.runs.listing import Listed
-    from advsearch.runs.results.photos import PhotoAgreement
 
 HELP = "show what a run found, or the details of a control, a policy, a task or a recipe"
 
@@ -43,7 +43,14 @@ def run(args: argparse.Namespace) -> int:
         case ["policy" | "task" as kind, name]:
             return _show_options(kind, name, args.json)
         case ["recipe", name]:
-            return _show_recipe(name, args.json)
+            from advsearch.questions.recipe.description import read_recipe, recipe_yaml
+
+            text = recipe_yaml(name)
+            if args.json:
+                output.print_json({"schema": 1, "recipe": name, **read_recipe(name).model_dump(mode="json")})
+            else:
+                print(text, end="")
+            return 0
         case [name]:
             return show_run(name, args.json, picture=args.picture)
     kinds = "control NAME, policy NAME, task NAME, recipe NAME"
@@ -78,12 +85,12 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
 
 def photos_of(run: Path) -> PhotoAgreement | None:
     """Return how photographs agree with the run's renderings; None where there are none."""
+    from advsearch.questions.photographs.files import FOLDER
     from advsearch.runs.directory import IMAGES
-    from advsearch.viewer.photos import FOLDER
 
     if not (run / IMAGES / FOLDER).is_dir():
         return None
-    from advsearch.api.photos import photo_agreement
+    from advsearch.questions.photographs.carry_out import photo_agreement
 
     return photo_agreement(run)
 
@@ -175,17 +182,6 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
     print(f"{name}: {first_doc_line(entry)}\n")
     rows = [{"name": one, "type": options[one][0], "default": _cell(defaults[one])} for one in options]
     print(f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(rows)}" if rows else "It has no options.")
-    return 0
-
-
-def _show_recipe(name: str, as_json: bool) -> int:
-    from advsearch.questions.recipe.description import read_recipe, recipe_yaml
-
-    text = recipe_yaml(name)
-    if as_json:
-        output.print_json({"schema": 1, "recipe": name, **read_recipe(name).model_dump(mode="json")})
-    else:
-        print(text, end="")
     return 0
 
 

@@ -9,10 +9,7 @@ from advsearch.cli import output
 from advsearch.errors import InputError
 
 HELP = "write the page of a run again, or a folder that any web server can serve"
-EXAMPLES = (
-    "view mug-sweep-001",
-    "view mug-sweep-001 mug-sweep-002 --bundle site",
-)
+EXAMPLES = ("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

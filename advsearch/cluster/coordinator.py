@@ -244,7 +244,12 @@ class Coordinator:
                 worker.sent = True
                 self._submit(worker, None, send=True)
             elif value.unfit or value.missing:
-                self._refuse(worker, value.text)
+                # give a worker nothing more
+                self.facts.refused += 1
+                self._refused[worker.address] = value.text
+                self._tell(f"{worker.address} is given nothing: {value.text}")
+                self._forget(worker)
+                self._requeue(worker)
             elif value.trace:
                 raise RuntimeError(f"on {worker.address}:\n{value.trace}")
             else:
@@ -272,14 +277,6 @@ class Coordinator:
         idle = not worker.tickets
         self._free.extendleft([worker] * idle)
         self._free.extend([worker] * (places - idle))
-
-    def _refuse(self, worker: _Worker, text: str) -> None:
-        """Give a worker nothing more."""
-        self.facts.refused += 1
-        self._refused[worker.address] = text
-        self._tell(f"{worker.address} is given nothing: {text}")
-        self._forget(worker)
-        self._requeue(worker)
 
     def _gone(self, address: str, *, died: bool) -> Iterator[Done]:
         """Take back what a worker had; what it was at when it died is suspected."""

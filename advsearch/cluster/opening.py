@@ -167,7 +167,13 @@ def _from_file(path: Path, workers: int | None) -> Site:
     name = str(said["class"])
     if name not in CLASSES:
         raise FileFormatError(f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}")
-    return Site(name, start=_starter(name, arguments), security=security or None, count=count or 1)
+    module = CLASSES[name]
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except ImportError:
+        package = module.partition(".")[0].replace("_", "-")
+        raise InputError(f"cluster: {name} needs {package}; pip install {package}") from None
+    return Site(name, start=lambda **more: found(**{**arguments, **more}), security=security or None, count=count or 1)
 
 
 def _mapping(path: Path, said: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -175,18 +181,3 @@ def _mapping(path: Path, said: Mapping[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
         raise FileFormatError(f"{path}: {name}: expected names and values, got {given!r}")
     return dict(given)
-
-
-def _starter(name: str, arguments: Mapping[str, Any]) -> Callable[..., Any]:
-    """What starts a cluster of a class.
-
-    Raises:
-        InputError: its package is not installed.
-    """
-    module = CLASSES[name]
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except ImportError:
-        package = module.partition(".")[0].replace("_", "-")
-        raise InputError(f"cluster: {name} needs {package}; pip install {package}") from None
-    return lambda **more: found(**{**arguments, **more})

@@ -10,7 +10,6 @@ from __future__ import annotations
 from advsearch import rooms
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.derivative import DerivativeConfig
-from advsearch.config.questions import GapConfig
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
@@ -20,12 +19,7 @@ CONFIGS: dict[str, type[Config]]
 """What the settings of each command are, in the order in which the docs show them; those of questions that are rooms
 are read when somebody first asks, since they are made of the kinds here."""
 
-_OWN: tuple[type[Config], ...] = (
-    AttackConfig,
-    RenderConfig,
-    SweepConfig,
-    GapConfig,
-)
+_OWN: tuple[type[Config], ...] = (AttackConfig, RenderConfig, SweepConfig)
 
 
 def __getattr__(name: str) -> object:
@@ -47,7 +41,6 @@ __all__ = [
     "TRIALS_OVER",
     "AttackConfig",
     "DerivativeConfig",
-    "GapConfig",
     "RenderConfig",
     "SceneConfig",
     "SweepConfig",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, model_validator
 
@@ -13,9 +13,6 @@ from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.files import JsonObject
 from advsearch.settings import Clash, setting, setting_as_in, split_names
-
-if TYPE_CHECKING:
-    pass
 
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""

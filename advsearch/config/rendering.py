@@ -40,14 +40,7 @@ class RenderConfig(SceneConfig):
         ge=2,
         le=64,
     )
-    spp: int = setting(
-        PICTURE_SPP,
-        "picture",
-        "samples per pixel",
-        unit="samples",
-        ge=1,
-        le=65536,
-    )
+    spp: int = setting(PICTURE_SPP, "picture", "samples per pixel", unit="samples", ge=1, le=65536)
     aov: str | None = setting(
         None,
         "picture",

@@ -53,10 +53,7 @@ class SceneConfig(Config):
     )
 
     object: str = setting(
-        ...,
-        "scene",
-        "the object that the model should recognise",
-        f"the name of an object or a {either(MESHES)} file",
+        ..., "scene", "the object that the model should recognise", f"the name of an object or a {either(MESHES)} file"
     )
     environment: str | None = setting(
         None,

@@ -93,12 +93,7 @@ class SweepConfig(SceneConfig):
         "sobol", "sweep", "how the draws are made, evenly spread or independent"
     )
     batch: int = setting(
-        16,
-        "sweep",
-        "pictures that are classified and stored together",
-        unit="pictures",
-        ge=1,
-        le=1024,
+        16, "sweep", "pictures that are classified and stored together", unit="pictures", ge=1, le=1024
     )
     path: str | None = setting_as_in(
         AttackConfig,

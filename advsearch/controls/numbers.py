@@ -21,17 +21,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import (
-    NOTHING,
-    WHOLE_RANGE,
-    BoundControl,
-    Budget,
-    Choice,
-    Control,
-    Group,
-    Parameter,
-    Value,
-)
+from advsearch.controls.base import NOTHING, WHOLE_RANGE, BoundControl, Budget, Choice, Control, Group, Parameter, Value
 from advsearch.controls.clean import Moved, apart, check_start, nearest, same
 from advsearch.controls.values import (
     Fixed,

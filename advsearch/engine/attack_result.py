@@ -5,22 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult
-from advsearch.config import AttackConfig
-from advsearch.controls import Control
+from advsearch.engine.attack_parts import AttackParts
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.objective import task_for
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
-from advsearch.models import Model
 from advsearch.report.drawing import new_axes
-from advsearch.report.notebook import attack_html, side_by_side
+from advsearch.report.notebook import answer_html, side_by_side
+from advsearch.report.shown import shown
 from advsearch.report.studies import search_axes
 from advsearch.runs import store
 from advsearch.runs.export import to_pandas
@@ -29,7 +28,6 @@ from advsearch.runs.results.attack import (
 )
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
-from advsearch.tasks import Task
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -45,30 +43,6 @@ class RenderKeywords(TypedDict, total=False):
     seed: int
     around: int | None
     aov: bool
-
-
-class AttackParts(Protocol):
-    """What an attack was asked with, found and loaded."""
-
-    @property
-    def config(self) -> AttackConfig:
-        """The settings."""
-
-    @property
-    def scene(self) -> Scene:
-        """The scene."""
-
-    @property
-    def loaded(self) -> tuple[Model, list[str]]:
-        """The model, and what was said of it."""
-
-    @property
-    def task(self) -> Task:
-        """The task."""
-
-    @property
-    def controls(self) -> tuple[Control, ...]:
-        """What was searched."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,16 +114,16 @@ class AttackResult:
         parts = self.parts()
         config = parts.config
         camera, settings = as_python(camera), as_python(settings)
-        shown = parts.scene if scene is None else scene if isinstance(scene, Scene) else load_scene(scene)
+        seen = parts.scene if scene is None else scene if isinstance(scene, Scene) else load_scene(scene)
         if isinstance(camera, Mapping):
             settings, camera = {**(settings or {}), **{f"camera.{name}": one for name, one in camera.items()}}, None
         if twice := sorted({*(settings or {})} & {*(self.summary.configuration or {})}):
             raise InputError(f"settings: the answer says what {twice[0]} is; leave it out")
-        shown = shown.with_settings(settings) if settings else shown
-        shown = replace(shown, description=shown.description.seen_by(camera)) if camera else shown
+        seen = seen.with_settings(settings) if settings else seen
+        seen = replace(seen, description=seen.description.seen_by(camera)) if camera else seen
         own = pictures_of(config)
         return render(
-            shown,
+            seen,
             parts.loaded[0] if model is None else model,
             task=parts.task if model is not None else task_for(parts.task, parts.loaded[0]),
             label=config.label,
@@ -197,7 +171,7 @@ class AttackResult:
 
     def _repr_html_(self) -> str:
         pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
-        return attack_html(self.summary, pictures)
+        return answer_html(shown(self.summary), pictures)
 
     def _repr_png_(self) -> bytes:
         return side_by_side([self.clean.numpy(), self.adversarial.numpy()])

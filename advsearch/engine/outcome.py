@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
-from advsearch.attacks.distribution import Distribution
+from advsearch.attacks.domain import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_result import AttackResult
@@ -57,7 +57,7 @@ from advsearch.runs.results.attack import (
 from advsearch.runs.results.base import Formation, MovedValue, VariedValue
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
-from advsearch.viewer.attack_page import write_report
+from advsearch.viewer.pages import write_page
 
 T = TypeVar("T")
 
@@ -110,7 +110,7 @@ def summarise(
     )
     if run is not None:
         run.write_summary(summary)
-        write_report(run.path)
+        write_page(run.path, summary)
         if not findings.interrupted:
             run.finish()
     return AttackResult(

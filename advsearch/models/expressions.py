@@ -83,12 +83,7 @@ def _operands(node: ast.expr, power: int) -> tuple[list[ast.expr], int]:
         return node.values, power
     if isinstance(node, ast.BinOp) and isinstance(node.op, (*_OPERATORS, ast.BitAnd, ast.BitOr)):
         return (
-            _powered(node.left, node.right, power)
-            if isinstance(node.op, ast.Pow)
-            else (
-                [node.left, node.right],
-                power,
-            )
+            _powered(node.left, node.right, power) if isinstance(node.op, ast.Pow) else ([node.left, node.right], power)
         )
     if isinstance(node, ast.Compare) and all(isinstance(op, _COMPARISONS) for op in node.ops):
         return [node.left, *node.comparators], power

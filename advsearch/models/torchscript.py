@@ -184,7 +184,10 @@ def _check_pickle(archive: Archive, name: str) -> None:
 def _check_values(archive: Archive, name: str, value: Any) -> None:
     level, seen = [value], {id(value)}
     for _ in range(DEPTH):
-        if any(isinstance(item, str) and not _is_plain(item) for item in level):
+        if any(
+            isinstance(item, str) and not all(ord(sign) in _WHITE or sign.isprintable() for sign in item)
+            for item in level
+        ):
             raise refused(archive.path, f"{name!r} has text with hidden characters")
         level = [inner for outer in level for inner in _inside(outer) if id(inner) not in seen]
         seen.update(map(id, level))
@@ -199,10 +202,6 @@ def _inside(value: Any) -> list[Any]:
     if isinstance(value, _Inert):
         return value.parts
     return list(value) if isinstance(value, (list, tuple)) else []
-
-
-def _is_plain(text: str) -> bool:
-    return all(ord(sign) in _WHITE or sign.isprintable() for sign in text)
 
 
 def _check_storage(archive: Archive, folder: str, storage: Any) -> None:

@@ -1,22 +1,19 @@
-"""Results as a notebook shows them: a verdict, pictures or a map, and a table, as HTML without styles of its own."""
+"""Answers as a notebook shows them: what is said, pictures or a figure, and tables, as HTML without styles."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from advsearch.report import wording
-from advsearch.report.drawing import Figures
-from advsearch.report.markup import Html, element, join_html
-from advsearch.report.phrases import answer_cells, beside_text, percent
-from advsearch.report.studies import sweep_figure
+from advsearch.report.drawing import Figures, drawn, new_axes
+from advsearch.report.markup import Html, element
+from advsearch.report.shown import AnswerPart, ShownAnswer, shown
 from advsearch.runs.images import png_bytes
-from advsearch.runs.results.attack import AttackSummary, VerifiedRate
-from advsearch.runs.results.base import Interval
-from advsearch.runs.results.sweep import AxisRow, SweepSummary
+from advsearch.runs.results.base import Result
 
 SHOWN = 224
 """Width of a picture on the page, in pixels."""
@@ -24,60 +21,70 @@ SHOWN = 224
 GAP = 4
 """White between pictures, in pixels."""
 
-MOST_ROWS = 24
-"""Values of an axis that are listed; of more, none."""
+PIXELS = 94
+"""Of a chart's height, to an inch of the figure."""
+
+WIDTH = 6.2
+"""Of a figure, in inches."""
 
 
-def attack_html(summary: AttackSummary, pictures: Mapping[str, ArrayLike]) -> str:
-    """Return an attack's verdict, its pictures and its rates.
+class InNotebook:
+    """What a notebook shows of a result: what its question says of it, as HTML and as a figure."""
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the figure of the answer and return the matplotlib axes; nothing is drawn where it has none.
+
+        Args:
+            axes: to draw on; None makes new ones.
+        """
+        axes = new_axes() if axes is None else axes
+        if part := drawn_part(_shown(self)):
+            part.draw(axes)  # type: ignore[misc]
+        return axes
+
+    def _repr_html_(self) -> str:
+        return answer_html(_shown(self))
+
+    def _repr_png_(self) -> bytes | None:
+        return figure_of_answer(_shown(self)).get("png")
+
+
+def _shown(result: object) -> ShownAnswer:
+    assert isinstance(result, Result)
+    return shown(result)
+
+
+def answer_html(given: ShownAnswer, pictures: Mapping[str, ArrayLike] | None = None) -> str:
+    """Return an answer as a cell of a notebook.
 
     Args:
-        summary: of the attack.
+        given: what is shown of it.
         pictures: name to (H, W, 3) sRGB in [0, 1].
     """
-    shown = [
+    figures = [
         element(
             "figure", _picture(png_bytes(image), SHOWN, name), element("figcaption", name), style="display:inline-block"
         )
-        for name, image in pictures.items()
+        for name, image in (pictures or {}).items()
     ]
-    rows = [["", "answer", "probability", "rate", "95 % interval"]]
-    success, control = wording.success(summary), summary.clean.control
-    rate = (
-        _rate("right", control.correct, control.trials, control.interval, control.not_a_number) if control else ["", ""]
-    )
-    rows.append(["clean", *answer_cells(summary.task, summary.clean), *rate])
-    if summary.adversarial:
-        rows.append(
-            ["adversarial", *answer_cells(summary.task, summary.adversarial), *_verified(success, summary.verified)]
-        )
-    if summary.baseline:
-        rows.append(["random search", "", "", *_verified(success, summary.baseline.verified)])
-    return element("div", element("p", wording.attack_verdict(summary)), *shown, _table(rows))
+    figure = figure_of_answer(given)
+    chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
+    parts = [_part(one) for one in given.sections if one.only in ("", "notebook") and not one.empty]
+    return element("div", element("p", given.said), *figures, chart, *parts)
 
 
-def sweep_html(summary: SweepSummary) -> str:
-    """Return a sweep's accuracy, its map, and the accuracy of every value of every axis."""
-    if not summary.configurations:
-        return element("p", "No configuration was looked at.")
-    compared = [beside_text(summary.beside.answer, one) for one in summary.beside.pairs] if summary.beside else []
-    total = f"Right in {summary.correct} of {summary.configurations} configurations"
-    rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
-    figure = sweep_figure(summary)
-    rows = [["axis", "value", "configurations", "right", "accuracy", "95 % interval"]]
-    for name in dict.fromkeys(row.axis for row in summary.axes):
-        mine = [row for row in summary.axes if row.axis == name]
-        rows += [axis_cells(row) for row in mine] if len(mine) <= MOST_ROWS else []
-    drawn = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
-    return element(
-        "div", element("p", " ".join(compared) or f"{total} ({rate})."), drawn, _table(rows) if len(rows) > 1 else None
-    )
+def drawn_part(given: ShownAnswer) -> AnswerPart | None:
+    """Return the first part of an answer that is drawn."""
+    return next((one for one in given.sections if one.draw is not None), None)
 
 
-def study_html(said: str, figure: Figures, tables: Sequence[Sequence[Sequence[str]]]) -> str:
-    """Return what a study says, its figure if it has one, and its tables, each of which begins with its heads."""
-    drawn = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
-    return element("div", element("p", said), drawn, *map(_table, tables))
+def figure_of_answer(given: ShownAnswer) -> Figures:
+    """Return the figure of an answer as files; none where nothing of it is drawn."""
+    part = drawn_part(given)
+    if part is None or part.draw is None:
+        return {}
+    draw = part.draw
+    return drawn(lambda figure: draw(figure.subplots()), part.size or (WIDTH, part.height / PIXELS))
 
 
 def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
@@ -87,31 +94,18 @@ def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
     return png_bytes(np.concatenate([part for one in arrays for part in (one, gap)][:-1], axis=1))
 
 
-def axis_cells(row: AxisRow) -> list[str]:
-    """Return what a table says of a value of an axis: axis, value, configurations, right, accuracy, interval."""
-    ends = row.value if isinstance(row.value, (list, tuple)) else [row.value]
-    value = " to ".join(f"{end:g}" if isinstance(end, float) else str(end) for end in ends)
-    unit = f" {row.unit}" if row.unit not in ("", "name") else ""
-    counts = [str(row.configurations), str(row.correct)]
-    return [row.axis, value + unit, *counts, percent(row.accuracy), wording.interval_text(row.interval)]
-
-
-def _verified(what: str, rated: VerifiedRate | None) -> list[str]:
-    return _rate(what, rated.successes, rated.trials, rated.interval, rated.not_a_number) if rated else ["", ""]
-
-
-def _rate(what: str, number: int, trials: int, interval: Interval, not_a_number: int = 0) -> list[str]:
-    return [wording.tally(what, number, trials, not_a_number), wording.interval_text(interval)]
+def _part(one: AnswerPart) -> Html:
+    """A part of an answer; a folded one has its title as the handle."""
+    head = element("thead", element("tr", *(element("th", cell) for cell in one.heads))) if one.heads else None
+    body = (element("tr", *(element("td", cell) for cell in row)) for row in one.rows)
+    inside = [
+        *(element("p", text) for text in one.text if text and one.draw is None),
+        element("table", head, element("tbody", *body)) if one.rows else None,
+    ]
+    if one.folded:
+        return element("details", element("summary", one.title), *inside)
+    return element("div", element("p", element("b", one.title)) if one.title else None, *inside)
 
 
 def _picture(png: bytes, width: int, alt: str) -> Html:
     return element("img", src=f"data:image/png;base64,{base64.b64encode(png).decode()}", width=width, alt=alt)
-
-
-def _table(rows: Sequence[Sequence[str]]) -> Html:
-    head, *body = rows
-    return element(
-        "table",
-        element("thead", element("tr", *(element("th", cell) for cell in head))),
-        element("tbody", join_html(*(element("tr", *(element("td", cell) for cell in row)) for row in body))),
-    )

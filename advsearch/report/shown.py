@@ -49,10 +49,11 @@ class AnswerPart:
         pictures: groups, each of which stands side by side.
         draw: draws a chart of the numbers on matplotlib's axes, for a page; `title` and `text` say what is on it.
         height: of the chart, CSS pixels.
+        size: of the figure that is kept of it, width and height in inches; None: as high as the chart.
         parts: the run among the parts that each row is of.
         shares: in [0, 1], by row and column: the larger, the stronger the colour of the cell.
         folded: whether a page shows it only when asked to.
-        only: `page` or `text`, where nobody else is shown it.
+        only: `page`, `text` or `notebook`, where nobody else is shown it.
     """
 
     title: str = ""
@@ -64,6 +65,7 @@ class AnswerPart:
     pictures: Sequence[Sequence[Picture]] = ()
     draw: Callable[[Any], object] | None = None
     height: int = 300
+    size: tuple[float, float] | None = None
     parts: Sequence[str | None] = ()
     shares: Mapping[tuple[int, int], float] = field(default_factory=dict)
     folded: bool = False
@@ -84,7 +86,7 @@ class AnswerPart:
     @property
     def empty(self) -> bool:
         """Whether there is nothing to show."""
-        return not (any(self.text) or self.rows or self.pictures)
+        return not (any(self.text) or self.rows or self.pictures or self.draw)
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,8 @@ def shown(result: Result) -> ShownAnswer:
 
 def remarks_of(result: Result, given: ShownAnswer) -> list[str]:
     """Return what has to be known beside an answer."""
-    stopped = ["Interrupted before its end."] if getattr(result, "ending", "") == INTERRUPTED else []
+    unsaid = getattr(result, "ending", "") == INTERRUPTED and "nterrupted" not in given.said
+    stopped = ["Interrupted before its end."] if unsaid else []
     return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
 
 

@@ -9,84 +9,13 @@ from typing import Any
 
 from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
 from advsearch.report.wording import short_name
-from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow
-from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.sweep import AxisRow, SweepMap, SweepSummary
 from advsearch.settings import split_names
 
 
-def curve_figure(answer: CurveResult) -> Figures:
-    """Draw the robust accuracy with its interval over epsilon; nothing where there is one epsilon only."""
-    return figure_of(lambda axes: curve_axes(answer, axes), (5.6, 3.6)) if len(_points(answer)) > 1 else {}
-
-
-def curve_axes(answer: CurveResult, axes: Any) -> None:
-    """Draw a curve on matplotlib axes; nothing where there is no epsilon of which something is known."""
-    points = _points(answer)
-    if not points:
-        return
-    at, accuracy = [one.epsilon for one in points], [one.accuracy for one in points]
-    low, high = ([one.interval[end] for one in points] for end in (0, 1))
-    axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
-    axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
-    axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
-    axes.set_title(f"{', '.join(answer.controls)}: {points[0].objects} objects, {answer.model}")
-    axes.grid(True)
-    axes.legend()
-
-
-def _points(answer: CurveResult) -> list[CurvePoint]:
-    return [one for one in answer.curve if one.epsilon is not None and one.accuracy is not None]
-
-
-def gap_figure(answer: GapResult) -> Figures:
-    """Draw, for each object and control, the accuracy on average and of the worst configuration, joined by a line."""
-    size = (6.4, 1.6 + 0.36 * len(answer.table))
-    return figure_of(lambda axes: gap_axes(answer, axes), size) if answer.table else {}
-
-
-def gap_axes(answer: GapResult, axes: Any) -> None:
-    """Draw a gap on matplotlib axes; nothing where there are no rows."""
-    rows = answer.table
-    if not rows:
-        return
-    for place, row in enumerate(reversed(rows)):
-        mean, worst, first = row.average.accuracy, _worst(row), place == 0
-        axes.plot(row.average.interval, [place, place], color=BLUE, alpha=0.35, linewidth=5)
-        axes.plot([worst, mean], [place, place], color=GREY, linewidth=1)
-        label = "average, with 95 % interval" if first else None
-        axes.plot(mean, place, "o", color=BLUE, ms=4, zorder=4, label=label)
-        label = "worst found, verified" if first else None  # an outline: where the two are equal, both are seen
-        axes.plot(worst, place, "D", color=RED, mfc="none", mew=1.5, ms=9, zorder=3, label=label)
-    axes.set_yticks(range(len(rows)), [f"{row.object}, {row.control}" for row in reversed(rows)])
-    axes.set(xlabel="accuracy", xlim=(-0.03, 1.03), ylim=(-0.6, len(rows) - 0.4))
-    axes.set_title(f"Average and worst case: {answer.model}")
-    axes.grid(True, axis="x")
-    axes.figure.legend(loc="outside lower center", ncols=2)
-
-
-def matrix_figure(answer: MatrixResult) -> Figures:
-    """Draw the share of trials in which each answer is a success on each model; nothing where none was tried."""
-    rows = [row for row in answer.table if row.tested]
-    if not rows:
-        return {}
-
-    def draw(axes: Any) -> None:
-        rates = [[cell.verified.rate for cell in row.tested] for row in rows]
-        axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")
-        for up, row in enumerate(rows):
-            for across, cell in enumerate(row.tested):
-                rated = cell.verified
-                colour = "white" if rated.rate > 0.6 else "black"
-                text = f"{rated.successes}/{rated.trials}"
-                axes.text(across, up, text, ha="center", va="center", color=colour)
-        names = [short_name(one.model) for one in answer.tested]
-        axes.set_xticks(range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0)
-        axes.set_yticks(range(len(rows)), [short_name(row.attacked) for row in rows])
-        axes.set(xlabel="tested on", ylabel="attacked on")
-        axes.set_title(f"{', '.join(answer.objects)}, {', '.join(answer.controls)}: wrong in trials")
-
-    return figure_of(draw, (2.6 + 1.3 * len(answer.models), 1.8 + 0.5 * len(rows)))
+def figure_size(answer: SweepSummary) -> tuple[float, float] | None:
+    """Return width and height of a sweep's figure in inches; None where there is neither a map nor one axis."""
+    return _map_size(answer.cells) if answer.cells else (5.6, 3.6) if _only_axis(answer) else None
 
 
 def sweep_figure(answer: SweepSummary) -> Figures:
@@ -94,8 +23,8 @@ def sweep_figure(answer: SweepSummary) -> Figures:
 
     A cell shows the accuracy there; where no cell has more than one configuration, the margin.
     """
-    size = _map_size(answer.cells) if answer.cells else (5.6, 3.6)
-    return figure_of(lambda axes: sweep_axes(answer, axes), size) if answer.cells or _only_axis(answer) else {}
+    size = figure_size(answer)
+    return {} if size is None else figure_of(lambda axes: sweep_axes(answer, axes), size)
 
 
 def sweep_axes(answer: SweepSummary, axes: Any) -> None:
@@ -223,11 +152,6 @@ def _map_size(cells: SweepMap) -> tuple[float, float]:
     )
     aslant = below if _long(cells.axes[0].values) else 0
     return 3.2 + 0.34 * wide + 0.09 * max(beside - 8, aslant - 8, 0), 1.8 + 0.3 * high + 0.065 * max(aslant - 8, 0)
-
-
-def _worst(row: GapRow) -> float:
-    """Accuracy of the worst configuration: what is left of its trials."""
-    return 0.0 if row.ending == "already wrong" else 1.0 - row.worst.rate if row.worst else 1.0
 
 
 def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:

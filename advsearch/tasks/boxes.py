@@ -5,8 +5,13 @@ A box is x0, y0, x1, y1 from the top left, (..., 4).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+
+from advsearch.tasks.detector_answers import Detections, as_option, counted, numbers_of
 
 FORMS = ("xyxy", "xywh", "cxcywh", "yxyx")
 """How a box may be given: corners; a corner or the middle with width and height; corners with y first."""
@@ -86,3 +91,115 @@ def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     left = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
     left[order] = kept
     return left
+
+
+UNITS = ("fractions", "pixels")
+
+KNOWN = "boxes_are_corners_in_pixels"
+"""The attribute of a network that says so of its boxes, which are then not guessed from what they look like."""
+
+LOOKED_AT = 100
+"""The best boxes of a picture that are looked at: what has no score says nothing."""
+
+FRACTION, PIXEL = 1.5, 4.0
+"""The largest number of a box, in the median: up to the first these are fractions of the picture, from the second on
+pixels."""
+
+BEYOND = 0.25
+"""How far outside the picture the middle of a box may lie, in sides of the picture."""
+
+ODD, USUAL = 0.5, 0.8
+"""Share of boxes that are as boxes are: a reading with less is doubted, one with more is named in its place."""
+
+
+NEARER = 0.1
+"""How much more a box has to overlap the object in another reading for that to be named."""
+
+FAULTS = (
+    "lie far outside the picture",
+    "have a right edge left of the left one, or a bottom above the top",
+    "are smaller than a pixel",
+)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How boxes are read.
+
+    Attributes:
+        form: one of `FORMS`.
+        unit: one of `UNITS`.
+        size: (height, width) of the model's input in pixels.
+    """
+
+    form: str
+    unit: str
+    size: tuple[int, int]
+
+    def fractions(self, boxes: Tensor) -> Tensor:
+        """Return boxes (D, 4) as corners in shares of width and height; differentiable."""
+        height, width = self.size if self.unit == "pixels" else (1, 1)
+        return corners(boxes, self.form) / boxes.new_tensor([width, height] * 2)
+
+    def usual(self, boxes: Tensor) -> float:
+        """Return the share of boxes (D, 4), D at least 1, that are as boxes are: the right way round, in the picture,
+        and larger than a pixel."""
+        inside, ordered, large = self._is_usual(boxes)
+        return float((inside & ordered & large).float().mean())
+
+    def _is_usual(self, boxes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        read, (height, width) = self.fractions(boxes), self.size
+        middle, sides = (read[:, :2] + read[:, 2:]) / 2.0, read[:, 2:] - read[:, :2]
+        inside = ((middle >= -BEYOND) & (middle <= 1.0 + BEYOND)).all(dim=1)
+        return inside, (sides > 0.0).all(dim=1), (sides.abs() * sides.new_tensor([width, height]) > 1.0).any(dim=1)
+
+    def fault(self, boxes: Tensor) -> str:
+        """Return what is odd about boxes (D, 4) in this reading; empty if nothing is."""
+        if not len(boxes) or self.usual(boxes) >= ODD:
+            return ""
+        shares = [1.0 - float(one.float().mean()) for one in self._is_usual(boxes)]
+        share, fault = max(zip(shares, FAULTS, strict=True), key=lambda one: one[0])
+        return f"{100.0 * share:.0f} % of them {fault}"
+
+    def instead(self, boxes: Tensor) -> str:
+        """Return which other readings would be usual ones: those that differ least in what is said."""
+        others = [Reading(form, unit, self.size) for unit in UNITS for form in FORMS[:3]]
+        fitting = [self.change_to(one) for one in others if one.usual(boxes) >= USUAL]
+        nearest = [one for one in fitting if one.count(":") == min(two.count(":") for two in fitting)]
+        return f"; {' or '.join(nearest)} would mend that" if nearest else ""
+
+    def change_to(self, other: Reading) -> str:
+        """Return what says another reading in place of this one, such as ``boxes: xywh``."""
+        said = [("boxes", self.form, other.form), ("unit", self.unit, other.unit)]
+        return as_option(", ".join(f"{name}: {new}" for name, old, new in said if old != new))
+
+    def better(self, boxes: Tensor, true: Tensor, least: float) -> str:
+        """Return what says the reading in which one of boxes (D, 4) overlaps the true box `NEARER` than in this one.
+
+        Args:
+            boxes: that have the right name.
+            true: (4,) corners in shares of width and height.
+            least: intersection over union.
+        """
+        every = [self, *(Reading(form, unit, self.size) for unit in UNITS for form in FORMS)]
+        found = {one: float(overlap(one.fractions(boxes), true).max()) for one in every} if len(boxes) else {}
+        best = max(found, key=lambda one: found[one], default=self)
+        return self.change_to(best) if found and found[best] >= max(least, found[self] + NEARER) else ""
+
+
+def strongest_boxes(found: Sequence[Detections]) -> Tensor:
+    """Return the boxes with the best scores of each picture, as they came, without what says nothing, (D, 4)."""
+    kept = []
+    for one in found:
+        rows, numbers = counted(one).nonzero().flatten(), numbers_of(one)
+        best = numbers.amax(dim=1) if numbers.shape[1] else numbers.sum(dim=1)
+        kept.append(one["boxes"].detach()[rows[best[rows].argsort(descending=True)[:LOOKED_AT]]])
+    return torch.cat(kept) if kept else torch.zeros(0, 4)
+
+
+def unit_in(boxes: Tensor) -> str:
+    """Return which of `UNITS` boxes (D, 4) of any form are in; "" if they leave it open."""
+    if not len(boxes):
+        return ""
+    largest = float(boxes.abs().amax(dim=1).median())
+    return "fractions" if largest <= FRACTION else "pixels" if largest >= PIXEL else ""

@@ -24,8 +24,18 @@ from advsearch.models import Model
 from advsearch.models.labels import names_nothing
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
-from advsearch.tasks.box_readings import KNOWN, UNITS, Reading, strongest_boxes, unit_in
-from advsearch.tasks.boxes import FORMS, left_over, overlap, share_inside, strongest
+from advsearch.tasks.boxes import (
+    FORMS,
+    KNOWN,
+    UNITS,
+    Reading,
+    left_over,
+    overlap,
+    share_inside,
+    strongest,
+    strongest_boxes,
+    unit_in,
+)
 from advsearch.tasks.classification import NO, ClassTask, Labels
 from advsearch.tasks.detector_answers import (
     ORDERS,

@@ -108,7 +108,7 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
     if len(paths) > files.scaled(MOST):
         raise files.too_large(root, f"at most {files.scaled(MOST):,} reference pictures", f"{len(paths):,}")
     with torch.no_grad():
-        shown = (_cut(_read(one), model.input_size) for _, one in paths)
+        shown = (_cut(torch.from_numpy(upright(one, SIDE)), model.input_size) for _, one in paths)
         parts = [_features(model, batch, root) for batch in _batches(shown)]
     features = torch.cat(parts)
     broken = ~features.isfinite().all(dim=1)
@@ -182,11 +182,6 @@ def _pictures(folder: Path) -> Sequence[Path]:
     if not found:
         raise InputError(f"references: expected pictures of {folder.name} in {folder}, got none; put some there")
     return found
-
-
-def _read(path: Path) -> Tensor:
-    """Return a picture (H, W, 3), display-referred sRGB in [0, 1]."""
-    return torch.from_numpy(upright(path, SIDE))
 
 
 def _cut(picture: Tensor, size: tuple[int, int]) -> Tensor:

@@ -1,4 +1,4 @@
-"""The frame of every page: head, policy, style and script, such that it needs nothing from elsewhere."""
+"""The frame of every page, such that it needs nothing from elsewhere, and what pages have in common."""
 
 from __future__ import annotations
 
@@ -6,13 +6,30 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
+from pathlib import Path
+from urllib.parse import quote
 
 from advsearch import __version__
+from advsearch.files import MESHES
+from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.style import CSS
+from advsearch.runs.directory import PARTS, REPORT
+
+MOST_NOTES = 3
+"""Notes on files that are not folded."""
+
+_OF_A_FILE = re.compile(
+    rf"[^:]{{1,200}}\.({'|'.join(one[1:] for one in (*MESHES, '.hdr', '.exr', '.xml'))})[: ]|The clean scene has ",
+    re.IGNORECASE,
+)
+"""How what is said of the reading of a file begins, and of a value that a control leaves out."""
+
+LONG = 32
+"""Letters of a cell above which its text is broken into lines."""
 
 
 def document(
@@ -77,3 +94,86 @@ def asset(name: str) -> str:
 
 def _digest(script: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+# ---- what pages have in common ---------------------------------------------------------------------------------------
+
+
+def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
+    """Return the header of a page: what was asked, the answer, and what has to be known beside it."""
+    return element("header", element("p", eyebrow, class_="eyebrow"), element("h1", text), remarks_html(remarks))
+
+
+def remarks_html(remarks: Sequence[str]) -> Html:
+    """Return what has to be known beside an answer, and below it, folded where it is much, how files were read."""
+    notes = [one for one in remarks if _OF_A_FILE.match(one)]
+    listed, noted = (
+        element("ul", *(element("li", one) for one in lines), class_=css) if lines else None
+        for lines, css in (([one for one in remarks if one not in notes], "remarks"), (notes, "notes"))
+    )
+    if len(notes) > MOST_NOTES:
+        noted = element("details", element("summary", f"{len(notes)} notes on how files were read"), noted)
+    return join_html(listed, noted)
+
+
+def subject_html(*parts: tuple[str, str]) -> Html:
+    """Return what a run is about: kinds with their names, the paths among which are short, and whole on hover."""
+    shown = (
+        join_html(f"{kind} " if kind else "", element("span", wording.short_names(text), title=text))
+        for kind, text in parts
+    )
+    return join_html(*(join_html(", " if number else "", one) for number, one in enumerate(shown)))
+
+
+def facts_table(facts: Mapping[str, str]) -> Html:
+    """Return names with their values; those that are empty are left out."""
+    lines = [
+        element("tr", element("th", name, scope="row"), element("td", value)) for name, value in facts.items() if value
+    ]
+    return element("table", element("tbody", *lines), class_="facts")
+
+
+def study_table(
+    heads: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    links: Sequence[str] = (),
+    shares: Mapping[tuple[int, int], float] | None = None,
+) -> Html:
+    """Return a table whose rows begin with their name.
+
+    Args:
+        heads: of the columns.
+        rows: texts.
+        links: of the rows' names; empty ones and those that are missing lead nowhere.
+        shares: in [0, 1], by row and column: the larger, the stronger the colour of the cell.
+    """
+    lines = []
+    for number, (first, *cells) in enumerate(rows):
+        link = links[number] if number < len(links) else ""
+        name = element("a", first, href=link) if link else first
+        shown = [_cell(text, (shares or {}).get((number, at))) for at, text in enumerate(cells, 1)]
+        lines.append(element("tr", element("th", name, scope="row"), *shown))
+    head = element("tr", *(element("th", text, scope="col") for text in heads))
+    made = element("table", element("thead", head), element("tbody", *lines))
+    return scrolled(made)
+
+
+def _cell(text: str, share: float | None) -> Html:
+    if share is None:
+        return element("td", text, class_="number" if len(text) <= LONG else "long")
+    return element("td", text, class_=f"number share share-{round(10 * share)}")
+
+
+def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
+    """Return where the pages of a run's parts are, seen from its own; empty of those that have none."""
+    found = []
+    for part in parts:
+        name = "" if part is None else Path(part).name
+        there = name and (run / PARTS / name / REPORT).is_file()
+        found.append(f"{PARTS}/{quote(name, safe='')}/{REPORT}" if there else "")
+    return found
+
+
+def again(command_line: str) -> Html:
+    """Return the command that asks the same again."""
+    return join_html(element("h2", "Do it again"), element("pre", command_line, class_="wrap"))

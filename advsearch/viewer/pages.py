@@ -11,14 +11,20 @@ from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
 from advsearch.runs.directory import IMAGES, REPORT
 from advsearch.runs.files import write_text
-from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.gap import CurveResult, GapResult
-from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.sweep import SweepSummary
-from advsearch.viewer import attack_page, study_page, sweep_page
-from advsearch.viewer.document import data_url, document, scrolled
-from advsearch.viewer.study_page import again, facts_table, heading, part_links, study_table, subject_html
+from advsearch.viewer.document import (
+    again,
+    data_url,
+    document,
+    facts_table,
+    heading,
+    part_links,
+    scrolled,
+    study_table,
+    subject_html,
+)
+from advsearch.viewer.sweep_page import write_sweep_page
 
 LARGEST_FIGURE = 2_000_000
 """Bytes of a figure or a picture that the page takes along."""
@@ -38,20 +44,11 @@ def write_page(run: Path, result: Result) -> Path:
         FileFormatError: other results of the run are damaged.
         StorageError: the page cannot be written.
     """
-    match result:
-        case AttackSummary():
-            return attack_page.write_report(run)
-        case SweepSummary():
-            return sweep_page.write_sweep_page(run, result)
-        case GapResult():
-            text = study_page.gap_page(run, result)
-        case CurveResult():
-            text = study_page.curve_page(run, result)
-        case MatrixResult():
-            text = study_page.matrix_page(run, result)
-        case _:
-            own = rooms.in_room(result.command, "page", "page")
-            text = own(run, result) if own else shown_page(run, result, shown(result))
+    if isinstance(result, SweepSummary):
+        return write_sweep_page(run, result)
+    own = rooms.in_room(result.command, "page", "page")
+    made = own(run, result) if own else None
+    text = made or shown_page(run, result, shown(result))
     return write_text(run / REPORT, text, durable=False)
 
 
@@ -63,7 +60,7 @@ def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
     main = element(
         "main",
         *([] if drawn else _figures(run, given.said)),
-        *(_section(run, one) for one in given.sections if one.only != "text" and not one.empty),
+        *(_section(run, one, given.said) for one in given.sections if one.only in ("", "page") and not one.empty),
         _links(run, parts) if parts and all(isinstance(one, str) for one in parts) else None,
         join_html(element("h2", "Cost and conditions"), facts_table(facts)),
         again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
@@ -82,11 +79,11 @@ def kept(run: Path, name: str | Path) -> Path | None:
     return file if inside and file.stat().st_size <= LARGEST_FIGURE else None
 
 
-def _section(run: Path, one: AnswerPart) -> Html:
-    """A part of an answer; a folded one has its title as the handle."""
+def _section(run: Path, one: AnswerPart, said: str) -> Html:
+    """A part of an answer, which says `said`; a folded one has its title as the handle."""
     chart = None
     if one.draw is not None:
-        words = " ".join([f"{one.title}.", *one.text])
+        words = " ".join([f"{one.title}.", *(one.text or [said])])
         chart = element("div", *(study_chart(one.draw, words, width, one.height) for width in (WIDE, NARROW)))
     table = study_table(one.heads, one.rows, part_links(run, one.parts), one.shares) if one.heads else None
     inside = join_html(

@@ -26,17 +26,16 @@ from socket import socket
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
+from advsearch import rooms
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import open_regular
 from advsearch.report.markup import element
 from advsearch.runs import listing, lock
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
-from advsearch.viewer import photographing
 from advsearch.viewer.certificate import https_context, reachable
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.following import START, following_page, is_under_way, progress_json
 from advsearch.viewer.list_page import list_page
-from advsearch.viewer.photographing import PhotoTaker
 from advsearch.viewer.refused import Refused
 from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
 from advsearch.viewer.thumbnails import cover, kept_pictures, path_of
@@ -97,7 +96,7 @@ class Dashboard(HTTPServer):
         port: int = 0,
         *,
         https: bool = False,
-        photographs: PhotoTaker | None = None,
+        photographs: object | None = None,
     ) -> None:
         self._given = tuple(runs)
         self.token = None if _is_loopback(host) else secrets.token_urlsafe(24)
@@ -339,21 +338,21 @@ class _Handler(BaseHTTPRequestHandler):
     def _align(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         path = f"/runs/{quote(name, safe='')}/align/"
         elsewhere = self.server.address_of(path) if self.server.token else None
-        made = photographing.photographs_html(
+        _, made = _photographs("photographs_html")(
             self.server.photographs, self._run(name), name, self.server.key, elsewhere
         )
         return _html(made, "../../../", ("../", name))
 
     def _rendering(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
-        return photographing.rendering_picture(self._run(name), rendering)
+        return _photographs("rendering_picture")(self._run(name), rendering)
 
     def _photo(self, _query: Mapping[str, list[str]], name: str, photo: str) -> tuple[str, bytes]:
-        return photographing.photo(self._run(name), photo)
+        return _photographs("photo")(self._run(name), photo)
 
     def _take(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
-        photographing.check_sender(self.headers, self.server.key)
-        data = partial(photographing.request_body, self.headers, self.rfile)
-        return photographing.take(self.server.photographs, self._run(name), rendering, data)
+        _photographs("check_sender")(self.headers, self.server.key)
+        data = partial(_photographs("request_body"), self.headers, self.rfile)
+        return _photographs("take")(self.server.photographs, self._run(name), rendering, data)
 
     def _picture(self, _query: Mapping[str, list[str]], name: str, number: str) -> tuple[str, bytes]:
         file = path_of(self._run(name), int(number))
@@ -381,6 +380,14 @@ _ROUTES: Routes = (
 
 _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
 """What is sent, not asked for."""
+
+
+def _photographs(what: str) -> Callable[..., tuple[str, bytes]]:
+    """A part of what takes photographs in, which the tool works without."""
+    found: Callable[..., tuple[str, bytes]] | None = rooms.in_room("photographs", "serving", what)
+    if found is None:
+        raise Refused(HTTPStatus.NOT_FOUND, "there are no photographs")
+    return found
 
 
 def _source(name: str, run: Path, base: str) -> SweepSource:

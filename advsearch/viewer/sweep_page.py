@@ -22,7 +22,6 @@ from advsearch.report.charts import NARROW, WIDE, study_chart
 from advsearch.report.distance import distance_axes, distance_of, distance_sentence
 from advsearch.report.drives import HEADS, drive_rows, drive_title
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.notebook import axis_cells
 from advsearch.report.phrases import answer_text, beside_text, is_command, percent
 from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
 from advsearch.runs import directory
@@ -31,8 +30,16 @@ from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.viewer.columns import Columns, read_columns
-from advsearch.viewer.document import data_script, data_url, document, scrolled
-from advsearch.viewer.study_page import facts_table, remarks_html, study_table, subject_html
+from advsearch.viewer.document import (
+    data_script,
+    data_url,
+    document,
+    facts_table,
+    remarks_html,
+    scrolled,
+    study_table,
+    subject_html,
+)
 from advsearch.viewer.thumbnails import Kept, kept_pictures
 
 MOST_EMBEDDED = 3_000_000
@@ -303,7 +310,16 @@ def _axes(summary: SweepSummary) -> Html:
 
 def _table(rows: Sequence[AxisRow]) -> Html:
     heads = ("value", "configurations", "right", "accuracy", "95 % interval")
-    return study_table(heads, [axis_cells(row)[1:] for row in rows])
+    return study_table(heads, [_cells(row) for row in rows])
+
+
+def _cells(row: AxisRow) -> list[str]:
+    """What a table says of a value of an axis: value, configurations, right, accuracy, interval."""
+    ends = row.value if isinstance(row.value, (list, tuple)) else [row.value]
+    value = " to ".join(f"{end:g}" if isinstance(end, float) else str(end) for end in ends)
+    unit = f" {row.unit}" if row.unit not in ("", "name") else ""
+    counts = [str(row.configurations), str(row.correct)]
+    return [value + unit, *counts, percent(row.accuracy), wording.interval_text(row.interval)]
 
 
 def _cost(path: Path, summary: SweepSummary) -> Html:

@@ -14,9 +14,9 @@ from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.attack import problem_from_config
-from advsearch.cli.attack import answer as answer_text
+from advsearch.cli.output import shown_text as answer_text
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.runs.listing import can_resume, listed_runs

@@ -29,8 +29,8 @@ from advsearch.engine.run_settings import given_to
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import NullProgress
+from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region.answer import RegionResult
-from advsearch.report.tables import GapTable
 from advsearch.runs.results.base import Result
 from advsearch.watching import BarProgress, LineProgress, NotebookProgress, watched
 
@@ -125,7 +125,7 @@ def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.
     assert isinstance(again, SweepResult) and again.summary == swept.summary and [*again.rows()] == [*swept.rows()]
     gap = advsearch.gap(scene, model, controls="pose.yaw", average=6, policy="random", run=tmp_path / "gap", **FAST)
     again = advsearch.load_run(tmp_path / "gap")
-    assert isinstance(again, GapTable) and again == gap and "PNG" in repr(again._repr_png_())
+    assert isinstance(again, GapResult) and again == gap and "PNG" in repr(again._repr_png_())
     few = {**PICTURE, "samples": 8, "map": 0, "verify_spp": 1}
     del few["spp"]
     region = advsearch.region(scene, model, controls="pose.yaw", run=tmp_path / "region", **few)
@@ -293,9 +293,9 @@ def _other() -> Callable[..., float]:
 
 
 def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
-    from advsearch.api.sweep import job_of, sweep_answers
     from advsearch.config import SweepConfig
     from advsearch.engine.metrics import metrics_as_settings, only_here
+    from advsearch.questions.sweep.carry_out import job_of, sweep_answers
 
     named = metrics_as_settings({"red": red, "own": lambda image, output, truth: 0.0})
     assert named == {"red": f"{__name__}:red", "own": "<lambda>"}

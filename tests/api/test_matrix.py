@@ -14,17 +14,18 @@ from stand_ins import rows, shared
 from torch import Tensor
 
 import advsearch
-from advsearch.api import parts
-from advsearch.api.attack import attack_from_config
-from advsearch.api.gap import models_answering
+from advsearch.api import studies as parts
 from advsearch.attacks import get_objective
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig, GapConfig
+from advsearch.config import AttackConfig
 from advsearch.engine.objective import of_ensemble
 from advsearch.engine.retrial import Retrials
 from advsearch.errors import InputError
 from advsearch.models.ensemble import of_each, together
-from advsearch.runs.results.matrix import MatrixResult
+from advsearch.questions.attack.answer import MatrixResult
+from advsearch.questions.attack.carry_out import attack_from_config
+from advsearch.questions.attack.matrix import models_answering
+from advsearch.questions.gap.settings import GapConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Classification

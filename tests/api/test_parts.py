@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 
-from advsearch.api import parts
-from advsearch.api.gap import curve_from_config, gap_from_config
-from advsearch.api.parts import chains_of
+from advsearch.api import studies as parts
+from advsearch.api.studies import chains_of
 from advsearch.cluster.executor import Done, Work, Workforce
-from advsearch.config import AttackConfig, GapConfig
+from advsearch.config import AttackConfig
 from advsearch.errors import ClusterError
+from advsearch.questions.attack.curve import curve_from_config
+from advsearch.questions.gap.carry_out import gap_from_config
+from advsearch.questions.gap.settings import GapConfig
 from advsearch.runs.answer import read_answer
 from advsearch.runs.store import NAME, Store
 
@@ -41,7 +43,7 @@ class Backwards:
 
     def __init__(self, work: Work, lost: str) -> None:
         self.call, self.lost = parts.attacks_of(work.settings), lost
-        assert work.function == "advsearch.api.parts:attacks_of" and not work.ahead
+        assert work.function == "advsearch.api.studies:attacks_of" and not work.ahead
 
     def results(self, ranges: Iterable[range]) -> Iterator[Done]:
         for one in reversed(list(ranges)):

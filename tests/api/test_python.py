@@ -124,7 +124,7 @@ def test_a_notebook_shows_verdict_pictures_and_tables(attacked: Any, swept: advs
     assert page.count('<img src="data:image/png;base64,') == 2 and "<th>95 % interval</th>" in page
     assert "<td>clean</td>" in page and "<script" not in page
     page = swept._repr_html_()
-    assert page.count("<img") == 1 and "<td>pose.yaw</td>" in page and "<td>90 degrees</td>" in page
+    assert page.count("<img") == 1 and "<b>pose.yaw, degrees</b>" in page and "<td>90</td>" in page
 
 
 def test_rows_become_a_table_of_pandas(

@@ -24,7 +24,6 @@ from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api import attack as attacking
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS, AttackConfig, SweepConfig
 from advsearch.controls import Control
@@ -34,6 +33,7 @@ from advsearch.controls.texture import TextureControl
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
+from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.report.wording import objective_text
 from advsearch.runs.directory import is_run

@@ -16,13 +16,16 @@ from samples import attack as attacked
 
 import advsearch
 from advsearch.api import carry_out
-from advsearch.api import gap as studies
-from advsearch.cli.gap import answer
 from advsearch.cli.main import main
+from advsearch.cli.output import shown_text as answer
 from advsearch.cli.output import shown_text as region_text
-from advsearch.config import AttackConfig, GapConfig
+from advsearch.config import AttackConfig
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack.curve import curve_from_config
+from advsearch.questions.gap.carry_out import gap_from_config
+from advsearch.questions.gap.settings import GapConfig
 from advsearch.questions.region import carry_out as mapping
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
@@ -48,7 +51,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[AttackConfig]
             run.write_summary(summary)
         return SimpleNamespace(summary=summary)
 
-    monkeypatch.setattr(studies, "attack_once", attack)
+    monkeypatch.setattr(attacking, "attack_once", attack)
     return done
 
 
@@ -68,7 +71,7 @@ def summary_of(config: AttackConfig, run: str) -> AttackSummary:
 
 def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
-    summary = studies.curve_from_config(config)
+    summary = curve_from_config(config)
     told = [(one.epsilon, one.robust, one.found, one.already_wrong) for one in summary.curve]
     assert told == [(0.01, 3, 0, 1), (0.05, 2, 1, 1), (0.1, 1, 2, 1)]
     low, high = summary.curve[1].interval
@@ -85,7 +88,7 @@ def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]
 
 
 def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[AttackConfig]) -> None:
-    summary = studies.curve_from_config(AttackConfig(object="mug,bowl", label="mug", run="curve"))
+    summary = curve_from_config(AttackConfig(object="mug,bowl", label="mug", run="curve"))
     assert any("also for bowl (its own is 'bowl')" in text for text in summary.warnings)
 
 
@@ -94,12 +97,14 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
     several: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     run = str(tmp_path / "it")
-    monkeypatch.setattr(studies, "curve_from_config", lambda config, **more: samples.curve(run=config.run))
+    monkeypatch.setattr(
+        "advsearch.questions.attack.curve.curve_from_config", lambda config, **more: samples.curve(run=config.run)
+    )
     assert carry_out(AttackConfig(**several, run=run)) == samples.curve(run=run)
 
 
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
-    summary = studies.curve_from_config(AttackConfig(object="mug,pan", run="study"))
+    summary = curve_from_config(AttackConfig(object="mug,pan", run="study"))
     assert [row.ending for row in summary.table] == ["found", "budget spent"]
     assert [one.robust for one in summary.curve] == [1] and len(asked) == 2
 
@@ -108,19 +113,19 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     asked: list[AttackConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = GapConfig(object="mug,bowl", controls="texture,geometry", run="study")
-    carry_out: Callable[..., Any] = vars(studies)["attack_once"]
+    carry_out: Callable[..., Any] = attacking.attack_once
 
     def stopped(config: AttackConfig, *, progress: Any, clean: CleanMatrix | None = None) -> Any:
         if len(asked) == 2:
             raise KeyboardInterrupt
         return carry_out(config, progress=progress)
 
-    monkeypatch.setattr(studies, "attack_once", stopped)
+    monkeypatch.setattr(attacking, "attack_once", stopped)
     with pytest.raises(KeyboardInterrupt):
-        studies.gap_from_config(config)
+        gap_from_config(config)
     assert Path("runs/study/parts/00-00-mug-texture/summary.json").is_file()
-    monkeypatch.setattr(studies, "attack_once", carry_out)
-    summary = studies.gap_from_config(config, resumed=Path("runs/study"))
+    monkeypatch.setattr(attacking, "attack_once", carry_out)
+    summary = gap_from_config(config, resumed=Path("runs/study"))
     assert [(row.object, row.control) for row in summary.table] == [
         ("mug", "texture"), ("mug", "geometry"), ("bowl", "texture"), ("bowl", "geometry"),
     ]  # fmt: skip
@@ -130,12 +135,12 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
 
 def test_a_gap_gives_each_control_its_own_budget(asked: list[AttackConfig]) -> None:
     config = GapConfig(object="mug", controls="texture,pose", epsilon="texture=0.05", run="study", average=7)
-    studies.gap_from_config(config)
+    gap_from_config(config)
     assert [(one.epsilon, one.average, list(one.controls)) for one in asked] == [
         ({"texture": 0.05}, 7, ["texture"]), (None, 7, ["pose"]),
     ]  # fmt: skip
     with pytest.raises(InputError, match="epsilon: several make a curve"):
-        studies.gap_from_config(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
+        gap_from_config(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
 
 
 # ---- rendered -------------------------------------------------------------------------------------------------------

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from advsearch.attacks.domain import TOLERANCE, Block, Domain, centre_of_option
-from advsearch.attacks.projections import project_l2_box
+from advsearch.attacks.domain import TOLERANCE, Block, Domain, centre_of_option, project_l2_box
 from advsearch.errors import InputError
 
 QP_TOLERANCE = 2e-5  # SLSQP stops here; the projection itself is exact to float32

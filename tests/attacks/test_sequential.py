@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from advsearch.attacks.sequential import STAKES, ConfidenceSequence, capital
+from advsearch.attacks.trials import STAKES, ConfidenceSequence, capital
 from advsearch.errors import InputError
 
 STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "sequential.py"

@@ -28,16 +28,17 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 import advsearch
 from advsearch import __version__
 from advsearch.cli import list as listing
-from advsearch.cli.attack import answer
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import aligned, finish
+from advsearch.cli.output import shown_text as answer
 from advsearch.cli.progress import watch_progress
-from advsearch.config import AttackConfig, GapConfig, SweepConfig
+from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
+from advsearch.questions.gap.settings import GapConfig
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
@@ -433,14 +434,21 @@ def test_several_objects_or_epsilons_are_a_curve(
     assert main(["attack", *line.split(), "--quiet"]) == 0
     assert given[0].is_study
     assert capsys.readouterr().out == (
-        "  object   clean right   ending   epsilon   wrong   margin\n"
-        "  mug      20/20         found    0.1       19/20   1.50\n"
-        "  bowl     not reached\n"
-        "  margin: how far the wrong answer leads the right one, in logits, in the trials of the worst case\n\n"
+        "Still recognised: 3 of 4 at epsilon 0.01.\n\n"
+        "Robust accuracy\n"
         "  epsilon   robust   accuracy   95 % interval   wrong already\n"
         "  0.01      3/4      75 %       35-97 %         1\n\n"
-        "  time   9.0 s\n"
-        "  run    runs/mug-texture-001\n"
+        "The objects, at the last epsilon tried\n"
+        "  object   clean right   ending        epsilon   wrong   margin\n"
+        "  mug      20/20         found         0.1       19/20   1.50\n"
+        "  bowl                   not reached\n\n"
+        "Margin: how far the wrong answer leads the right one, in logits, in the trials of the worst case.\n\n"
+        "  model         reference\n"
+        "  policy        auto\n"
+        "  environment   studio\n"
+        "  time          9.0 s\n"
+        "  seed          0\n"
+        "  page          runs/mug-texture-001/report.html\n"
     )
     assert main(["attack", *line.split(), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == samples.curve().to_dict()
@@ -455,11 +463,17 @@ def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
     assert main(argv) == 0
     assert given == [GapConfig(object="mug,bowl", controls={"pose": {}, "light": {}}, average=50, run="x")]
     assert capsys.readouterr().out == (
+        "The model is right in 75 % of random configurations, yet one is found that it gets wrong.\n\n"
+        "The worst case beside the average\n"
         "  object   control   right on average   95 % interval   worst: wrong   margin   ending\n"
-        "  mug      pose      150/200 (75 %)     35-97 %         20/20          3.25     found\n"
-        "  margin: how far the wrong answer leads the right one, in logits, in the trials of the worst case\n\n"
-        "  time   9.0 s\n"
-        "  run    runs/mug-pose-001\n"
+        "  mug      pose      150/200 (75 %)     35-97 %         20/20          3.25     found\n\n"
+        "Margin: how far the wrong answer leads the right one, in logits, in the trials of the worst case.\n\n"
+        "  model         reference\n"
+        "  policy        auto\n"
+        "  environment   studio\n"
+        "  time          9.0 s\n"
+        "  seed          0\n"
+        "  page          runs/mug-pose-001/report.html\n"
     )
 
 
@@ -471,7 +485,7 @@ def test_an_interrupted_study_says_how_to_go_on(
     api(lambda config, progress, resumed: answer)
     assert main([command, "--object", "mug,bowl"]) == 130
     assert capsys.readouterr().out.endswith(
-        f"\n\nInterrupted.\n\nGo on with: advsearch resume {Path(answer.run).name}\n"
+        f"\n\nNote: Interrupted before its end.\n\nGo on with: advsearch resume {Path(answer.run).name}\n"
     )
 
 
@@ -836,8 +850,8 @@ def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
 @pytest.mark.parametrize(
     ("summary", "first"),
     [
-        (samples.gap(), "  object   control   right on average"),
-        (samples.curve(), "  object   clean right   ending"),
+        (samples.gap(), "The model is right in 75 % of random configurations"),
+        (samples.curve(), "Still recognised: 3 of 4 at epsilon 0.01."),
         (samples.region(), "The model is wrong in 200 of 200 fresh samples of this box"),
         (samples.sweep(), "The model is right in 6 of 8 configurations"),
     ],
@@ -876,14 +890,15 @@ def test_doctor_passes_its_status_on(flag: list[str], monkeypatch: pytest.Monkey
 def test_the_table_is_read_in_five_seconds() -> None:
     assert answer(SUMMARY) == (
         "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %).\n\n"
-        "  clean           mug           98 %   right in 20 of 20   83-100 %\n"
-        "  adversarial     vase          91 %   wrong in 20 of 20   83-100 %\n"
-        "  random search   40 pictures          wrong in 1 of 20    0.1-25 %\n\n"
-        "  changed    texture within 0.1 (linf: the largest change of any value)\n"
-        "  search     pgd, 40 steps: found\n"
-        "  renders    40 of the search, 40 gradients, 21 of the verification\n"
-        "  time       14.6 s\n"
-        "  pictures   runs/mug-texture-001"
+        "                  answer        probability   rate                95 % interval\n"
+        "  clean           mug           98 %          right in 20 of 20   83-100 %\n"
+        "  adversarial     vase          91 %          wrong in 20 of 20   83-100 %\n"
+        "  random search   40 pictures                 wrong in 1 of 20    0.1-25 %\n\n"
+        "  changed   texture within 0.1 (linf: the largest change of any value)\n"
+        "  search    pgd, 40 steps: found\n"
+        "  renders   40 of the search, 40 gradients, 21 of the verification\n"
+        "  time      14.6 s\n"
+        "  page      runs/mug-texture-001/report.html"
     )
 
 
@@ -901,10 +916,11 @@ def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -
     assert answer(summary) == (
         "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %), each with another"
         " camera.\n\n"
-        "  clean           mug                  98 %   right in 20 of 20     83-100 %\n"
-        "  adversarial     vase                 91 %   target in 20 of 20    83-100 %\n"
-        "  random search   40 pictures                 target in 1 of 20     0.1-25 %\n"
-        "  average case    200 configurations          right in 150 of 200   68-81 %\n\n"
+        "                  answer               probability   rate                  95 % interval\n"
+        "  clean           mug                  98 %          right in 20 of 20     83-100 %\n"
+        "  adversarial     vase                 91 %          target in 20 of 20    83-100 %\n"
+        "  random search   40 pictures                        target in 1 of 20     0.1-25 %\n"
+        "  average case    200 configurations                 right in 150 of 200   68-81 %\n\n"
         "  wanted     the model should answer vase\n"
         "  changed    texture within 0.1 (linf: the largest change of any value)\n"
         "  over       camera, drawn anew for every picture\n"
@@ -912,13 +928,13 @@ def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -
         "  search     pgd, 40 steps: found\n"
         "  renders    40 of the search, 40 gradients, 21 of the verification\n"
         "  time       14.6 s\n"
-        "  pictures   runs/mug-texture-001"
+        "  page       runs/mug-texture-001/report.html"
     )
 
 
 def test_easier_to_recognise_is_not_called_wrong() -> None:
     text = answer(samples.attack(**EASIER))
-    assert "wanted     easier to recognise\n" in text
+    assert "wanted    easier to recognise\n" in text
     assert "easier in 20 of 20" in text and "wrong in" not in text
 
 
@@ -926,7 +942,7 @@ def test_a_table_of_almost_nothing() -> None:
     clean = {**ATTACK["clean"], "label": "vase", "probability": None, "control": None}
     text = answer(samples.attack(ending="already wrong", clean=clean, adversarial=None, verified=None, baseline=None))
     assert text.startswith("The model already calls this mug a vase")
-    assert "  clean   vase      not verified\n" in text
+    assert "  clean   vase                   not verified\n" in text
 
 
 def test_columns() -> None:

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.api.sweep import sweep_from_config
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.config import SweepConfig
@@ -19,6 +18,7 @@ from advsearch.controls.clean import sentences
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.runs.results.base import plain
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, describe

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.attack import problem_of
 from advsearch.attacks import Query, get_objective
 from advsearch.config import AttackConfig
 from advsearch.engine import bank
+from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.bank import Bank
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Predictor, Transport

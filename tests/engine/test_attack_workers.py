@@ -11,11 +11,11 @@ import torch
 from stand_ins import shared
 
 import advsearch
-from advsearch.api.attack import attack_once
-from advsearch.cli.attack import answer
+from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_result import AttackResult
 from advsearch.errors import InputError
+from advsearch.questions.attack.carry_out import attack_once
 from advsearch.runs.store import Row, Store
 
 SMALL: dict[str, Any] = {

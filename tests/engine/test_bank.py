@@ -10,13 +10,13 @@ import torch
 from stand_ins import Impatient, rows, shared
 
 import advsearch
-from advsearch.api.attack import attack_once
 from advsearch.attacks.domain import Block, Domain
 from advsearch.config import AttackConfig
 from advsearch.engine import bank, transport
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.bank import Bank, stratified
 from advsearch.errors import ClusterError
+from advsearch.questions.attack.carry_out import attack_once
 from advsearch.scene.surface import plan
 
 SMALL: dict[str, Any] = {

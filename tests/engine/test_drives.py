@@ -14,8 +14,7 @@ from test_sweep_workers import Disorder, rows, summary
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.sweep import job_of
-from advsearch.cli.sweep import answer
+from advsearch.cli.output import shown_text as answer
 from advsearch.config import SweepConfig
 from advsearch.engine.sharing import answering
 from advsearch.engine.sweeps import swept_scene
@@ -24,6 +23,7 @@ from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import DriveRates
 

@@ -8,22 +8,20 @@ from typing import Any
 
 import pytest
 import torch
-from samples import attack, make_run
+from samples import attack, make_run, written_page
 from stand_ins import StandInProblem, attack_on, configuration
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult, make_policy
-from advsearch.attacks.failure_share import FailureShare
-from advsearch.attacks.failures import Failures, FoundFailure
+from advsearch.attacks.failures import Failures, FailureShare, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, Rule
-from advsearch.cli.attack import answer
+from advsearch.cli.output import shown_text as answer
 from advsearch.engine.failures import TRIED, check_failures, described_failures
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.stages import Attack
 from advsearch.progress import NullProgress
-from advsearch.report.failures import failure_rows, failures_text
+from advsearch.questions.attack.words import failures_part, failures_text
 from advsearch.runs.results.attack import DifferentFailures
-from advsearch.viewer.attack_page import write_report
 
 NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))
 
@@ -85,8 +83,8 @@ def test_no_more_are_tried_than_is_said_and_the_rest_is_a_claim() -> None:
     assert told.tried == TRIED
     assert [one.holds for one in told.listed[TRIED:]] == [None] * 3
     assert failures_text(told).endswith(f"with fresh renders {TRIED} of the {TRIED} that were tried hold")
-    assert len(failure_rows(told)) == TRIED + 3 and len(failure_rows(told, tried=True)) == TRIED
-    assert failure_rows(told)[-1][2] == "not tried"
+    assert len(failures_part(told).rows) == TRIED + 3 and len(failures_part(told, tried=True).rows) == TRIED
+    assert failures_part(told).rows[-1][2] == "not tried"
 
 
 def test_over_conditions_none_is_tried_and_that_is_said() -> None:
@@ -106,7 +104,7 @@ def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
     few = described(checked(replace(known, share=replace(share, estimate=None))))
     assert "2.1-8 % fail in one render (95 % interval); with fresh" in failures_text(few)
     assert (
-        failure_rows(described(checked(Failures((replace(failure(0.9), ranges={}),), (), 1, 9, None))))[0][0]
+        failures_part(described(checked(Failures((replace(failure(0.9), ranges={}),), (), 1, 9, None)))).rows[0][0]
         == "anywhere"
     )
 
@@ -114,7 +112,7 @@ def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
 def test_ranges_are_in_units_and_a_choice_has_its_option() -> None:
     (one,) = described(checked(failures(0.9))).listed
     assert one.ranges == {"u.0": pytest.approx((76.5, 85.5)), "kind": "brass"}
-    assert failure_rows(described(checked(failures(0.9))))[0][0] == "u.0 76.5 to 85.5 degrees, kind brass"
+    assert failures_part(described(checked(failures(0.9)))).rows[0][0] == "u.0 76.5 to 85.5 degrees, kind brass"
 
 
 def test_a_policy_that_looks_for_one_failure_has_none_of_it() -> None:
@@ -125,7 +123,7 @@ def test_a_policy_that_looks_for_one_failure_has_none_of_it() -> None:
 def test_the_page_and_the_table_have_them(tmp_path: Path) -> None:
     known = described(checked(failures(0.9, 0.45)))
     summary = attack(failures=known.to_dict())
-    page = write_report(make_run(tmp_path / "run", summary)).read_text(encoding="utf-8")
+    page = written_page(make_run(tmp_path / "run", summary)).read_text(encoding="utf-8")
     assert "Different failures" in page and "1 of the 2 that were tried hold" in page
     assert "u.0 76.5 to 85.5 degrees, kind brass" in answer(summary)
     assert "30 of 100 cells over u.0 and kind (50 were seen)" in answer(summary)

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from advsearch import load_scene
-from advsearch.api.attack import problem_from_config
 from advsearch.config import AttackConfig
 from advsearch.controls import make_control
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import (
     Estimate,
     Probe,

@@ -11,13 +11,13 @@ from covering import only
 from small_models import easy
 
 import advsearch
-from advsearch.api.attack import attack_once
-from advsearch.cli.attack import answer
+from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig
 from advsearch.engine.print_terms import off_print, variation
 from advsearch.engine.record import Stages
 from advsearch.errors import InputError
-from advsearch.report.method import method_facts
+from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.method import method_facts
 from advsearch.report.wording import print_cost_text, renders_text
 
 SHORT: dict[str, Any] = {

@@ -29,14 +29,13 @@ from samples import sweep as swept
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.sweep import job_of, sweep_from_config
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.draws import NET, Draws, Seeds
 from advsearch.attacks.product import Product, batches
 from advsearch.cli.flags import READERS, help_text, with_flags
 from advsearch.cli.main import main
+from advsearch.cli.output import shown_text as answer
 from advsearch.cli.question import QuestionCommand
-from advsearch.cli.sweep import answer
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
@@ -48,6 +47,7 @@ from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.points import Points, parts_of_ranges
 from advsearch.errors import AdvsearchError, InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
+from advsearch.questions.sweep.carry_out import job_of, sweep_from_config
 from advsearch.report.wording import formation_text
 from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
@@ -867,7 +867,7 @@ def test_the_command_prints_a_table(
     assert status == 0
     assert "in 0 of 60 configurations (0 %, 95 % interval 0-6 %)" in out or "in 60 of 60 configurations (100 %" in out
     assert "pose.yaw, degrees (the 12 of 30 values where the model is right least often)" in out
-    assert "camera.elevation, degrees\n" in out and "kept in   runs/mug-sweep-001" in out
+    assert "camera.elevation, degrees\n" in out and "runs/mug-sweep-001/report.html" in out
 
 
 @pytest.mark.parametrize(

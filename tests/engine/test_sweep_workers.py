@@ -14,9 +14,8 @@ from samples import sweep as swept
 from test_sweep import FakeRenderer
 
 import advsearch
-from advsearch.api.sweep import job_of
 from advsearch.cli.main import main
-from advsearch.cli.sweep import answer
+from advsearch.cli.output import shown_text as answer
 from advsearch.cluster.executor import Call, Done, Workforce
 from advsearch.config import SweepConfig
 from advsearch.engine.rows import LOST
@@ -26,6 +25,7 @@ from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.store import NAME, Store

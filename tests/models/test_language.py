@@ -18,7 +18,8 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
-from advsearch.models.zoo import language, memory
+from advsearch.models.zoo import language
+from advsearch.models.zoo import transformers as own
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import FreeAnswer
@@ -280,7 +281,7 @@ def test_weights_larger_than_the_memory_are_refused(tmp_path: Path, monkeypatch:
     spec = published(tmp_path / "net", llava())
     told = tmp_path / "meminfo"
     told.write_text("MemTotal: 99 kB\nMemAvailable: 10 kB\nSwapFree: 2 kB\n")
-    monkeypatch.setattr(memory, "MEMORY", told)
+    monkeypatch.setattr(own, "MEMORY", told)
     with pytest.raises(ModelError, match=r"its weights take 5.*e-05 GB, and 1.23e-05 GB of memory are free"):
         load_model(spec, labels=NAMES)
 

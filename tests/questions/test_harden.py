@@ -12,10 +12,10 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.api.attack import executor_for
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import executor_for
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
 from advsearch.models import Model

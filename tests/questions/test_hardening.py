@@ -19,9 +19,9 @@ from small_models import Colours
 from torch import Tensor, nn
 
 from advsearch import threads
-from advsearch.api.attack import problem_of
 from advsearch.attacks import Block, Domain
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference

@@ -11,11 +11,11 @@ import torch
 from covering import only
 
 from advsearch import attack, load_scene
-from advsearch.api.attack import problem_from_config
 from advsearch.attacks import Query
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig
 from advsearch.controls import LightControl, TextureControl
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.path_length import BOUND, measured_bounces
 from advsearch.questions.plan.carry_out import plan_from_config

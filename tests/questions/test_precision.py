@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from advsearch.api import attack as attacking
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as precision_text
 from advsearch.cluster.executor import Done, InProcess, Workforce
 from advsearch.config import AttackConfig
+from advsearch.engine import attack_parts as attacking
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import load_scene
 from advsearch.errors import ClusterError, InputError

@@ -11,13 +11,14 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.api.attack import attack_once, problem_from_config
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.errors import FileFormatError, InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.replay import carry_out as replaying
 from advsearch.questions.replay.settings import ReplayConfig
 from advsearch.runs.answer import read_answer, write_answer

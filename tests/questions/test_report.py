@@ -13,6 +13,7 @@ import samples
 
 from advsearch.questions.explain.answer import ExplainResult
 from advsearch.questions.harden.answer import HardenResult
+from advsearch.questions.photographs.answer import PhotoAgreement
 from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.report.answer import Evidence
@@ -21,7 +22,6 @@ from advsearch.questions.report.page import evidence_page
 from advsearch.questions.report.runs import evidence_of, markdown
 from advsearch.report.claims import ENDED, NO_PROOF, NOTHING, Claim
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.photos import PhotoAgreement
 from advsearch.runs.summary import to_json
 
 ENDINGS = (

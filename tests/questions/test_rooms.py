@@ -34,7 +34,8 @@ def test_without_the_folders_of_three_questions_the_tool_works(tmp_path: Path) -
     listed = told("-m", "advsearch", "list", "objects")
     assert listed.returncode == 0 and "mug" in listed.stdout
     asked = (
-        "import advsearch; from advsearch.config import CONFIGS; import advsearch.api.attack, advsearch.viewer.pages; "
+        "import advsearch; from advsearch.config import CONFIGS; import advsearch.viewer.pages; "
+        "import advsearch.questions.attack.carry_out; "
         "import advsearch.questions.report.claims, advsearch.questions.explain.carry_out; print(*CONFIGS)"
     )
     known = told("-c", asked)

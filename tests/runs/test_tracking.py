@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from advsearch.api.attack import attack_from_config
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.errors import InputError
+from advsearch.questions.attack.carry_out import attack_from_config
 from advsearch.runs import tracking
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Store

@@ -27,9 +27,8 @@ from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import objects, unwrap
 from advsearch.scene.importing.images import area_average, display_image
-from advsearch.scene.importing.objects import import_object
+from advsearch.scene.importing.objects import guess_up, import_object
 from advsearch.scene.importing.texture import filtered, sampled
-from advsearch.scene.importing.upright import guess_up
 
 DATA = conftest.DATA / "objects"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
@@ -1032,7 +1031,7 @@ def test_large_pictures_are_averaged_in_bands_to_the_same_values(monkeypatch: py
 )
 def test_faces_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, face: str, message: str) -> None:
     if "20 triangles" in message:
-        monkeypatch.setattr("advsearch.scene.importing.checks.LARGEST_FACES", 20)
+        monkeypatch.setattr("advsearch.scene.importing.files.LARGEST_FACES", 20)
     with pytest.raises(FileFormatError, match=message):
         import_object(written(tmp_path, "thing.obj", QUAD_V + face))
 

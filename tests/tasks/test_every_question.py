@@ -15,12 +15,12 @@ from small_models import SIDE, Finder, Painter, Slider
 from torch import nn
 
 import advsearch
-from advsearch.api.photos import Photographs
 from advsearch.cli.main import main
+from advsearch.questions.photographs.carry_out import Photographs
+from advsearch.questions.photographs.files import rendering_file
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
-from advsearch.viewer.photos import rendering_file
 
 ALSO_SLOWLY = pytest.mark.parametrize(
     "asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True

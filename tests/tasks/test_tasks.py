@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.attack import problem_from_config
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective, get_objective
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS, AttackConfig
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.errors import InputError, ModelError, UnknownNameError
 from advsearch.models import load_model
 from advsearch.options import as_setting
@@ -261,8 +261,8 @@ def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: in
 @pytest.mark.parametrize("command", ["precision", "check", "plan", "attack"])
 def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     network = load_model(Level(), input_size=8, read=Yaw().reader)
-    monkeypatch.setattr("advsearch.api.attack.make_task", lambda name: Yaw())
-    monkeypatch.setattr("advsearch.api.attack.load_models", lambda *_, **__: ((network,), []))
+    monkeypatch.setattr("advsearch.engine.attack_parts.make_task", lambda name: Yaw())
+    monkeypatch.setattr("advsearch.engine.attack_parts.load_models", lambda *_, **__: ((network,), []))
     config: Any = CONFIGS[command]
     problem, _ = problem_from_config(config(object="mug", resolution=16, controls={"pose": {"yaw": [0, 90]}}))
     image = torch.full((16, 16, 3), 0.5)

@@ -25,20 +25,22 @@ from samples import (
     keep_object,
     make_run,
     rated,
+    written_page,
 )
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
+from advsearch.questions.attack.page import LARGE_PICTURE, SMALLER_SIDE
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.markup import Html, element, join_html
+from advsearch.report.notebook import figure_of_answer
 from advsearch.report.phrases import objective_label, percent
-from advsearch.report.studies import gap_figure
+from advsearch.report.shown import shown
 from advsearch.report.style import CSS
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.images import read_png
-from advsearch.viewer.attack_page import LARGE_PICTURE, SMALLER_SIDE, write_report
 from advsearch.viewer.document import asset
 from advsearch.viewer.turning import LARGEST, object_section, read_object
 
@@ -81,7 +83,7 @@ class Page(HTMLParser):
 
 def page_of(run: Path) -> Page:
     """Return the parsed report of a run."""
-    return Page(write_report(run).read_text(encoding="utf-8"))
+    return Page(written_page(run).read_text(encoding="utf-8"))
 
 
 # ---- the page ----
@@ -148,7 +150,7 @@ def test_the_page_does_not_say_what_was_not_asked(tmp_path: Path) -> None:
 def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     keep_object(run)
-    text = write_report(run).read_text()
+    text = written_page(run).read_text()
     page, code = Page(text), "\n".join(map(asset, ("make.js", "attack.js", "object.js")))
     assert code in text
     assert not re.search(r"\b(fetch|import|XMLHttpRequest|WebSocket|https?:)", code)
@@ -174,7 +176,7 @@ def test_the_page_is_accessible(tmp_path: Path) -> None:
 
 
 def test_a_phone_gets_a_chart_that_fits_with_letters_that_can_be_read(tmp_path: Path) -> None:
-    text = write_report(make_run(tmp_path / "run")).read_text(encoding="utf-8")
+    text = written_page(make_run(tmp_path / "run")).read_text(encoding="utf-8")
     narrow = next(svg for svg in Page(text).all("svg") if svg["class"] == "chart narrow")
     width = float(str(narrow["viewbox"]).split()[2])
     assert (
@@ -247,7 +249,7 @@ def test_a_large_picture_is_embedded_smaller(tmp_path: Path) -> None:
 
 def test_without_a_summary_there_is_no_page(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="expected the summary of a run"):
-        write_report(tmp_path)
+        written_page(tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -295,7 +297,7 @@ def test_any_name_may_stand_in_a_chart(name: str) -> None:
 def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() -> None:
     average = {**AVERAGE, "accuracy": 1.0, "interval": [1.0, 1.0]}
     row = {**GAP["table"][0], "average": average, "worst": rated(0), "ending": "budget spent"}
-    figure = gap_figure(gap(table=[row]))["png"]
+    figure = figure_of_answer(shown(gap(table=[row])))["png"]
     pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
     pixels = pixels[: int(0.55 * len(pixels))]  # without the axis and the legend
     for colour in ((0x1D, 0x5F, 0xD0), (0xB3, 0x26, 0x1E)):
@@ -304,7 +306,8 @@ def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() 
 
 def test_every_row_of_a_gap_is_drawn_whole() -> None:
     row = {**GAP["table"][0], "worst": rated(10), "ending": "budget spent"}
-    figure = gap_figure(gap(table=[{**row, "control": name} for name in ("pose", "light", "camera")]))["png"]
+    several = gap(table=[{**row, "control": name} for name in ("pose", "light", "camera")])
+    figure = figure_of_answer(shown(several))["png"]
     pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
     red = (pixels[..., 0] - pixels[..., 1:].max(axis=-1) > 20).any(axis=1).astype(int)
     edges = np.diff(np.concatenate([[0], red, [0]])).nonzero()[0].reshape(-1, 2)
@@ -397,7 +400,7 @@ def test_the_verdict_says_what_is_known_and_no_more(fields: dict[str, Any], sent
 
 @pytest.mark.parametrize("goal", [ANY, TARGET, EASIER], ids=["wrong", "target", "easier"])
 def test_every_ending_has_a_verdict(goal: dict[str, Any]) -> None:
-    from advsearch.attacks.ending import Ending
+    from advsearch.attacks.verification import Ending
 
     said = [wording.attack_verdict(attack(ending=ending.value, **goal)) for ending in Ending]
     assert len(set(said)) == len(said)

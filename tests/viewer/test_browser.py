@@ -17,14 +17,28 @@ import numpy as np
 import pytest
 from covering import once_each
 from PIL import Image
-from samples import EXPLAIN, GAP, HARDEN, RECIPE, REPLAY, STABILITY, curve, gap, keep_object, make_run, matrix, region
+from samples import (
+    EXPLAIN,
+    GAP,
+    HARDEN,
+    RECIPE,
+    REPLAY,
+    STABILITY,
+    curve,
+    gap,
+    keep_object,
+    make_run,
+    matrix,
+    region,
+    written_page,
+)
 from samples import attack as attack_with
 from stored_sweeps import described, make_sweep, serving
 
-from advsearch.api.photos import Photographs
 from advsearch.config import AttackConfig
 from advsearch.questions.explain.answer import ExplainResult
 from advsearch.questions.harden.answer import HardenResult
+from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.stability.answer import StabilityResult
@@ -34,7 +48,6 @@ from advsearch.runs.results.base import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.tasks import Answer
 from advsearch.viewer import thumbnails
-from advsearch.viewer.attack_page import write_report
 from advsearch.viewer.bundle import write_bundle
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import write_page
@@ -101,7 +114,7 @@ def attack(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plan = {"renders_per_gradient": 0, "spp": None, "groups": [PLANNED]}
     run = make_run(tmp_path_factory.mktemp("runs") / "attack", attack_with(gradient_plan=plan))
     keep_object(run)
-    write_report(run)
+    written_page(run)
     return run
 
 

@@ -18,9 +18,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 from samples import CURVE, GAP, sweep
 
+from advsearch.questions.attack.answer import CurveResult
+from advsearch.questions.gap.answer import GapResult
 from advsearch.report.notebook import side_by_side
 from advsearch.report.studies import search_axes, sweep_axes
-from advsearch.report.tables import CurveTable, GapTable
 
 NOTEBOOK, LOSSES = ROOT / "docs" / "notebook.ipynb", ROOT / "docs" / "own-loss.ipynb"
 
@@ -84,12 +85,12 @@ def test_a_sweep_without_axes_draws_nothing() -> None:
 @pytest.mark.parametrize(
     ("table", "rows", "said"),
     [
-        (GapTable.of(GAP), {"object": "mug", "average.accuracy": 0.75, "worst.successes": 20}, "right in 75 %"),
-        (CurveTable.of(CURVE), {"epsilon": 0.01, "robust": 3, "accuracy": 0.75}, "Still recognised: 3 of 4"),
+        (GapResult.of(GAP), {"object": "mug", "average.accuracy": 0.75, "worst.successes": 20}, "right in 75 %"),
+        (CurveResult.of(CURVE), {"epsilon": 0.01, "robust": 3, "accuracy": 0.75}, "Still recognised: 3 of 4"),
     ],
 )
 def test_a_study_is_shown(
-    table: GapTable | CurveTable, rows: dict[str, Any], said: str, monkeypatch: pytest.MonkeyPatch
+    table: GapResult | CurveResult, rows: dict[str, Any], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def frame(data: list[dict[str, Any]], columns: list[str]) -> list[dict[str, Any]]:
         assert set(rows) <= set(columns)
@@ -105,13 +106,13 @@ def test_a_study_is_shown(
 
 def test_a_figure_is_a_picture_and_what_has_none_says_so() -> None:
     points = [{**CURVE["curve"][0], "epsilon": epsilon} for epsilon in (0.01, 0.1)]
-    several = CurveTable.of({**CURVE, "curve": points})
-    for table in (GapTable.of(GAP), several):
+    several = CurveResult.of({**CURVE, "curve": points})
+    for table in (GapResult.of(GAP), several):
         png = table._repr_png_()
         assert png is not None and png.startswith(b"\x89PNG")
         assert "<img" in table._repr_html_()
-    assert CurveTable.of(CURVE)._repr_png_() is None
-    assert GapTable.of({**GAP, "table": []})._repr_png_() is None
+    assert CurveResult.of({**CURVE, "curve": []})._repr_png_() is None
+    assert GapResult.of({**GAP, "table": []})._repr_png_() is None
 
 
 def test_pictures_stand_side_by_side() -> None:

@@ -22,15 +22,15 @@ from PIL import Image
 from samples import make_run
 from stored_sweeps import make_sweep, serving
 
-from advsearch.api.photos import Photographs, photo_agreement
 from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
+from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
+from advsearch.questions.photographs.files import LARGEST, photo_file, rendering_file, rendering_names, sound_photo
+from advsearch.questions.photographs.page import align_page
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.viewer import certificate
-from advsearch.viewer.align_page import align_page
-from advsearch.viewer.photos import LARGEST, photo_file, rendering_file, rendering_names, sound_photo
 from advsearch.viewer.server import Dashboard
 
 

@@ -18,9 +18,9 @@ from advsearch.questions.stability.answer import StabilityResult
 from advsearch.report.shown import fields_shown
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.gap import StudyResult
+from advsearch.runs.results.study import StudyResult
+from advsearch.viewer.document import heading
 from advsearch.viewer.pages import shown_page, write_page
-from advsearch.viewer.study_page import heading
 
 ACCURACIES = ((0.01, 7), (0.03, 4), (0.1, 1))
 

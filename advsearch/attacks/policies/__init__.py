@@ -16,9 +16,8 @@ from advsearch.attacks.policies.grid import Grid
 from advsearch.attacks.policies.mixture import Mixture
 from advsearch.attacks.policies.nes import NES
 from advsearch.attacks.policies.pgd import PGD
-from advsearch.attacks.policies.portfolio import Portfolio
+from advsearch.attacks.policies.portfolio import Portfolio, Restarts
 from advsearch.attacks.policies.random import Random
-from advsearch.attacks.policies.restarts import Restarts
 from advsearch.attacks.policies.sobol import Sobol
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options

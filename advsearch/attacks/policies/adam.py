@@ -9,11 +9,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Domain, half_widths
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.clipping import clipped
 from advsearch.attacks.policies.pgd import PATIENCE
-from advsearch.attacks.policies.scaling import half_widths
 from advsearch.errors import InputError
 
 

@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Domain, half_widths, wraps
 from advsearch.attacks.failures import Failures, FoundFailure, most_different
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
-from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.attacks.policies.surrogate import MOST_OWN, Observed, Surrogate
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
@@ -139,7 +138,10 @@ class MapElites(Policy[ArchiveState]):
         dims = [sizes[place] for place in spanned.tolist()]
         if math.prod(dims) > MOST_CELLS:
             raise InputError(f"cells: expected at most {MOST_CELLS} in all, got {math.prod(dims)}; set `cells` lower")
-        archive = _ribs().GridArchive(
+        # import the archives of ribs, which takes seconds
+        from ribs import archives
+
+        archive = archives.GridArchive(
             solution_dim=domain.dim,
             dims=dims,
             ranges=list(zip(domain.lower[spanned].tolist(), domain.upper[spanned].tolist(), strict=True)),
@@ -273,10 +275,3 @@ def _spanned(domain: Domain, over: str) -> Tensor:
     if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
         raise InputError(f"over: expected 1 to {MOST_SPANNED} different parameters, got {', '.join(names)}")
     return torch.tensor([places[name] for name in names])
-
-
-def _ribs() -> Any:
-    """Import the archives of ribs, which takes seconds."""
-    from ribs import archives
-
-    return archives

@@ -17,8 +17,7 @@ from typing import ClassVar, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Distribution, Domain
 from advsearch.attacks.evaluation import Evaluation, WhichGradient
 from advsearch.attacks.failures import Failures
 from advsearch.seeds import stream

@@ -9,13 +9,30 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import Block, Domain, centre_of_option
+from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
 from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
 from advsearch.attacks.policies.base import Counts, Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.racing import Race
-from advsearch.attacks.policies.stay import Stay
+
+
+@dataclass(frozen=True)
+class Stay(Policy[Tensor]):
+    """Proposes the configuration where it began, again and again; its state is that configuration. For wrappers."""
+
+    name: ClassVar[str] = "stay"
+    uses_gradient: ClassVar[bool] = False
+    handles_choices: ClassVar[bool] = True
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Tensor:
+        return domain.begin
+
+    def propose(self, state: Tensor, n: int) -> tuple[tuple[Proposal, ...], Tensor]:
+        return (Proposal(state),) * n, state
+
+    def update(self, state: Tensor, evaluated: Evaluated) -> Tensor:
+        return state
+
 
 MOST = 256
 """No more combinations than this take part."""

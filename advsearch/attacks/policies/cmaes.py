@@ -15,10 +15,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Distribution, Domain, half_widths, wraps
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
-from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
@@ -156,7 +154,11 @@ def _strategy(d: int, sigma: float, population: int, seed: int) -> Any:
         "verb_log": 0,
     }
     with _own_random(seed, 0):
-        return _pycma().CMAEvolutionStrategy(np.zeros(d), sigma, options)
+        # import pycma, which takes most of a second and complains that there is no matplotlib
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import cma
+        return cma.CMAEvolutionStrategy(np.zeros(d), sigma, options)
 
 
 def _anew(state: CMAESState, sigma: float) -> CMAESState:
@@ -232,11 +234,3 @@ def _own_random(seed: int, generation: int) -> Iterator[None]:
             yield
     finally:
         np.random.set_state(before)  # noqa: NPY002
-
-
-def _pycma() -> Any:
-    """Import pycma, which takes most of a second and complains that there is no matplotlib."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import cma
-    return cma

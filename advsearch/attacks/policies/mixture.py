@@ -9,11 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Domain, centre_of_option
-from advsearch.attacks.failure_share import failure_share
-from advsearch.attacks.failures import Failures, FoundFailure, most_different
+from advsearch.attacks.domain import Domain, centre_of_option, wraps
+from advsearch.attacks.failures import Failures, FoundFailure, failure_share, most_different
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
-from advsearch.attacks.policies.scaling import wraps
 from advsearch.errors import InputError
 
 MOST = 50

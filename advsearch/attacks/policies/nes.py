@@ -10,10 +10,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Distribution, Domain, half_widths, wraps
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
-from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.errors import InputError
 
 NARROWEST, WIDEST = 1e-4, 2.0

@@ -205,7 +205,10 @@ class PGD(Policy[PGDState]):
         ((u, evaluation),) = evaluated
         state = replace(state, count=state.count + 1)
         if not evaluation.finite:
-            return _retreat(state)
+            state = replace(state, step_size=state.step_size / 2, counts=state.counts + Counts(rejected=1))
+            if state.peak is None:
+                return _step(state, state.domain.begin, torch.zeros_like(state.u))
+            return replace(state, u=state.peak.u, direction=state.peak.direction)
         gradient = evaluation.gradient
         if gradient is not None:
             gradient, lengths, outliers = clipped(state.domain, gradient, state.lengths)
@@ -224,14 +227,6 @@ class PGD(Policy[PGDState]):
 
     def counts(self, state: PGDState) -> Counts:
         return state.counts
-
-
-def _retreat(state: PGDState) -> PGDState:
-    """Return to the best configuration itself with half the step size; if there is none, leave the start at random."""
-    state = replace(state, step_size=state.step_size / 2, counts=state.counts + Counts(rejected=1))
-    if state.peak is None:
-        return _step(state, state.domain.begin, torch.zeros_like(state.u))
-    return replace(state, u=state.peak.u, direction=state.peak.direction)
 
 
 def _accumulate(state: PGDState, gradient: Tensor | None, momentum: float) -> PGDState:

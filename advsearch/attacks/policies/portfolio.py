@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
@@ -13,8 +13,49 @@ from advsearch.attacks.policies.auto import Auto
 from advsearch.attacks.policies.base import Policy, draw_seed, seeded
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.policies.cmaes import CMAES
+from advsearch.attacks.policies.pgd import PGD
 from advsearch.attacks.policies.racing import Race, Raced
 from advsearch.errors import InputError
+
+
+@dataclass(frozen=True)
+class Restarts(Raced):
+    """Lets a policy search `times` times, each with an equal share of the renders; they take turns, step by step.
+
+    The first begins where the policy would begin by itself, the others at samples of the domain (`Domain.sample`); the
+    norm balls stay where they are. One that has nothing more to propose leaves its renders to the rest. For an
+    objective with several peaks, where a gradient finds the nearest. Discrete choices are fixed outside (`Choices`), so
+    every combination of options has its own restarts.
+
+    Attributes:
+        policy: what searches; in `make_policy` a name, or a mapping with a name and options.
+        times: at least 1; fewer if the renders do not suffice for one evaluation each.
+
+    Raises:
+        InputError: a value is outside what is said here.
+    """
+
+    policy: Policy[Any] = field(default_factory=PGD)
+    times: int = 4
+
+    name: ClassVar[str] = "restarts"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.policy, Policy):
+            raise InputError(f"policy of restarts: expected a policy, got {self.policy!r}; use make_policy for names")
+        if self.times < 1:
+            raise InputError(f"times: expected at least 1, got {self.times}")
+
+    @property
+    def uses_gradient(self) -> bool:
+        return self.policy.uses_gradient
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
+        seed = draw_seed(generator)
+        each = 1 + (domain.gradient_cost if self.policy.uses_gradient else 0)
+        count = max(1, min(self.times, steps // each))
+        begins = (domain.begin, *(domain.sample(seeded(seed, number))[0] for number in range(1, count)))
+        return racing.line_up([(self.policy, replace(domain, first=begin)) for begin in begins], steps, seed, rounds=1)
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from typing import Any
 
-from advsearch.attacks.distribution import Distribution
-from advsearch.attacks.domain import Domain
+from advsearch.attacks.domain import Distribution, Domain
 from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Evaluated, Policy, Proposal, affordable, seeded
 
@@ -202,7 +201,11 @@ def _ask(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
             given[k], state = runner.policy.propose(runner.state, min(each, runner.left))
             runner = replace(runner, state=state)
         if not given[k]:
-            _leave(runners, field, k)
+            # take out a search that has nothing more to propose; its share is for those that are left in the round
+            share, runners[k] = runners[k].left, replace(runners[k], left=0, over=True)
+            others = [other for other in field if not runners[other].over]
+            for other in others:
+                runners[other] = replace(runners[other], left=runners[other].left + share // len(others))
             queue = _queue(runners, field)
             continue
         if taken[k] == len(given[k]):  # what it proposes next, these evaluations say
@@ -229,11 +232,3 @@ def _queue(runners: Sequence[Runner], field: Sequence[int]) -> list[tuple[int, i
     queue = [(-runners[k].left, place) for place, k in enumerate(field) if runners[k].left]
     heapify(queue)
     return queue
-
-
-def _leave(runners: list[Runner], field: Sequence[int], k: int) -> None:
-    """Take out a search that has nothing more to propose; its share is for those that are left in the round."""
-    share, runners[k] = runners[k].left, replace(runners[k], left=0, over=True)
-    others = [other for other in field if not runners[other].over]
-    for other in others:
-        runners[other] = replace(runners[other], left=runners[other].left + share // len(others))

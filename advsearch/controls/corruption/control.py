@@ -18,14 +18,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter, Value
-from advsearch.controls.corruption.blur import (
-    defocus_blur,
-    elastic,
-    gaussian_blur,
-    glass_blur,
-    motion_blur,
-    zoom_blur,
-)
+from advsearch.controls.corruption.blur import defocus_blur, elastic, gaussian_blur, glass_blur, motion_blur, zoom_blur
 from advsearch.controls.corruption.digital import brightness, contrast, jpeg, pixelate, saturate
 from advsearch.controls.corruption.noise import gaussian_noise, impulse_noise, shot_noise, speckle_noise
 from advsearch.controls.corruption.tools import LEVELS

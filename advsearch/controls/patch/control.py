@@ -16,30 +16,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.controls.base import (
-    NOTHING,
-    WHOLE_RANGE,
-    BoundControl,
-    Budget,
-    Choice,
-    Control,
-    Group,
-    Parameter,
-    Value,
-)
+from advsearch.controls.base import NOTHING, WHOLE_RANGE, BoundControl, Budget, Choice, Control, Group, Parameter, Value
 from advsearch.controls.clean import Moved
 from advsearch.controls.numbers import BoundNumbers, NumberControl
 from advsearch.controls.patch.sticker import Sticker, towards_camera
 from advsearch.controls.texture import resampled
-from advsearch.controls.values import (
-    LARGEST_EPSILON,
-    Fixed,
-    Number,
-    OneOf,
-    Range,
-    in_words,
-    read,
-)
+from advsearch.controls.values import LARGEST_EPSILON, Fixed, Number, OneOf, Range, in_words, read
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -164,7 +146,12 @@ class PatchControl(Control):
         self.name = name or self.kind
         self.resolution, self.epsilon, self.picture = resolution, epsilon, picture
         self.norm = norm or ("box" if epsilon is None else "linf")
-        self._check_choices()
+        for choice in self.choices:
+            choice.check(self.name, getattr(self, choice.name))
+        if self.norm == "box" and self.epsilon is not None:
+            raise InputError(
+                f"{self.name}.epsilon: expected none with norm box, got {self.epsilon:g}; set norm to linf or l2"
+            )
         self._placement = _Placement(self.name, **numbers)
         self._pixels_given = pixels
         self._pixels = self._pixel_spec()
@@ -182,20 +169,8 @@ class PatchControl(Control):
         named = {"kind": self.kind} if self.name != self.kind else {}
         return {**named, **given, **self._placement.given}
 
-    def _check_choices(self) -> None:
-        for choice in self.choices:
-            choice.check(self.name, getattr(self, choice.name))
-        if self.norm == "box" and self.epsilon is not None:
-            raise InputError(
-                f"{self.name}.epsilon: expected none with norm box, got {self.epsilon:g}; set norm to linf or l2"
-            )
-
     def _pixel_spec(self) -> Range | Fixed:
-        """What the pixels are set to; where there is a picture, that takes their place.
-
-        Raises:
-            InputError: they were given as a list, or beside a picture.
-        """
+        """What the pixels are set to; where there is a picture, that takes their place."""
         if self._pixels_given is None:
             return Fixed(0.0) if self.picture is not None else Range(0.0, 1.0)
         if self.picture is not None:

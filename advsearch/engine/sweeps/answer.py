@@ -9,7 +9,8 @@ from typing import Any
 
 from advsearch.engine.sweeps.job import KIND
 from advsearch.report.drawing import new_axes
-from advsearch.report.notebook import sweep_html
+from advsearch.report.notebook import answer_html
+from advsearch.report.shown import shown
 from advsearch.report.studies import sweep_axes, sweep_figure
 from advsearch.runs import store
 from advsearch.runs.export import to_pandas
@@ -69,7 +70,7 @@ class SweepResult:
         return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={place!r})"
 
     def _repr_html_(self) -> str:
-        return sweep_html(self.summary)
+        return answer_html(shown(self.summary))
 
     def _repr_png_(self) -> bytes | None:
         return sweep_figure(self.summary).get("png")

@@ -23,12 +23,6 @@ def source(loaded: Loaded) -> Source:
     return loaded.source(_DepthMap(loaded.network, bool(getattr(loaded.processor, "do_pad", False))))
 
 
-def _kind(config: Any) -> str:
-    """Return what a network's numbers are; "predicted_depth" where nothing says it."""
-    said = {"relative": DISPARITY, "metric": METRIC}.get(getattr(config, "depth_estimation_type", ""), "")
-    return said or BY_FAMILY.get(config.model_type, "predicted_depth")
-
-
 class _DepthMap(nn.Module):
     """A mapping with numbers (N, h, w) under what they are.
 
@@ -41,7 +35,8 @@ class _DepthMap(nn.Module):
 
     def __init__(self, network: Any, padded: bool) -> None:
         super().__init__()
-        self.network, self.kind = network, _kind(network.config)
+        said = {"relative": DISPARITY, "metric": METRIC}.get(getattr(network.config, "depth_estimation_type", ""), "")
+        self.network, self.kind = network, (said or BY_FAMILY.get(network.config.model_type, "predicted_depth"))
         self.padded = padded and network.config.model_type == "zoedepth"
 
     def forward(self, images: Tensor) -> dict[str, Tensor]:

@@ -70,27 +70,23 @@ def _finished(loaded: Loaded, plain: Callable[[Loaded], Source] | None, purpose:
     if purpose.task == TASK:
         if purpose.prompts is not None:
             raise InputError(f"prompt: task {TASK} compares pictures and reads no text; leave `prompt` out")
-        return _source(loaded)
+        network = loaded.network
+        part, config = network, network.config
+        if zero_shot.compares(network):
+            zero_shot.check_takes_pictures(network, loaded.spec)
+            config = getattr(config, "vision_config", config)
+        elif "ForImageClassification" in type(network).__name__:
+            part = network.base_model if network.base_model is not network else getattr(network, "vision_model", None)
+            if part is None:
+                raise ModelError(f"model {loaded.spec}: has no part before its head; give its network without one")
+        described, side = loaded.described, getattr(config, "image_size", None)
+        if "input_size" not in described and isinstance(side, int):
+            described = Measured(**{**described, "input_size": (side, side)})
+        return loaded.source(_Features(part), **described)
     if plain is None:
         raise no_classes(loaded.name, f"is a {type(loaded.network).__name__}")
     found = plain(loaded)
     return found if found.finish is None else found.finish(purpose)
-
-
-def _source(loaded: Loaded) -> Source:
-    network = loaded.network
-    part, config = network, network.config
-    if zero_shot.compares(network):
-        zero_shot.check_takes_pictures(network, loaded.spec)
-        config = getattr(config, "vision_config", config)
-    elif "ForImageClassification" in type(network).__name__:
-        part = network.base_model if network.base_model is not network else getattr(network, "vision_model", None)
-        if part is None:
-            raise ModelError(f"model {loaded.spec}: has no part before its head; give its network without one")
-    described, side = loaded.described, getattr(config, "image_size", None)
-    if "input_size" not in described and isinstance(side, int):
-        described = Measured(**{**described, "input_size": (side, side)})
-    return loaded.source(_Features(part), **described)
 
 
 def pooled(answer: Any, *, token: bool) -> Tensor | None:

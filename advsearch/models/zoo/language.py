@@ -149,9 +149,6 @@ def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measur
 
     An affine map is measured and left to that. What cuts a picture into patches or tiles is called itself, which is
     differentiable where the processor works with torchvision.
-
-    Raises:
-        ModelError: it does neither, or something else to values than to 8-bit pictures.
     """
     described, side = Measured(), _side(loaded.network.config)
     with suppress(ModelError):  # it is called then

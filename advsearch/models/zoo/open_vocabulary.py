@@ -119,11 +119,7 @@ class _Grounded(nn.Module):
 def _grounded(
     network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str, ...] | None, name: str
 ) -> nn.Module:
-    """Return the detector of one text, ``mug. cup. bowl.``, as its processor writes it.
-
-    Raises:
-        InputError: there are several prompts, more tokens than the network reads, or names with a mark that ends one.
-    """
+    """Return the detector of one text, ``mug. cup. bowl.``, as its processor writes it."""
     prompt, *others = patterns(prompts or BARE)
     if others:
         raise InputError(

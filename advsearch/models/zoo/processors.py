@@ -99,11 +99,7 @@ def _answer(processor: Any, picture: Any, spec: str) -> Array:
 
 
 def _called(processor: Any, spec: str, found: Measured, what: str) -> Measured:
-    """Return what was found, with the processor to be called on a picture of that size.
-
-    Raises:
-        ModelError: it pads, lets no gradient through, or answers otherwise than to the same picture in 8 bits.
-    """
+    """Return what was found, with the processor to be called on a picture of that size."""
     height, width = found.get("input_size", (SIDES[0], SIDES[0]))
     ends = [_answer(processor, np.full((SIDES[0], SIDES[0], 3), level, np.uint8), spec) for level in (0, 255)]
     if (ends[0] == ends[1]).all(axis=0).any():

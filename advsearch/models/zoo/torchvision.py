@@ -35,7 +35,10 @@ def load(spec: str) -> Source:
         models.list_models(module=m) for m in (models, models.segmentation, models.detection)
     )
     if name not in (*classifies, *segments, *finds):
-        _check_for_pictures(models, spec, name)
+        for part, what in NOT_FOR_PICTURES.items():
+            if name in (models.list_models(module=getattr(models, part)) if hasattr(models, part) else ()):
+                plain = f"torchvision:{name.removeprefix('quantized_')}"
+                raise ModelError(f"model {spec}: {what.format(plain=plain)}")
         raise UnknownNameError("torchvision network", name, near_names(name, (*classifies, *segments, *finds)))
     default = getattr(models.get_model_weights(name), "DEFAULT", None)
     parts = {} if name in classifies else {"weights_backbone": None}
@@ -57,14 +60,6 @@ NOT_FOR_PICTURES = {
     "made of, or give it from Python and search with a policy without gradients, such as nes",
 }
 """What torchvision's other networks are, by its module, and the way on."""
-
-
-def _check_for_pictures(models: Any, spec: str, name: str) -> None:
-    """Raise a ModelError that says what a network of torchvision is that is none of those which are read."""
-    for part, what in NOT_FOR_PICTURES.items():
-        if name in (models.list_models(module=getattr(models, part)) if hasattr(models, part) else ()):
-            plain = f"torchvision:{name.removeprefix('quantized_')}"
-            raise ModelError(f"model {spec}: {what.format(plain=plain)}")
 
 
 def _detector(module: nn.Module, name: str, default: Any | None) -> Source:

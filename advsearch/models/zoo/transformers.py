@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping
@@ -20,7 +21,6 @@ from advsearch.models.source import Source
 from advsearch.models.zoo import depth_maps, features, language, mask_queries, open_vocabulary, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
 from advsearch.models.zoo.loaded import Loaded, in_pixels
-from advsearch.models.zoo.memory import check_fits
 from advsearch.models.zoo.processors import processor_of
 
 
@@ -138,11 +138,7 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
 
 
 def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what is in the config.json of a repository or a folder.
-
-    Raises:
-        ModelError: it is neither there nor to be had, or it has the files of open_clip and none of transformers.
-    """
+    """Return what is in the config.json of a repository or a folder."""
     has = partial(transformers.utils.cached_file, name, _raise_exceptions_for_missing_entries=False, **where)
     try:
         if not has("config.json") and has("open_clip_config.json"):
@@ -244,15 +240,9 @@ NETWORKS = (
         lambda loaded: timm.of_wrapped(loaded, names_of(loaded.network.config)),
     ),
     Family(
-        _called("ForImageClassification"),
-        "AutoModelForImageClassification",
-        features.also(_with_names(_Classifier)),
+        _called("ForImageClassification"), "AutoModelForImageClassification", features.also(_with_names(_Classifier))
     ),
-    Family(
-        _called("ForSemanticSegmentation"),
-        "AutoModelForSemanticSegmentation",
-        _with_names(_Segmenter),
-    ),
+    Family(_called("ForSemanticSegmentation"), "AutoModelForSemanticSegmentation", _with_names(_Segmenter)),
     Family(
         mask_queries.is_ours,
         "AutoModelForUniversalSegmentation",
@@ -263,17 +253,9 @@ NETWORKS = (
         "AutoModelForZeroShotObjectDetection",
         open_vocabulary.source,
     ),
-    Family(
-        _called("ForObjectDetection"),
-        "AutoModelForObjectDetection",
-        _with_names(_Detector),
-    ),
+    Family(_called("ForObjectDetection"), "AutoModelForObjectDetection", _with_names(_Detector)),
     Family(language.speaks, "AutoModelForImageTextToText", language.source),
-    Family(
-        _called("ForDepthEstimation"),
-        "AutoModelForDepthEstimation",
-        depth_maps.source,
-    ),
+    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", depth_maps.source),
     Family(
         lambda architecture, network: zero_shot.compares(network),
         "AutoModel",
@@ -282,3 +264,47 @@ NETWORKS = (
     Family(features.answers_with_features, "", features.source),
 )
 """Every kind that is read, the particular ones first."""
+
+
+MEMORY = Path("/proc/meminfo")
+"""Where Linux says what is free."""
+
+
+def check_fits(transformers: Any, name: str, where: Mapping[str, Any], spec: str) -> None:
+    """Raise a ModelError where the weights of a repository or a folder are larger than the memory that is free.
+
+    They are kept in the type in which they are stored. Nothing is checked where the system does not say what is free.
+    """
+    size, free = _stored(transformers, name, where), free_bytes()
+    if free is not None and size > free:
+        raise ModelError(
+            f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free. Give a "
+            "smaller network, one whose weights are stored in bfloat16, or a machine with more memory"
+        )
+
+
+def free_bytes(told: Path | None = None) -> int | None:
+    """Return the bytes that can be had without anything else being ended, swap included; None where nobody says."""
+    try:
+        lines = (told or MEMORY).read_text(encoding="ascii").splitlines()
+        kilobytes = {line.partition(":")[0]: int(line.split()[1]) for line in lines if len(line.split()) > 1}
+        return 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def _stored(transformers: Any, name: str, where: Mapping[str, Any]) -> int:
+    """Return the bytes of the weights: as the index of several files says, or the size of one; 0 of none."""
+
+    def kept(file: str) -> str | None:
+        found: str | None = transformers.utils.cached_file(
+            name, file, _raise_exceptions_for_missing_entries=False, **where
+        )
+        return found
+
+    index = kept("model.safetensors.index.json")
+    if index:
+        told = json.loads(Path(index).read_text(encoding="utf-8")).get("metadata", {}).get("total_size", 0)
+        return int(told)
+    one = kept("model.safetensors")
+    return Path(one).stat().st_size if one else 0

@@ -89,11 +89,7 @@ def spoken(names: Sequence[str]) -> list[str]:
 
 
 def _encoded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Mapping[str, Tensor]:
-    """Return texts as the network was trained on them: SigLIP's are as long as can be, the others' as the longest.
-
-    Raises:
-        InputError: one is longer than the network reads.
-    """
+    """Return texts as the network was trained on them: SigLIP's are as long as can be, the others' as the longest."""
     most = min(int(network.config.text_config.max_position_embeddings), int(tokenizer.model_max_length))
     for text, tokens in zip(texts, tokenizer(list(texts), verbose=False)["input_ids"], strict=True):
         if len(tokens) > most:

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.base import Fields, JsonFloat, RunResult
 from advsearch.runs.results.derivatives import GradientStatus
 
@@ -71,7 +72,7 @@ class CheckedRows(Fields):
     rows: list[CheckedRow]
 
 
-class CheckResult(CheckedRows, RunResult):
+class CheckResult(InNotebook, CheckedRows, RunResult):
     """Every derivative of a scene beside differences, as far as they are measured."""
 
     command: ClassVar[str] = "check"

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import asks, configured
 from advsearch.controls import CONTROLS
 from advsearch.engine import run_settings
+from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import (
     FACTORS,
     Estimate,

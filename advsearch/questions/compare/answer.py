@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
 from advsearch.runs.results.sweep import AxisValue, CountedAnswers
 
@@ -90,7 +91,7 @@ class ComparedPair(PairCounts):
     shown: list[PairPicture] = Field(description="pairs that one side alone gets right, the farthest apart first")
 
 
-class CompareResult(RunResult):
+class CompareResult(InNotebook, RunResult):
     """Two sides or more on the same pictures; of more than two, each with the first."""
 
     command: ClassVar[str] = "compare"

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from advsearch.api.keywords import Named, Names, SampledKeywords, asks, configured
 from advsearch.api.subruns import carry_out_part
-from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
 from advsearch.engine.loading import Controls
 from advsearch.engine.sweeps.job import check_all
@@ -23,6 +22,7 @@ from advsearch.questions.compare.answer import ComparedPair, ComparedSide, Compa
 from advsearch.questions.compare.pairs import compared, far_apart
 from advsearch.questions.compare.settings import CompareConfig
 from advsearch.questions.compare.sides import Side, differing, read_sides, varying
+from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED

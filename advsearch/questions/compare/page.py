@@ -19,8 +19,7 @@ from advsearch.questions.compare.words import (
 )
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
-from advsearch.viewer.document import data_url, document
-from advsearch.viewer.study_page import again, facts_table, heading, study_table, subject_html
+from advsearch.viewer.document import again, data_url, document, facts_table, heading, study_table, subject_html
 
 NOTE = (
     "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "

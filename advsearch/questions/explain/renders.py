@@ -16,7 +16,6 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.subruns import carry_out_part
-from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.engine.sweeps.job import check_all
@@ -31,6 +30,7 @@ from advsearch.progress import Progress
 from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.explain.findings import find_clusters
 from advsearch.questions.explain.settings import ExplainConfig
+from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import Fields, Interval, RunResult
 
@@ -50,7 +51,7 @@ class SplitSide(Fields):
     views: int
 
 
-class HardenResult(RunResult):
+class HardenResult(InNotebook, RunResult):
     """How robust a model was, and how robust it is after training on worst cases."""
 
     command: ClassVar[str] = "harden"

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, executor_for
 from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.engine import run_settings
+from advsearch.engine.attack_parts import LOADING, executor_for
 from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import Controls
 from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name

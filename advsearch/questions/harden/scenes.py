@@ -15,12 +15,12 @@ import numpy as np
 from safetensors import torch as safetensors
 
 from advsearch import seeds
-from advsearch.api.attack import attack_on, problem_of
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.objects import OBJECTS
 from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig
 from advsearch.engine import run_settings
+from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.problem import Problem
@@ -28,6 +28,7 @@ from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.trainable import trainable
+from advsearch.questions.attack.carry_out import attack_on
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
 from advsearch.questions.harden.settings import ALL, HardenConfig
 from advsearch.runs.results.base import INTERRUPTED

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.base import Fields, Formation, JsonFloat, RunResult
 from advsearch.runs.results.derivatives import CosineRow, GroupDerivative, PathLength
 
@@ -47,7 +48,7 @@ class EstimatorLimit(Fields):
     measured: str
 
 
-class PlanResult(RunResult):
+class PlanResult(InNotebook, RunResult):
     """How a search gets its derivatives, what it leaves out, and why, as far as that is measured."""
 
     command: ClassVar[str] = "plan"

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, configured
+from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
 from advsearch.engine.loading import Scene

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, executor_for, problem_from_config
 from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, Names, asks, configured
 from advsearch.attacks import Policy, make_policy
 from advsearch.cluster.executor import Call, Executor
+from advsearch.engine.attack_parts import LOADING, executor_for, problem_from_config
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.base import Fields, Interval, RunResult
 from advsearch.runs.results.sweep import CountedAnswers, SurfaceTable
 
@@ -266,7 +267,7 @@ AnyFigure = Annotated[
 ]
 
 
-class RecipeResult(RunResult):
+class RecipeResult(InNotebook, RunResult):
     """What a recipe came to: its runs, its figures and what they say."""
 
     command: ClassVar[str] = "recipe"

@@ -12,25 +12,25 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 
-from advsearch.api.attack import check_from_config
 from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
-from advsearch.api.photos import Photographs, photographs_in
 from advsearch.api.subruns import carry_out_part
-from advsearch.api.sweep import job_of
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.config.named import name_in
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
+from advsearch.engine.attack_parts import check_from_config
 from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
 from advsearch.explanations.answered import TRIAL, WORKERS, Answered, rows_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.recipe.answer import RecipeFigure, RecipePart, RecipeResult
 from advsearch.questions.recipe.description import ANY, Recipe, check_figures, read_recipe, recipe_of
 from advsearch.questions.recipe.figures import compute, draw_figure, read_options
 from advsearch.questions.recipe.parts import Planned, made_of, names_listed, planned
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, photographs_of
+from advsearch.questions.sweep.carry_out import job_of
 from advsearch.report.phrases import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, JsonFloat, SceneResult, having
 
 
@@ -47,7 +48,7 @@ class GrownRegion(Fields):
     )
 
 
-class RegionResult(GrownRegion, SceneResult):
+class RegionResult(InNotebook, GrownRegion, SceneResult):
     """The box around a configuration in which the verdict stays."""
 
     command: ClassVar[str] = "region"

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.attack import ControlGroup, VerifiedRate
 from advsearch.runs.results.base import Fields, SceneResult
 
@@ -26,7 +27,7 @@ class ReplayRow(Fields):
     reason: str = Field("", description="why it was not done, and what to do; absent if it was")
 
 
-class ReplayResult(SceneResult):
+class ReplayResult(InNotebook, SceneResult):
     """The answer of a run under other conditions than it was searched and verified under."""
 
     command: ClassVar[str] = "replay"

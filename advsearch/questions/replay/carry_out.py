@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, SEARCHED_WITH, parts_in, problem_of_parts
 from advsearch.api.keywords import Names, RunKeywords, asks, configured
-from advsearch.engine.attack_result import AttackParts, AttackResult
+from advsearch.engine.attack_parts import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
+from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, Retrials, kept_answer

@@ -6,8 +6,7 @@ from advsearch.questions.report.answer import Evidence, EvidenceRun
 from advsearch.questions.report.runs import sections
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.wording import interval_text
-from advsearch.viewer.document import document
-from advsearch.viewer.study_page import again, facts_table, heading, study_table
+from advsearch.viewer.document import again, document, facts_table, heading, study_table
 
 CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.base import Fields, JsonFloat, Result, having
 
 
@@ -39,7 +40,7 @@ class CaseRow(Fields):
     seconds: float = Field(description="what the case took")
 
 
-class StabilityResult(Result):
+class StabilityResult(InNotebook, Result):
     """Extreme cases, and whether each of them holds."""
 
     command: ClassVar[str] = "stability"

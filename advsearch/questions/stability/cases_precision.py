@@ -19,8 +19,8 @@ from torch import Tensor
 
 from advsearch import seeds, threads
 from advsearch.attacks import Block, Domain, make_policy, search
+from advsearch.attacks.domain import project_l2_box
 from advsearch.attacks.policies.base import one_thread
-from advsearch.attacks.projections import project_l2_box
 from advsearch.engine.gradients import smooth_loss
 from advsearch.models import load_model
 from advsearch.questions.stability.case import CaseGroup, Check, Outcome, Toy, holds

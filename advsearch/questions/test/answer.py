@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report.notebook import InNotebook
 from advsearch.runs.results.base import Fields, Interval, JsonFloat, RunResult
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
@@ -42,7 +43,7 @@ class ClaimAnswer(Fields):
         return ANSWERS.index(self.answer) <= ANSWERS.index(self.expected)
 
 
-class SuiteResult(RunResult):
+class SuiteResult(InNotebook, RunResult):
     """What the claims of a suite came to."""
 
     command: ClassVar[str] = "test"

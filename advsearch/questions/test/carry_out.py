@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from advsearch.api.attack import check_from_config
 from advsearch.config import AttackConfig, SceneConfig
+from advsearch.engine.attack_parts import check_from_config
 from advsearch.engine.measuring import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible

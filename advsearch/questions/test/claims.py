@@ -13,12 +13,12 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import executor_for, parts_of, problem_of
 from advsearch.api.subruns import carry_out_part
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.attacks.sequential import ConfidenceSequence
+from advsearch.attacks.trials import ConfidenceSequence
 from advsearch.config import AttackConfig, SceneConfig
+from advsearch.engine.attack_parts import executor_for, parts_of, problem_of
 from advsearch.engine.journal import Journal
 from advsearch.engine.problem import Problem
 from advsearch.engine.sharing import Shared, answering
@@ -90,7 +90,7 @@ class Trial:
         sequence, right = ConfidenceSequence(self.confidence), 0
         wrong: list[tuple[float, Query, str]] = []
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
-        with executor_for(shared, "advsearch.api.attack:attack_answers", self.progress) as executor:
+        with executor_for(shared, "advsearch.questions.attack.carry_out:attack_answers", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor))
             queries = drawn(problem, f"claim {asked.name}", claim.pictures, spp_of(config))
             answer = UNDECIDED

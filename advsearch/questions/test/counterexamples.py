@@ -19,8 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.attack import parts_in, problem_of_parts
 from advsearch.config import AttackConfig, SceneConfig
+from advsearch.engine.attack_parts import parts_in, problem_of_parts
 from advsearch.engine.loading import Scene
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import kept_answer

@@ -7,8 +7,16 @@ from pathlib import Path
 from advsearch.questions.test.answer import HELD, SuiteResult
 from advsearch.questions.test.words import TABLE_HEADS, facts, suite_text, table_rows
 from advsearch.report.markup import Html, element, join_html
-from advsearch.viewer.document import data_url, document
-from advsearch.viewer.study_page import again, facts_table, heading, part_links, study_table, subject_html
+from advsearch.viewer.document import (
+    again,
+    data_url,
+    document,
+    facts_table,
+    heading,
+    part_links,
+    study_table,
+    subject_html,
+)
 
 LARGEST = 2_000_000
 """Bytes of a picture that the page takes along."""

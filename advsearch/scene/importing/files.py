@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from advsearch import files
@@ -109,3 +110,51 @@ def _near(path: Path, suffixes: Sequence[str]) -> str:
         return ""
     near = difflib.get_close_matches(path.name.lower(), sorted(names), n=3, cutoff=0.5)
     return f" Did you mean {' or '.join(repr(names[name]) for name in near)}?" if near else ""
+
+
+LARGEST_FACES = 2_000_000
+"""Triangles that a mesh may have, before `advsearch.files.scaled`; each takes over 1 KB of memory to import."""
+
+MOST_CORNERS = 10_000
+"""Corners that one face may have."""
+
+
+def check_faces(path: Path, count: int) -> None:
+    """Refuse a mesh with too many triangles.
+
+    Raises:
+        FileFormatError: there are more than `LARGEST_FACES`, before `advsearch.files.scaled`.
+    """
+    if count > files.scaled(LARGEST_FACES):
+        raise files.too_large(path, f"a mesh of at most {files.scaled(LARGEST_FACES):,} triangles", f"{count:,}")
+
+
+class Inventory:
+    """What a file has, and what of it was taken.
+
+        inventory = Inventory()
+        inventory.has("property", "confidence")
+        inventory.take("property", "x")
+        list(inventory.left())   # ["property 'confidence' is left out"]
+
+    A thing is a kind (a word of the format: ``"property"``, ``"keyword"``) and its name in the file.
+    """
+
+    def __init__(self) -> None:
+        self._has: Counter[tuple[str, str]] = Counter()
+        self._taken: set[tuple[str, str]] = set()
+
+    def has(self, kind: str, name: str) -> None:
+        """Note that the file has this, once more."""
+        self._has[kind, name] += 1
+
+    def take(self, kind: str, name: str) -> None:
+        """Note that this is used; that the file need not have it makes readers short."""
+        self._taken.add((kind, name))
+
+    def left(self) -> Iterator[str]:
+        """Yield a clause for everything that the file has and nobody took, in the order of the file."""
+        for (kind, name), count in self._has.items():
+            if (kind, name) not in self._taken:
+                times = "" if count == 1 else f" ({count:,} times)"
+                yield f"{kind} {shown(name)}{times} is left out"

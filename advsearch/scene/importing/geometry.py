@@ -299,19 +299,14 @@ def smooth_normals(soup: Soup) -> Array:
     count = soup.faces.size
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
     groups, group = csgraph.connected_components(graph, directed=False)
-    weighted = unit[:, None] * _angles(soup)[:, :, None]
+    corners = soup.points[soup.faces]
+    ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    angles: Array = np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2))
+    weighted = unit[:, None] * angles[:, :, None]
     sums: Array = np.stack([np.bincount(group, weighted[:, :, k].ravel(), groups) for k in range(3)], axis=1)
     smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
     sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0  # NaN, where normals cancel, is not
     return np.where(sound, smooth, unit[:, None])
-
-
-def _angles(soup: Soup) -> Array:
-    """Return the (F, 3) angles of the faces at their corners, in radians."""
-    corners = soup.points[soup.faces]
-    ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-    angles: Array = np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2))
-    return angles
 
 
 # --- small pieces ----------------------------------------

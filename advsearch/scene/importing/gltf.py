@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
 from advsearch import files
-from advsearch.files import JsonObject, JsonValue
-from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
-from advsearch.scene.importing.gltf_checks import check_header
-from advsearch.scene.importing.gltf_entries import Asset, Header
+from advsearch.errors import FileFormatError
+from advsearch.files import JsonValue
+from advsearch.scene.importing.files import check_faces, damaged, looks_like, shown, text_of
+from advsearch.scene.importing.gltf_entries import Asset, Header, Primitive
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
@@ -44,13 +45,6 @@ def read_header(path: Path, data: bytes) -> Header:
         header = Header.model_validate(content)
     except ValidationError as error:
         raise damaged(path, *_first(error)) from None
-    header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *_extensions(content)})})
-    check_header(path, header)
-    return header
-
-
-def _extensions(content: JsonObject) -> set[str]:
-    """Return the names of the extensions that entries have, in the file's list of them or not."""
     found: set[str] = set()
     level: list[JsonValue] = [content]
     while level:
@@ -61,7 +55,9 @@ def _extensions(content: JsonObject) -> set[str]:
             held = entry.get("extensions")
             found.update(held if isinstance(held, dict) else ())
             level.extend(value for key, value in entry.items() if key != "extras")
-    return found
+    header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *found})})
+    check_header(path, header)
+    return header
 
 
 def binary_chunk(data: bytes) -> bytes | None:
@@ -95,3 +91,137 @@ def _first(error: ValidationError) -> tuple[str, str]:
     needed = first["msg"].removeprefix("Input should be ").removeprefix("Field ")
     got = "nothing" if first["type"] == "missing" else shown(json.dumps(first["input"], default=str))
     return f"glTF whose {place} is {needed}" if got != "nothing" else f"glTF with {place}", got
+
+
+LARGEST_VALUES = 1 << 28
+"""Bytes that all views, and all accessors, of a file may have; they may overlap, so its size says nothing."""
+
+LARGEST_TREE = 20_000
+"""Nodes, and pieces of geometry at their places, in one file."""
+
+DEEPEST_TREE = 500
+"""Nodes from the root to a leaf."""
+
+READ = (
+    "EXT_texture_webp",
+    "KHR_lights_punctual",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+)
+"""Extensions that are understood."""
+
+_LOOKS = ("KHR_materials_", "KHR_xmp")
+"""Beginnings of those without which a file looks otherwise and has the same geometry: they are named in warnings."""
+
+
+def check_header(path: Path, header: Header) -> None:
+    """Check what the types leave open: extensions, limits, and that whatever is referred to is there.
+
+    Raises:
+        FileFormatError: the header needs what is not supported, refers to what is not there, or is over a limit.
+    """
+    needed = sorted(name for name in header.extensionsRequired if name not in READ and not name.startswith(_LOOKS))
+    if needed:
+        names = shown(", ".join(needed), quoted=False)
+        raise FileFormatError(f"{path}: needs {names}, which is not supported; export it without that option")
+    for view in header.bufferViews:
+        _check_index(path, "buffers", view.buffer, header.buffers)
+    for accessor in header.accessors:
+        _check_index(path, "bufferViews", accessor.bufferView, header.bufferViews)
+        if accessor.sparse is not None:
+            _check_index(path, "bufferViews", accessor.sparse.indices.bufferView, header.bufferViews)
+            _check_index(path, "bufferViews", accessor.sparse.values.bufferView, header.bufferViews)
+    for texture in header.textures:
+        _check_index(path, "images", texture.image, header.images)
+        _check_index(path, "samplers", texture.sampler, header.samplers)
+    for image in header.images:
+        _check_index(path, "bufferViews", image.bufferView, header.bufferViews)
+    for material in header.materials:
+        surface = material.surface
+        for use in (
+            surface.baseColorTexture,
+            surface.metallicRoughnessTexture,
+            material.normalTexture,
+            material.emissiveTexture,
+        ):
+            _check_index(path, "textures", None if use is None else use.index, header.textures)
+    sizes = (sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
+    if max(sizes) > files.scaled(LARGEST_VALUES):
+        most = f"geometry and pictures of at most {files.scaled(LARGEST_VALUES):,} bytes"
+        raise files.too_large(path, most, f"{max(sizes):,}")
+    for mesh in header.meshes:
+        for primitive in mesh.primitives:
+            _check_primitive(path, header, primitive)
+    _check_tree(path, header)
+
+
+def _check_index(path: Path, kind: str, index: int | None, entries: list[Any]) -> None:
+    if index is not None and index >= len(entries):
+        raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{len(entries)}")
+
+
+def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
+    """Refuse attributes that are not what their names say, or of different lengths."""
+    for index in (*primitive.attributes.values(), primitive.indices):
+        _check_index(path, "accessors", index, header.accessors)
+    _check_index(path, "materials", primitive.material, header.materials)
+    held = {name: header.accessors[index] for name, index in primitive.attributes.items()}
+    coordinates = "TEXCOORD_0" if primitive.material is None else header.materials[primitive.material].attribute
+    kinds_of = {"POSITION": ("VEC3",), "NORMAL": ("VEC3",), "COLOR_0": ("VEC3", "VEC4"), coordinates: ("VEC2",)}
+    for name, kinds in kinds_of.items():
+        if name in held and held[name].type not in kinds:
+            raise damaged(path, f"{name} of type {' or '.join(kinds)}", held[name].type)
+        if name in held and "POSITION" in held and held[name].count != held["POSITION"].count:
+            expected = f"as many values of {name} as of POSITION, {held['POSITION'].count:,}"
+            raise damaged(path, expected, f"{held[name].count:,}")
+    if primitive.indices is not None and header.accessors[primitive.indices].type != "SCALAR":
+        raise damaged(path, "indices of type SCALAR", header.accessors[primitive.indices].type)
+    if primitive.indices is not None and header.accessors[primitive.indices].componentType not in (5121, 5123, 5125):
+        raise damaged(path, "indices that are unsigned integers", "other numbers")
+
+
+def _triangles(header: Header, primitive: Primitive) -> int:
+    """Return how many triangles a primitive has, at most."""
+    index = primitive.attributes.get("POSITION") if primitive.indices is None else primitive.indices
+    if index is None or primitive.mode < 4:
+        return 0
+    count = header.accessors[index].count
+    return count // 3 if primitive.mode == 4 else max(0, count - 2)
+
+
+def _check_tree(path: Path, header: Header) -> None:
+    """Check that the nodes form trees, as glTF demands, and neither too large nor too deep ones."""
+    for scene in header.scenes:
+        for root in scene.nodes:
+            _check_index(path, "nodes", root, header.nodes)
+    _check_index(path, "scenes", header.scene, header.scenes)
+    parents: set[int] = set()
+    triangles = [sum(_triangles(header, primitive) for primitive in mesh.primitives) for mesh in header.meshes]
+    pieces, drawn = 0, 0
+    for node in header.nodes:
+        _check_index(path, "meshes", node.mesh, header.meshes)
+        _check_index(path, "cameras", node.camera, header.cameras)
+        _check_index(path, "lights", node.lamp, header.lights)
+        if node.mesh is not None:
+            pieces, drawn = pieces + len(header.meshes[node.mesh].primitives), drawn + triangles[node.mesh]
+        for child in node.children:
+            _check_index(path, "nodes", child, header.nodes)
+            if child in parents:
+                raise damaged(path, "nodes with one parent each", f"two for node {child}")
+            parents.add(child)
+    pieces = max(pieces, sum(len(mesh.primitives) for mesh in header.meshes), len(header.nodes))
+    check_faces(path, max(drawn, sum(triangles)))
+    if pieces > files.scaled(LARGEST_TREE):
+        raise files.too_large(path, f"glTF of at most {files.scaled(LARGEST_TREE):,} nodes and pieces", f"{pieces:,}")
+    level, reached = [index for index in range(len(header.nodes)) if index not in parents], 0
+    for _ in range(files.scaled(DEEPEST_TREE)):
+        reached += len(level)
+        level = [child for index in level for child in header.nodes[index].children]
+        if not level:
+            break
+    if level:
+        raise files.too_large(path, f"nodes of at most {files.scaled(DEEPEST_TREE)} levels", "more")
+    if reached < len(header.nodes):
+        raise damaged(path, "nodes that form trees", "a cycle")

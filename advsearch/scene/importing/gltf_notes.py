@@ -9,10 +9,9 @@ from collections.abc import Iterator
 
 from pydantic import BaseModel
 
-from advsearch.scene.importing.files import shown
-from advsearch.scene.importing.gltf_checks import READ
+from advsearch.scene.importing.files import Inventory, shown
+from advsearch.scene.importing.gltf import READ
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header, MeshEntry
-from advsearch.scene.importing.left_out import Inventory
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
 

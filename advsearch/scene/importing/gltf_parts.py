@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing import gltf_notes
-from advsearch.scene.importing.checks import check_faces
-from advsearch.scene.importing.files import damaged
+from advsearch.scene.importing.files import check_faces, damaged
 from advsearch.scene.importing.gltf import binary_chunk, read_header
 from advsearch.scene.importing.gltf_buffers import Buffers
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header, MaterialEntry, Node, Primitive, TextureUse

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from advsearch.scene.importing.files import shown, text_of
-from advsearch.scene.importing.left_out import Inventory
+from advsearch.scene.importing.files import Inventory, shown, text_of
 from advsearch.scene.importing.mtl import (
     MapUse,
     MtlMaterial,
@@ -129,7 +128,13 @@ class MtlReader:
                 what = f"{material.spelled[key]} of the material {shown(material.name)}"
                 self.note(f"{self.source}: {what} lies elsewhere than its other maps (-s, -o); it is left out")
                 del uses[key]
-        color = self._color(material)
+        rest = material.numbers("kd")
+        color = color_of(rest)
+        if "kd" in material.statements and color is None:
+            self.note(
+                f"{self.source}: the Kd {shown(rest)} of the material {shown(material.name)} is no colour; neutral grey"
+                " is used instead"
+            )
         texture = self._texture(material, uses.get("map_kd"), color)
         if "map_kd" in uses and color is not None and (color > 0.999).all():
             color = None  # plain white only leaves a texture alone
@@ -192,16 +197,6 @@ class MtlReader:
             if not quiet:
                 self.inventory.has("texture option", f"-{option} of {material.spelled[key]}")
         return use
-
-    def _color(self, material: MtlMaterial) -> Floats | None:
-        rest = material.numbers("kd")
-        color = color_of(rest)
-        if "kd" in material.statements and color is None:
-            self.note(
-                f"{self.source}: the Kd {shown(rest)} of the material {shown(material.name)} is no colour; neutral grey"
-                " is used instead"
-            )
-        return color
 
     def _texture(self, material: MtlMaterial, use: MapUse | None, color: Floats | None) -> Floats | None:
         """Return the base colour texture. It stands alone: a Kd beside it is an exporter's default more often than a

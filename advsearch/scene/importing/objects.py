@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from scipy.spatial import ConvexHull, QhullError
 
 from advsearch.errors import InputError
 from advsearch.files import MESHES
@@ -22,7 +23,6 @@ from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.parts import GLTF, read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
 from advsearch.scene.importing.texture import by_material, textured
-from advsearch.scene.importing.upright import guess_up
 
 Floats = npt.NDArray[np.float32]
 
@@ -95,13 +95,16 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     if opacity is not None and not opacity.any():
         opacity, bakes = None, [*bakes, "it is transparent all over; it is shown opaque"]
     material, blends = _material(soup, surfaces)
+    warnings = [*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)]
+    kept = warnings[:MOST_WARNINGS]
+    more = len(warnings) - len(kept)
     return ObjectAsset(
         name=name,
         mesh=_mesh(soup, surfaces, file),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
-        warnings=_first([*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)], file.name),
+        warnings=(*kept, *([f"{file.name}: {more:,} more warnings are left out"] if more else [])),
         up=axis,
         opacity=opacity,
         normal_map=maps.normals,
@@ -129,13 +132,6 @@ def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
     columns, rows = ((np.arange(n) * m) // n for n, m in ((width, sizes[0][0]), (height, sizes[0][1])))
     found = np.asarray(emission[rows][:, columns] * share, np.float32)
     return found if found.any() else None
-
-
-def _first(warnings: list[str], name: str) -> tuple[str, ...]:
-    """Return warnings about a file, and of very many the first and how many more there are."""
-    kept = warnings[:MOST_WARNINGS]
-    more = len(warnings) - len(kept)
-    return (*kept, *([f"{name}: {more:,} more warnings are left out"] if more else []))
 
 
 def _upright(parts: list[ImportedPart], file: Path, up: str | None) -> tuple[Soup, UpAxis]:
@@ -167,3 +163,53 @@ def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, li
     means = f"{roughness:.2g} and {metallic:.2g}"
     notes = [] if same else [f"the roughness and metallic of its materials are replaced by their means ({means})"]
     return Material(roughness=float(roughness), metallic=float(metallic)), notes
+
+
+Array = npt.NDArray[np.float64]
+
+TOUCHING = 0.02
+"""Height, as a share of the largest extent, up to which a vertex touches the ground: feet and scans are uneven."""
+CLEAR = 1.1
+"""The shares of two axes differ by more than this factor, or the shape does not tell which one is up."""
+
+
+def guess_up(points: Array, name: str) -> UpAxis:
+    """Return the axis that points up, y or z, by the shape alone; z where that does not tell.
+
+    What stands on a table touches it with a large part of what it covers, seen from above: the foot of a vase, the four
+    wheels of a car. Lying on its side it touches with less. Of 39 meshes of several authors and the bundled objects,
+    each written with y and with z up, it takes the right axis for all that can stand in only one way.
+
+    Args:
+        points: (P, 3) vertices of faces, finite.
+        name: the file's, for the sentence.
+    """
+    shares = {"y": touching_share(points[:, [2, 0, 1]]), "z": touching_share(points)}
+    axis, other = ("y", "z") if shares["y"] > CLEAR * shares["z"] else ("z", "y")
+    if shares[axis] > CLEAR * shares[other]:
+        on = (f"{100 * shares[one]:.0f} %" for one in (axis, other))
+        why = "it then rests on {} of what it covers, seen from above, and on {} otherwise".format(*on)
+    else:
+        why = "its shape does not tell, as it rests as well either way"
+    return UpAxis(axis, f"{name}: {axis} is taken for up, because {why}; if it lies on its side, give `up={other}`")
+
+
+def touching_share(points: Array) -> float:
+    """Return which share, in [0, 1], of what an object covers from above (along its third axis) touches the ground.
+
+    Both are areas of convex hulls.
+    """
+    height = points[:, 2] - points[:, 2].min()
+    touching = height <= TOUCHING * np.ptp(points, axis=0).max()
+    covered = _hull_area(points[:, :2])
+    return _hull_area(points[touching, :2]) / covered if covered > 0.0 else 0.0
+
+
+def _hull_area(points: Array) -> float:
+    """Area of the convex hull of (N, 2) points; 0 where they lie on a line."""
+    if len(points) < 3:
+        return 0.0
+    try:
+        return float(ConvexHull(points).volume)  # in the plane this is the area
+    except QhullError:
+        return 0.0

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.checks import check_faces
-from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
+from advsearch.scene.importing.files import check_faces, damaged, looks_like, shown, text_of
 
 Ints = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.generic]

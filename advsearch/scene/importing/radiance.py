@@ -108,11 +108,7 @@ def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
 
 
 def _run_lengths(body: bytes, position: int, line: Bytes) -> int:
-    """Fill a line (W, 4) from its four run-length encoded channels; return the position after them.
-
-    Raises:
-        IndexError, ValueError: the data ends early, or a run does not fit.
-    """
+    """Fill a line (W, 4) from its four run-length encoded channels; return the position after them."""
     width = len(line)
     for channel in range(4):
         pieces, filled = [], 0
@@ -133,11 +129,7 @@ def _run_lengths(body: bytes, position: int, line: Bytes) -> int:
 
 
 def _plain_line(body: bytes, position: int, line: Bytes) -> int:
-    """Fill a line (W, 4) from pixels of four bytes, where (1, 1, 1, n) repeats the last; return the next position.
-
-    Raises:
-        IndexError, ValueError: the data ends early, or a repeat does not fit.
-    """
+    """Fill a line (W, 4) from pixels of four bytes, where (1, 1, 1, n) repeats the last; return the next position."""
     width = len(line)
     raw = np.frombuffer(body, np.uint8, count=min(4 * width, len(body) - position), offset=position)
     if len(raw) == 4 * width and not (raw.reshape(width, 4)[:, :3] == 1).all(axis=1).any():

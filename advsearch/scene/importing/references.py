@@ -53,7 +53,9 @@ class References:
     def tried(self, name: str) -> bytes | str:
         """Return the content of a named file, or why it is not read, which is not remembered."""
         reason = MISSING
-        for candidate in _candidates(name, plain_name(name)):
+        plain = plain_name(name)
+        tried = [form for text in (name.strip(), plain) for form in (text, text.lstrip("/"), os.path.basename(text))]
+        for candidate in [form for form in dict.fromkeys(tried) if form]:
             try:
                 return self._content(candidate)
             except ValueError:  # a zero byte in the name
@@ -65,12 +67,7 @@ class References:
         return reason
 
     def _content(self, name: str) -> bytes:
-        """Return the content of a file in the folder.
-
-        Raises:
-            FileFormatError: it must not be read; the message is the clause that says why.
-            OSError, ValueError: there is none of that name, or no permission.
-        """
+        """Return the content of a file in the folder."""
         path = os.path.realpath(os.path.join(self._folder, name))
         if os.path.commonpath((path, self._folder)) != self._folder:
             raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)
@@ -86,9 +83,3 @@ class References:
         if size > most:
             raise files.too_large(path, f"files of at most {most:,} bytes in all", f"{size:,}")
         self._contents[path] = data
-
-
-def _candidates(name: str, plain: str) -> list[str]:
-    """Return the names to try: as it stands, plain, without the root, without folders."""
-    tried = [form for text in (name.strip(), plain) for form in (text, text.lstrip("/"), os.path.basename(text))]
-    return [form for form in dict.fromkeys(tried) if form]

@@ -11,10 +11,8 @@ import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.checks import check_faces
-from advsearch.scene.importing.files import damaged, looks_like, text_of
+from advsearch.scene.importing.files import Inventory, check_faces, damaged, looks_like, text_of
 from advsearch.scene.importing.imported_part import ImportedPart
-from advsearch.scene.importing.left_out import Inventory
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
 
 Array = npt.NDArray[np.float64]

@@ -232,7 +232,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
     size = _baked_size(_texels(soup, surfaces))
     corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
     face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
-    through = any(_channels(one) == 4 for one in surfaces)
+    through = any(int((_plain(one) if one.texture is None else one.texture).shape[-1]) == 4 for one in surfaces)
     image, inside = np.ones((size, size, 3 + through), np.float32), np.zeros((size, size), np.bool_)
     bumpy = any(one.normal_map is not None for one in surfaces)
     normals = np.full((size, size, 3), FLAT) if bumpy else None
@@ -265,11 +265,6 @@ def _looked_up(surface: ImportedSurface, at: Array) -> Floats:
         return filtered(surface.texture, at)
     color = _plain(surface)[None] if surface.texture is None else _mean(surface.texture)
     return np.broadcast_to(color, (len(at), color.shape[1]))
-
-
-def _channels(surface: ImportedSurface) -> int:
-    """Return how many channels its base colour has: 3, or 4 with opacity."""
-    return int((_plain(surface) if surface.texture is None else surface.texture).shape[-1])
 
 
 def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Adam, Block, Domain, Ending, Evaluation, Query, search
-from advsearch.attacks.policies.scaling import half_widths
+from advsearch.attacks.domain import half_widths
 
 
 def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor]:

@@ -37,8 +37,7 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.policies import racing
 from advsearch.attacks.policies.base import affordable
-from advsearch.attacks.policies.choices import MOST, with_choices
-from advsearch.attacks.policies.stay import Stay
+from advsearch.attacks.policies.choices import MOST, Stay, with_choices
 from advsearch.errors import InputError, UnknownNameError
 
 BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))

@@ -24,12 +24,12 @@ import yaml
 from torch import Tensor
 
 import advsearch
-from advsearch.api.attack import attack_once
 from advsearch.cli.main import main
 from advsearch.cluster.executor import InProcess
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
+from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.report.claims import claims_of
 from advsearch.questions.test import claims, machines
 from advsearch.questions.test.answer import ClaimAnswer, SuiteResult

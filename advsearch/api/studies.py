@@ -1,0 +1,310 @@
+"""Studies: questions that take several attacks, each in a folder of its own in the run, on workers if asked to.
+
+A worker carries an attack out in a folder on its own disk, which comes back as files.
+
+An attack that this process has begun itself stays its own. What is shared are whole attacks, in a curve all those of an
+object, so that one whose worker died begins again.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from advsearch import rooms
+from advsearch.cluster.executor import Call, Work
+from advsearch.cluster.opening import executor_of
+from advsearch.config import CONFIGS, AttackConfig
+from advsearch.engine import run_settings
+from advsearch.engine.answers import one_label_for_several
+from advsearch.engine.attack_result import AttackResult
+from advsearch.engine.naming import different, load_models
+from advsearch.engine.transport import CleanMatrix
+from advsearch.errors import ClusterError
+from advsearch.files import JsonObject
+from advsearch.interrupts import interruptible
+from advsearch.progress import NullProgress, Progress
+from advsearch.report.notebook import figure_of_answer
+from advsearch.report.shown import shown
+from advsearch.runs import lock
+from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
+from advsearch.runs.files import PART, storage_errors, write_bytes
+from advsearch.runs.listing import finished
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results.study import StudyResult
+from advsearch.runs.summary import attack_of
+from advsearch.scene.library import list_objects, load_object
+from advsearch.settings import FILES
+from advsearch.tasks import make_task
+from advsearch.viewer.pages import write_page
+
+Study = TypeVar("Study", bound=StudyResult)
+Rows = TypeVar("Rows")
+
+LONGEST = 6 * 3600.0
+"""Seconds that one attack may take on a worker before it counts as hanging."""
+
+TEXTS = (".json", ".html", ".yaml")
+"""Files that may say where the run is."""
+
+
+SETTLED = ("found", "already wrong")
+"""Endings after which an object is not attacked with a larger epsilon."""
+
+ALL = "all"
+"""What an ensemble is called among the models that were attacked."""
+
+
+@dataclass(frozen=True)
+class StudyAttack:
+    """One attack of a study.
+
+    Attributes:
+        config: what the attack is carried out with.
+        name: of its folder.
+        of: what tells it from the others: an object, a control of it, or a model.
+        epsilon: that of a curve; None where there is one for all.
+    """
+
+    config: AttackConfig
+    name: str
+    of: str
+    epsilon: float | None = None
+
+    @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return self.config.object + ("" if self.of == self.config.object else f" with {self.of}")
+
+
+Chain = list[StudyAttack]
+"""Attacks that follow one another, until one finds something."""
+
+
+def chains_of(config: AttackConfig) -> list[Chain]:
+    """Return the attacks of a study: of a gap, a matrix or a curve.
+
+    Raises:
+        InputError: a setting that none of the controls takes, or a name comes twice.
+    """
+    if config.command == "gap":
+        return [[one] for one in _controls_of(config)]
+    return [[one] for one in _models_of(config)] if config.is_matrix else _objects_of(config)
+
+
+def _controls_of(config: AttackConfig) -> Chain:
+    """Every object with every control."""
+    run_settings.check(config)
+    attacks = []
+    for place, name in enumerate(different(config.objects, "object")):
+        for number, (control, settings) in enumerate(config.controls.items()):
+            own = run_settings.alone(config, control, settings)
+            one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
+            attacks.append(StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control))
+    return attacks
+
+
+def _models_of(config: AttackConfig) -> Chain:
+    """Every model, or all of them together."""
+    names = different(config.models, "model")
+    own = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
+    return [
+        StudyAttack(AttackConfig.of(config, **more), f"{place:02d}-" + default_name(name, []), name)
+        for place, (name, more) in enumerate(own)
+    ]
+
+
+def _objects_of(config: AttackConfig) -> list[Chain]:
+    """Every object with every epsilon, from the smallest."""
+    chains: list[Chain] = []
+    for place, name in enumerate(different(config.objects, "object")):
+        chains.append([])
+        epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
+        for epsilon in epsilons:
+            words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
+            one = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
+            chains[-1].append(StudyAttack(one, f"{place:02d}-" + default_name(name, words), name, epsilon))
+    return chains
+
+
+def attack_once() -> Callable[..., AttackResult]:
+    """Return what carries out one attack, of the room that attacks."""
+    found: Callable[..., AttackResult] = rooms.in_room("attack", "carry_out", "attack_once")
+    return found
+
+
+def attacks_of(settings: JsonObject) -> Call:
+    """Return what carries out the attacks of the study that the settings describe: what a worker does."""
+    config = CONFIGS[str(settings["command"])](**{k: v for k, v in settings.items() if k != "command"})
+    assert isinstance(config, AttackConfig)
+    chains = chains_of(config)
+
+    def call(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
+        found, clean = [], CleanMatrix()
+        with tempfile.TemporaryDirectory(prefix="advsearch-part-") as folder:
+            for part in chains[numbers[0]]:
+                path = Path(folder) / part.name
+                own = part.config.model_copy(update={"run": str(path), "overwrite": True})
+                ending = attack_once()(own, clean=clean).summary.ending
+                files = (one for one in path.rglob("*") if one.is_file() and one.name != lock.NAME)
+                read = {one.relative_to(path).as_posix(): one.read_bytes() for one in files}
+                found.append((part.name, str(path), read))
+                if ending in SETTLED:
+                    break
+        return found
+
+    return call
+
+
+def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress) -> None:
+    """Have the attacks that are not begun carried out by workers, where some were asked for.
+
+    Args:
+        config: of the study.
+        chains: its attacks.
+        run: its folder, which gets theirs.
+        progress: told how far it is.
+
+    Raises:
+        ClusterError: every worker died of an attack, or there are none.
+    """
+    left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / one.name) for one in chain)]
+    plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
+    settings, threads = {"command": config.command, **plain}, config.used_threads or 1
+    work = Work("advsearch.api.studies:attacks_of", settings, FILES, threads, seconds=LONGEST, ahead=False)
+    workers, cluster = (config.workers, config.cluster) if left else (None, None)
+    with executor_of(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
+        if executor is None:
+            return
+        progress.stage("attacks on workers", len(left))
+        for done in executor.results([number] for number in left):
+            if done.lost:
+                title = chains[done.items[0]][0].title
+                raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
+            for name, place, files in done.value:
+                _place(run / PARTS, name, place, files)
+            facts = executor.facts
+            progress.advance(1, **({} if facts is None else {"workers": facts.workers}))
+
+
+def _place(folder: Path, name: str, before: str, files: Mapping[str, bytes]) -> None:
+    """Write the files of an attack that was carried out in another folder, whole or not at all."""
+    path, part = folder / name, folder / f"{PART}{name}"
+    with storage_errors(path):
+        for relative, data in files.items():
+            if relative.endswith(TEXTS):
+                data = data.replace(before.encode(), str(path).encode())
+            (part / relative).parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(part / relative, data)
+        part.rename(path)
+
+
+# ---- one study ------------------------------------------------------------------------------------------------------
+
+
+def carry_out_study(
+    config: AttackConfig,
+    attacks: Callable[[StudyRun], Rows],
+    result_of: Callable[[Rows, StudyResult], Study],
+    progress: Progress | None,
+    resumed: Path | None,
+) -> Study:
+    """Carry out the attacks of a study in its run.
+
+    Args:
+        config: what is asked.
+        attacks: carries out the attacks and returns their rows.
+        result_of: puts these into a result, beside what all studies have in common.
+        progress: told how far it is.
+        resumed: folder of the run to go on with.
+    """
+    begun, progress = time.perf_counter(), progress or NullProgress()
+    with RunDirectory.of(config, resumed) as run:
+        notes = _label_for_all(config)
+        for text in notes:
+            progress.message(text)
+        study = StudyRun(config, run, progress)
+        rows = attacks(study)
+        common = StudyResult(
+            run=str(run.path),
+            objects=list(config.objects),
+            controls=list(config.controls),
+            environment=config.lit_by,
+            model=config.model,
+            task=config.task_name,
+            policy=config.policy_name,
+            warnings=[*notes, *study.warnings],
+            parts=study.names,
+            ending=INTERRUPTED if study.interrupted else "done",
+            seconds={"total": time.perf_counter() - begun},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        result = result_of(rows, common)
+        for suffix, data in figure_of_answer(shown(result)).items():
+            write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
+        run.write_summary(result)
+        write_page(run.path, result)
+        return result
+
+
+def _label_for_all(config: AttackConfig) -> list[str]:
+    """What there is to say where several bundled objects have one label."""
+    if config.label is None or len(config.objects) < 2:
+        return []
+    bundled = list_objects()
+    own = {name: load_object(name).label if name in bundled else None for name in config.objects}
+    models, _ = load_models([config.model], make_task(config.task), config)
+    return one_label_for_several(models, config.label, own)
+
+
+class StudyRun:
+    """Carries out attacks, each in a folder of its own, unless they are done already; first on workers, if asked to.
+
+    Attributes:
+        chains: all that there are.
+        run: of the study.
+        progress: told how far it is.
+        names: of the parts so far.
+        warnings: what they said, each sentence once.
+        interrupted: whether one was; nothing more is carried out then.
+    """
+
+    def __init__(self, config: AttackConfig, run: RunDirectory, progress: Progress) -> None:
+        self.chains, self.run, self.progress = chains_of(config), run, progress
+        self.names: list[str] = []
+        self.warnings: list[str] = []
+        self.interrupted = False
+        try:
+            with interruptible():
+                share(config, self.chains, run.path, progress)
+        except KeyboardInterrupt:
+            self.interrupted = True
+
+    def attack(self, one: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
+        """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
+        if self.interrupted:
+            return None
+        config, path = one.config, self.run.path / PARTS / one.name
+        self.names.append(one.name)
+        budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
+        what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
+        self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
+        if is_run(path) and (path / CONFIG).is_file():
+            began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG)
+            summary = (
+                attack_once()(began, progress=self.progress, resumed=path, clean=clean).summary
+                if began
+                else attack_of(path)
+            )
+        else:
+            own = config.model_copy(update={"run": str(path), "overwrite": True})
+            summary = attack_once()(own, progress=self.progress, clean=clean).summary
+        self.warnings += [text for text in summary.warnings if text not in self.warnings]
+        self.interrupted = summary.ending == INTERRUPTED
+        return None if self.interrupted else summary

@@ -1,0 +1,1 @@
+"""`attack`: the worst configuration of a scene, or of several."""

@@ -1,0 +1,1 @@
+"""`gap`: the worst case beside the average."""

@@ -1,0 +1,1 @@
+"""Photographs of the real thing, aligned with renderings, judged and counted."""

@@ -1,0 +1,378 @@
+"""`sweep`: the average case of a scene over a grid, over draws by chance, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from advsearch.api.keywords import SweepKeywords, asks
+from advsearch.cluster.executor import Call
+from advsearch.config import AttackConfig, SweepConfig
+from advsearch.controls import Control
+from advsearch.controls.camera import CameraControl, measured_in
+from advsearch.engine import run_settings
+from advsearch.engine.answers import one_label_for_several, shown
+from advsearch.engine.attack_parts import LOADING, executor_for, is_named
+from advsearch.engine.attack_result import AttackResult
+from advsearch.engine.going_on import check_made_of
+from advsearch.engine.loading import Controls, Scene, load_scene, named_camera, only_here, settings_of
+from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
+from advsearch.engine.metrics import only_here as metrics_only_here
+from advsearch.engine.naming import (
+    AnyModel,
+    check_not_of_scene,
+    check_not_spread,
+    different,
+    exists_here,
+    load_models,
+    model_name,
+    scene_of,
+    several,
+)
+from advsearch.engine.sharing import answering
+from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
+from advsearch.engine.sweeps.drives import with_frames
+from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
+from advsearch.engine.sweeps.loop import carry_out
+from advsearch.engine.sweeps.swept_scene import Scenes
+from advsearch.errors import InputError
+from advsearch.files import JsonObject
+from advsearch.models import Model
+from advsearch.options import as_setting
+from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.runs.answer import read_answer
+from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
+from advsearch.runs.listing import finished
+from advsearch.runs.summary import attack_of
+from advsearch.scene.description import ENVIRONMENT
+from advsearch.scene.parameters import Parameter
+from advsearch.scene.surfaces import aovs_of
+from advsearch.settings import split_names
+from advsearch.tasks import AnyTask, Task, make_task
+from advsearch.tasks.own import OwnTask, function_of
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
+"""Settings that a scene of the caller's own has."""
+
+ANSWERING = "advsearch.questions.sweep.carry_out:sweep_answers"
+"""What a worker does."""
+
+CLEAN = "clean"
+"""What the scene without the answer of a run is called beside that with it."""
+
+AnyScene = Scene | str | Path
+
+
+@asks(SweepConfig, SweepKeywords)
+def sweep(
+    scene: AnyScene | Sequence[AnyScene] | None = None,
+    model: AnyModel | Sequence[AnyModel] | None = None,
+    grid: Mapping[str, object] | None = None,
+    *,
+    task: AnyTask = "classification",
+    samples: int | None = None,
+    controls: Controls = (),
+    answer_of: str | Path | AttackResult | None = None,
+    metrics: Mapping[str, str | Metric] | None = None,
+    run: str | Path | None = None,
+    progress: Watched = None,
+    **settings: Unpack[SweepKeywords],
+) -> SweepResult:
+    """Render every configuration of a grid, and draws by chance, and say how often the model is right.
+
+    With `run` naming a sweep of the same settings that was stopped, it goes on where that was stopped. All other
+    arguments are the settings of `advsearch sweep`.
+
+    Args:
+        scene: from `load_scene`, or what that takes; or several. None takes that of `answer_of`.
+        model: from `load_model`, or what that takes; or several, which are shown the same pictures. None takes that of
+            `answer_of`, and the reference model without.
+        task: what judges the models' outputs: a name, a mapping with a `name` and options, an instance, or a function
+            (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
+        grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
+        samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
+        controls: what is drawn by chance, as for `attack`.
+        answer_of: an attack that was kept, or its folder, whose answer is swept beside the clean scene, under the same
+            draws; `summary.beside` compares the two. Where neither `grid` nor `controls` is given, what the attack was
+            over varies.
+        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
+            truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
+        run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
+        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    options = {name: value for name, value in settings.items() if value is not None}
+    if not isinstance(grid, (Mapping, type(None))):
+        raise InputError(f"grid: expected a mapping from parameters to values, got {type(grid).__name__}")
+    brought = _brought(answer_of, varies=bool(grid) or bool(controls))
+    if scene is None and not brought:
+        raise InputError("scene: expected what load_scene returns or takes, got nothing; name one")
+    if scene is not None:
+        brought = {name: value for name, value in brought.items() if name not in OF_A_SCENE}
+    scenes = _several(brought["object"] if scene is None else scene)
+    networks = _several(brought.get("model", "reference") if model is None else model)
+    controls = controls or brought.get("controls", ())
+    task = brought.get("task", task) if task == "classification" else task
+    task = make_task(task) if callable(task) else task
+    names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
+    if names and len(names) < len(scenes):
+        raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
+    described: dict[str, object] = {
+        "model": ",".join(model_name(one) for one in networks),
+        "task": as_setting(task) if isinstance(task, Task) else task,
+        "controls": settings_of(controls),
+        "grid": dict(grid or {}),
+        "samples": samples,
+        "answer_of": _folder(answer_of),
+        "metrics": metrics_as_settings(metrics or {}),
+    }
+    loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
+    if loaded:
+        check_not_of_scene(options)
+        described |= _described(loaded)
+    else:
+        described["object"] = ",".join(name for some in names for name in some)
+    config = SweepConfig(**{**brought, **described, **options, "run": None if run is None else str(run)})
+    parts = [f"the model {model_name(one)}" for one in networks if exists_here(one)]
+    parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
+    parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
+    parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
+    config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
+    if config.workers is not None or config.cluster is not None:
+        check_shared(config.metrics)
+    if config.keep_pictures != "none" and config.run is None:
+        raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
+    if config.aov is not None and config.run is None:
+        raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
+    if config.surface and config.run is None:
+        raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
+    progress = watcher(progress)
+    told = all(isinstance(one, (str, Path)) for one in networks) and not isinstance(task, OwnTask)
+    if loaded or only_here(controls) or not told:
+        check_not_spread(options)
+    resumed = _stopped(config)
+    if config.run is not None and resumed is None:
+        check_free(config.run, overwrite=config.overwrite)
+    asked = task if isinstance(task, Task) else config.task
+    with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as folder:
+        job = _job(config, loaded or _places(config), several(networks), asked, controls)
+        job = replace(job, metrics=load_metrics(config.metrics, metrics))
+        if config.run is not None:
+            return _kept(config, job, progress, folder)
+        with executor_for(config, ANSWERING, progress) as executor:
+            return carry_out(job, None, progress, executor)
+
+
+def sweep_from_config(
+    config: SweepConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> SweepResult:
+    """Do what a configuration describes and keep it in a run directory; see `sweep`.
+
+    Args:
+        config: what.
+        progress: told how far it is.
+        resumed: the folder of a run to go on with: what is stored is not rendered again.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    if config.run is not None and resumed is None:
+        check_free(config.run, overwrite=config.overwrite)
+    progress = progress or NullProgress()
+    progress.stage(LOADING)
+    return _kept(config, job_of(config), progress, resumed)
+
+
+# ---- from names to things -------------------------------------------------------------------------------------------
+
+
+def _folder(answer: str | Path | AttackResult | None) -> str | None:
+    """The run of an answer.
+
+    Raises:
+        InputError: the attack was not kept.
+    """
+    if isinstance(answer, AttackResult) and answer.run is None:
+        raise InputError("answer_of: expected an attack that was kept, got one that was not; give it a `run`")
+    kept = answer.run if isinstance(answer, AttackResult) else answer
+    return None if kept is None else str(kept)
+
+
+def _brought(answer: str | Path | AttackResult | None, *, varies: bool) -> dict[str, Any]:
+    """The settings that an answer brings with it; none without one."""
+    folder = _folder(answer)
+    if folder is None:
+        return {}
+    return SweepConfig.of_answer(AttackConfig.from_yaml(find_run(folder) / CONFIG), varies=varies)
+
+
+def _beside_answer(
+    config: SweepConfig, places: Sequence[NamedScene], drawn: Sequence[Control], axes: Sequence[Axis]
+) -> tuple[NamedScene, ...]:
+    """The places as they are, and then with the answer of the run that the configuration names.
+
+    Raises:
+        InputError: the run has no answer, or the sweep varies what that sets.
+        FileFormatError: it did not end, or is of another command.
+    """
+    if config.answer_of is None:
+        return tuple(places)
+    folder = find_run(config.answer_of)
+    summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
+    if summary.adversarial is None:
+        raise InputError(f"answer_of: {folder} ended with {summary.ending!r}, so that there is no answer to sweep")
+    held = run_settings.given_to(theirs, theirs.controls)
+    varied = {control.name for control in drawn} | {axis.instance for axis in axes}
+    if twice := sorted(varied & {control.name for control in held}):
+        raise InputError(
+            f"answer_of: the answer of {folder} says what {twice[0]} is already; leave it out of `grid` and `controls`"
+        )
+    u, name = torch.from_numpy(read_answer(folder)), folder.resolve().name
+    clean = [replace(place, held=held, answer=CLEAN) for place in places]
+    return (*clean, *(replace(place, u=u, answer=f"{name}'s" if name == CLEAN else name) for place in clean))
+
+
+def _several(given: Any) -> list[Any]:
+    listed = list(given) if isinstance(given, (list, tuple)) else [given]
+    if not listed:
+        raise InputError("scene and model: expected at least one of each, got an empty list")
+    return listed
+
+
+def _place(scene: Scene) -> NamedScene:
+    described = scene.description
+    object_name = described.object_name
+    return NamedScene(object_name, described.environment_name, scene)
+
+
+def _described(places: Sequence[NamedScene]) -> dict[str, object]:
+    """Settings that say what loaded scenes are."""
+    first = places[0].scene.description
+    return {
+        "object": ",".join(dict.fromkeys(place.object for place in places)),
+        "environment": ",".join(dict.fromkeys(place.environment for place in places)),
+        "up": first.up,
+        "camera": named_camera(first),
+        "set": first.given_values if len(places) == 1 else {},
+    }
+
+
+def job_of(config: SweepConfig) -> Job:
+    """Find and load everything that a configuration names."""
+    job = _job(config, _places(config), config.models, config.task, config.controls)
+    return replace(job, metrics=load_metrics(config.metrics))
+
+
+def _job(
+    config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
+) -> Job:
+    run_settings.check(config.model_copy(update={"path": None}))  # where no control travels, one is added
+    drawn, grid = run_settings.given_to(config, controls), config.grid
+    if config.path is not None:
+        drawn, grid = with_frames(config, drawn)
+    axes = read_axes(grid, drawn)
+    if config.samples is not None and not drawn:
+        raise InputError(
+            "samples: expected `controls` beside it, which says what is drawn by chance; add `controls=pose`, say, or "
+            "leave `samples` out"
+        )
+    if not axes and not drawn and len(places) * len(models) == 1:
+        raise InputError(
+            "grid: expected something that varies, got nothing; add an axis such as `grid` pose.yaw=0:360:24, or "
+            "`controls=pose` `samples=100`"
+        )
+    places = _beside_answer(config, places, drawn, axes)
+    check_scenes(places, drawn, axes)
+    sized = all(place.scene.description.object.metres is not None for place in places)
+    axes = tuple(replace(one, parameter=_in_units(one, sized)) for one in axes)
+    made = make_task(task)
+    networks, warnings = _models(models, config, made)
+    scenes = [place.scene for place in places]
+    tasks = tuple(shown(made.on(network), network, scenes, config) for network in networks)
+    warnings += [remark for task in tasks for remark in task.remarks]
+    own = {place.object: place.scene.description.object.label for place in places}
+    warnings += one_label_for_several(networks, config.label, own)
+    for place in places:
+        described = place.scene.description
+        for control in on_grid(drawn, axes, described):
+            described = control.prepare(described) if control.kind == ENVIRONMENT else described
+        warnings += described.notes
+    return Job(
+        config=config,
+        places=tuple(places),
+        models=networks,
+        tasks=tasks,
+        controls=drawn,
+        axes=axes,
+        aovs=aovs_of(config.aov),
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def _in_units(axis: Axis, metres: bool) -> Parameter:
+    """The parameter of an axis, as it is around objects that have a size in metres, or have not."""
+    return measured_in(axis.parameter, metres) if axis.control == CameraControl.kind else axis.parameter
+
+
+def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
+    """Every object under every environment; each is loaded once."""
+    objects, environments = different(config.objects, "object"), different(config.environments, "environment")
+    asked = environments[0] if config.environment else None
+    scenes = {name: scene_of(config, name, asked) for name in objects}
+    if asked is None:
+        return tuple(NamedScene(name, scene.description.environment_name, scene) for name, scene in scenes.items())
+    lights = {asked: scenes[objects[0]].description.environment}
+    for name in environments[1:]:
+        lights[name] = load_scene(scenes[objects[0]].description.object, name).description.environment
+    return tuple(NamedScene(name, light, scenes[name].lit_by(lights[light])) for name in objects for light in lights)
+
+
+def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tuple[tuple[Model, ...], list[str]]:
+    """Load the models; their warnings become sentences of the run."""
+    names = [model_name(one) for one in models]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"model: expected models with different names, got {', '.join(names)}; from Python, "
+            "load_model(..., name=...) gives one"
+        )
+    return load_models(models, task, config)
+
+
+# ---- where it is kept -----------------------------------------------------------------------------------------------
+
+
+def _stopped(config: SweepConfig) -> Path | None:
+    """The folder of a sweep of the same settings that was stopped, if `run` names one."""
+    if config.run is None or config.overwrite or not is_run(run_path(config.run)):
+        return None
+    path = run_path(config.run)
+    recipe = path / CONFIG
+    same = recipe.is_file() and SweepConfig.from_yaml(recipe).plain() == config.to_repeat().plain()
+    return path if same and not finished(path) else None
+
+
+def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
+    """Sweep in a run directory: a new one, or one that was begun."""
+    with RunDirectory.of(config, resumed) as run, executor_for(config, ANSWERING, progress) as executor:
+        functions = {f"metric {name}": one for name, one in job.metrics.items()}
+        check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
+        return carry_out(job, run, progress, executor)
+
+
+# ---- who does it ----------------------------------------------------------------------------------------------------
+
+
+def sweep_answers(settings: JsonObject) -> Call:
+    """Return what answers the queries of the sweep that the settings describe: what a worker does."""
+    return answering(Scenes(job_of(SweepConfig(**settings))).named)
