@@ -33,8 +33,6 @@ from advsearch.scene.transport.renderer import MOST_BYTES, LinearRenderer
 
 FIRST = 8
 """Conditions in the bank at first, in what an evaluation draws."""
-ONE = 24
-"""Conditions in the bank at first where they are one number, as along a path: next to each other, they are alike."""
 GROWTH = 4
 """An evaluation adds a condition for so many that it draws, while the bank grows."""
 EVERY = 100
@@ -191,11 +189,9 @@ class Bank(Predictor):
 
     def _wanted(self, index: int) -> int:
         """How many conditions have been collected by the evaluation with this index."""
-        assert self.problem.conditions is not None
-        index, draws = min(index, self.steps // 2 - 1), self.problem.draws
-        first, begun = (ONE, self.grown) if self.problem.conditions.dim == 1 else (FIRST * draws, [0, *self.grown])
-        steps = sum(min(max(index - begin + 1, 0), EVERY) for begin in begun)
-        return first + steps * draws // GROWTH
+        index = min(index, self.steps // 2 - 1)
+        steps = sum(min(max(index - begin + 1, 0), EVERY) for begin in (0, *self.grown))
+        return FIRST * self.problem.draws + steps * self.problem.draws // GROWTH
 
     def _place(self, number: int) -> Tensor:
         """The configuration at which the matrix of a condition is made."""
