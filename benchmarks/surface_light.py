@@ -19,7 +19,7 @@ seeds: rows a second, light and comparisons included, and how often that is of t
 accuracy; and in how many rows the verdict is not that of the rendered ones, and how many differ between these.
 
 With `--rule`, how often the comparison before a search accepts predictions: as they are, and with mistakes planted in
-them. Each of `--views` searches compares two pictures. Beside it: how far the pictures are off, by 16 times the samples.
+them. Each of `--views` searches compares two pictures. Beside it: how far the pictures are off, by more samples.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Draws docs/images/objects.png and docs/images/environments.png: all objects and environments, to be looked at.
+"""Draws docs/images/objects.webp and docs/images/environments.webp: all objects and environments, to be looked at.
 
 Those of the street are drawn by docs/make_street_image.py.
 
@@ -87,8 +87,7 @@ def picture(
 def _save(path: Path, image: Floats) -> None:
     from PIL import Image
 
-    levels = (image * 127 + 0.5).astype(np.uint8) * 2  # seven bits are enough to look at, and make a smaller file
-    Image.fromarray(levels).save(path, optimize=True)
+    Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(path, quality=85, method=6)
     print(f"{path}: {path.stat().st_size // 1024} KiB")
 
 
@@ -135,9 +134,9 @@ def main() -> None:
     args = parser.parse_args()
     os.makedirs(args.out, exist_ok=True)
     if not args.no_objects:
-        _save(args.out / "objects.png", objects(args.size, args.spp, args.only))
+        _save(args.out / "objects.webp", objects(args.size, args.spp, args.only))
     if not args.no_environments:
-        _save(args.out / "environments.png", environments(args.size, args.spp))
+        _save(args.out / "environments.webp", environments(args.size, args.spp))
 
 
 if __name__ == "__main__":

@@ -106,9 +106,8 @@ class Attack:
     def _cut_paths(self) -> None:
         """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
         problem, config = self.problem, self.config
-        if self._searches.against_surface_light() is None:
-            return  # no step will be rendered
-        if config.specialise and (config.measure == "full" or problem.steps >= WORTH):
+        worth = config.specialise and (config.measure == "full" or problem.steps >= WORTH)
+        if worth and self._searches.against_surface_light() is not None:  # else no step will be rendered
             self.stages.begin(
                 "setup",
                 "finding how many bounces of light the search needs",

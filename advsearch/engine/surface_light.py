@@ -49,11 +49,11 @@ TOGETHER = 8
 
 def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise: bool) -> str | None:
     """Why light on surfaces does not predict a search, in words; None if it may: how far it is off is measured then."""
+    if not specialise:
+        return "nothing is left out"
     names = [one.name for one in problem.space.controls]
     if not plan.varied(problem.renderer, names) & CAMERAS:
         return NO_CAMERA
-    if not specialise:
-        return "nothing is left out"
     if steps * problem.draws < WORTH:
         return f"light on surfaces pays from {WORTH} pictures on"
     if policy.takes_differences(problem.domain, steps):
