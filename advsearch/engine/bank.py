@@ -163,7 +163,7 @@ class Bank(Predictor):
     def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
         wholes = [torch.cat([u, one.numbers]) for one in chosen]
         found = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
-        return replace(found, predicted=True)
+        return replace(found, predicted=1)
 
     def _pictures(self, chosen: Sequence[Condition], u: Tensor) -> Tensor:
         """Predicted pictures (N, H, W, 3) of u under conditions, with a graph."""

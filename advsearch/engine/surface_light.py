@@ -32,8 +32,7 @@ from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
 from advsearch.scene.surface.renderer import SurfaceRenderer
 
 WORTH = 32
-"""Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones
-(`benchmarks/surface_light.py`)."""
+"""Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones."""
 NO_CAMERA = "no camera moves"
 """The reason where light on surfaces has no advantage."""
 LIGHTS = 64
@@ -201,7 +200,7 @@ class SurfaceLight(Predictor):
         answer = self.problem.mean_under(
             lambda some, at: self._pictures(wholes[some], at), wholes, query.u, query.gradient, TOGETHER
         )
-        answer = replace(answer, cost=query.samples, predicted=True)
+        answer = replace(answer, cost=query.samples, predicted=1)
         if not query.keep:
             return answer
         with torch.no_grad():

@@ -307,7 +307,7 @@ class Transport(Predictor):
         renderer = self._compared(query)
         if renderer is None:
             return self.problem.evaluate(query)
-        return replace(self.problem.evaluated(query, query.u, query.seed, renderer)[0], predicted=True)
+        return replace(self.problem.evaluated(query, query.u, query.seed, renderer)[0], predicted=1)
 
     def likely(self, u: Tensor) -> bool:
         """Whether the picture that is predicted from the start would pass its trials, as far as those of the last

@@ -102,7 +102,7 @@ class Groups:
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class WantedPicture:
     """A picture that is wanted.
 
     Attributes:
@@ -217,12 +217,12 @@ class SweptPredictor(ABC):
 
     # ---- pictures ---------------------------------------------------------------------------------------------------
 
-    def pictures(self, asked: Sequence[Asked]) -> list[SweptPicture]:
+    def pictures(self, asked: Sequence[WantedPicture]) -> list[SweptPicture]:
         """Return pictures, each rendered or predicted."""
         if self.reason is not None:
             return [self._rendered(one, 0) for one in asked]
         found: dict[int, SweptPicture] = {}
-        waiting: dict[int, list[Asked]] = {}
+        waiting: dict[int, list[WantedPicture]] = {}
         made: dict[int, Any] = {}
         for one in asked:
             group = self._groups.group(one.number)
@@ -237,10 +237,10 @@ class SweptPredictor(ABC):
                 found[one.number] = SweptPicture(picture, self.samples, self._spent(one))
         return [found[one.number] for one in asked]
 
-    def _rendered(self, one: Asked, spent: int) -> SweptPicture:
+    def _rendered(self, one: WantedPicture, spent: int) -> SweptPicture:
         return SweptPicture(self.renderer(one.u, seed=one.seed, spp=self.spp), predicted=0, traced=spent + 1)
 
-    def _spent(self, one: Asked) -> int:
+    def _spent(self, one: WantedPicture) -> int:
         """Pictures that were traced for a group, said of its first picture alone."""
         first = one.number == self._groups.member(one.number, 0)
         return (self._traced + self._checks * self.for_a_check) * first

@@ -43,7 +43,7 @@ MOST_RAYS = 1 << 21
 
 
 @dataclass(frozen=True, eq=False)
-class Lit:
+class LitGroup:
     """A group: object and surroundings as they stand, and their light."""
 
     renderer: SurfaceRenderer
@@ -96,10 +96,10 @@ class SweptSurfaceLight(SweptPredictor):
 
     @property
     def _bytes(self) -> int:
-        held: list[Lit] = [one for one in self._held.values() if one is not None]
+        held: list[LitGroup] = [one for one in self._held.values() if one is not None]
         return sum(one.light.bytes for one in held) + sum(one.bytes for one in self._arranged)
 
-    def _made(self, u: Tensor, seed: int) -> Lit:
+    def _made(self, u: Tensor, seed: int) -> LitGroup:
         with torch.no_grad():
             inputs = self.renderer.scene.assembly(self.renderer.space.inputs(u))
             arranged = next((one for one in self._arranged if one.stands(inputs)), None)
@@ -111,9 +111,9 @@ class SweptSurfaceLight(SweptPredictor):
                 self._arranged.append(arranged)
             light = arranged.light(inputs)
             arranged.forget()
-            return Lit(arranged, light)
+            return LitGroup(arranged, light)
 
-    def _predicted(self, made: Lit, us: Sequence[Tensor]) -> list[Tensor]:
+    def _predicted(self, made: LitGroup, us: Sequence[Tensor]) -> list[Tensor]:
         of, found = made.renderer, list[Tensor]()
         height, width = of.formation.resolution
         together = max(1, MOST_RAYS // (height * width * RAYS))
@@ -124,7 +124,7 @@ class SweptSurfaceLight(SweptPredictor):
                 found += of.under(made.light, inputs[some], of.there, us[some])
         return found
 
-    def _compared(self, made: Lit, shown: Sequence[tuple[Tensor, int]]) -> list[Deviation]:
+    def _compared(self, made: LitGroup, shown: Sequence[tuple[Tensor, int]]) -> list[Deviation]:
         found = []
         for u, seed in shown:
             rendered = self.renderer(u, seed=seeds.stream(seed, "rendered"), spp=self.spp)

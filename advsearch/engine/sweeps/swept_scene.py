@@ -22,7 +22,7 @@ from advsearch.engine.metrics import judgements
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.light import SweptLight
 from advsearch.engine.sweeps.points import Picks, Points
-from advsearch.engine.sweeps.predicting import Asked, SweptPicture, SweptPredictor
+from advsearch.engine.sweeps.predicting import SweptPicture, SweptPredictor, WantedPicture
 from advsearch.engine.sweeps.surface_light import SweptSurfaceLight
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
@@ -122,11 +122,11 @@ class SweptScene:
     def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
         """The pictures of one size, rounded to 8 bits, by their numbers."""
         job, models = self.job, len(self.job.models)
-        before, asked = self.number * self.points[size].count, dict[int, Asked]()
+        before, asked = self.number * self.points[size].count, dict[int, WantedPicture]()
         for one in queries:
             number, model = divmod(one.number, models)
             if job.sizes[model] == size:
-                asked[number] = Asked(number - before, one.u, one.seed)
+                asked[number] = WantedPicture(number - before, one.u, one.seed)
         with torch.no_grad():
             shown = self.light[size].pictures(list(asked.values()))
         return {n: replace(one, picture=to_8_bit(one.picture)) for n, one in zip(asked, shown, strict=True)}
