@@ -172,7 +172,7 @@ def ruled(scene: str, searches: int) -> None:
             inputs = renderer.scene.assembly(renderer.space.inputs(whole))
             color, lit = light.color(inputs), light.light(inputs)
             brighter = [replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)]
-            pictures = [light.under(one, [inputs], color, [whole])[0] for one in brighter]
+            pictures = [light.shown(light.looks([inputs], one), [inputs], color, [whole])[0] for one in brighter]
             pictures += [pictures[0].roll(shift, dims=1) for shift in (1, 2)]
             shown = [*pictures, renderer(whole, seed=number, spp=SPP)]
             *levels, rendered = levels_off(renderer, shown, whole, search, CHECK_SPP)

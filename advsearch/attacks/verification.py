@@ -64,10 +64,10 @@ TRIAL_LOOKS = 14, 23
 What holds in 75 % or less is found in 2.4 % of all cases at most, as by 19 of 20, and the interval of what is found
 begins at 77 %, by 19 of 20 at 75 %. `benchmarks/verdicts.py` has both exactly."""
 
-EARLY_PERCENT = 97
-OVER_LOOKS = 30, 60, 100, 200
+OVER_EARLY = {30: 30, 60: 59, 100: 95, 150: 141}
+OVER_LOOKS = *OVER_EARLY, 200
 """Trials over many conditions after which a verdict may stand, where nobody asked for a number: of those that count at
-all but the last, where `EARLY_PERCENT` must succeed (30 of 30, 59 of 60, 97 of 100), and of all at the last.
+all but the last, with the successes of `OVER_EARLY`, and of all at the last.
 
 What holds in 85 % or less is found in 3.3 % of all cases at most, and in 2.6 % by 180 of 200 alone."""
 OVER_CONFIDENCE = 0.97
@@ -97,8 +97,8 @@ class Rule:
     def needed(self, trials: int, *, early: bool = False) -> int:
         """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`.
 
-        Of conditions, `early` asks for `EARLY_PERCENT`: more of them could follow."""
-        share = -(-EARLY_PERCENT * trials // 100) if early and self.conditional else self.share(trials)
+        Of conditions, `early` asks for those of `OVER_EARLY`: more of them could follow."""
+        share = OVER_EARLY[trials] if early and self.conditional else self.share(trials)
         return max(share, self.fewest)
 
     def allowed(self, trials: int) -> int:

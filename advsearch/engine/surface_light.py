@@ -29,7 +29,7 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import plan
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
-from advsearch.scene.surface.renderer import SurfaceRenderer
+from advsearch.scene.surface.renderer import Look, SurfaceRenderer
 
 WORTH = 32
 """Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones."""
@@ -44,6 +44,9 @@ CHECK_SPP = 16
 """Samples a pixel of each of the two traced pictures beside one."""
 TOGETHER = 8
 """Pictures that the model is asked about at once."""
+AGAIN = 4
+"""Evaluations of a random search from which on cameras and environments come again: nothing learns from them, and what
+each camera sees is known then."""
 
 
 def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise: bool) -> str | None:
@@ -84,6 +87,7 @@ class SurfaceLight(Predictor):
     _renderer: SurfaceRenderer | None = None
     _lights: list[Tensor] = field(default_factory=list)
     _compared: int = 0
+    _looks: dict[tuple[int, int], list[Look]] = field(default_factory=dict)
 
     # ---- what a predictor says --------------------------------------------------------------------------------------
 
@@ -196,9 +200,16 @@ class SurfaceLight(Predictor):
             yield self.evaluate(query)
 
     def evaluate(self, query: Query) -> Evaluation:
-        wholes = [torch.cat([query.u, numbers]) for numbers in self._drawn(query, self.problem.draws)]
+        again = query.kind == "baseline" and self.problem.conditions is not None and not bool(self._moving.any())
+        number = query.number % AGAIN if again else query.number
+        drawn = self._drawn(replace(query, number=number), self.problem.draws)
+        wholes = [torch.cat([query.u, numbers]) for numbers in drawn]
         answer = self.problem.mean_under(
-            lambda some, at: self._pictures(wholes[some], at), wholes, query.u, query.gradient, TOGETHER
+            lambda some, at: self._pictures(wholes[some], at, (number, some.start) if again else None),
+            wholes,
+            query.u,
+            query.gradient,
+            TOGETHER,
         )
         answer = replace(answer, cost=query.samples, predicted=1)
         if not query.keep:
@@ -220,15 +231,24 @@ class SurfaceLight(Predictor):
         return [torch.where(self._of_light, *both) for both in zip(lights, fresh, strict=True)]
 
     def _inputs(self, whole: Tensor) -> dict[str, Tensor]:
-        """What a configuration of the whole space sets in the scene."""
+        """What a configuration of the whole space sets in the scene; without the base colour, where the searched
+        controls set nothing else."""
+        space, searched = self.problem.space, self.problem.domain.dim
+        if not bool(self._moving.any()):
+            space, whole = replace(space, controls=space.controls[self.problem.searched or 0 :]), whole[searched:]
         with torch.no_grad():
-            return self.problem.renderer.scene.assembly(self.problem.space.inputs(whole))
+            return self.problem.renderer.scene.assembly(space.inputs(whole))
 
-    def _pictures(self, wholes: Sequence[Tensor], u: Tensor) -> Tensor:
-        """Predicted pictures (n, H, W, 3) of u under conditions, with a graph."""
+    def _pictures(self, wholes: Sequence[Tensor], u: Tensor, key: tuple[int, int] | None = None) -> Tensor:
+        """Predicted pictures (n, H, W, 3) of u under conditions, with a graph; what the cameras of a key see is kept."""
         color = self.renderer.color(self.problem.searched_space.inputs(u))
         places = [torch.cat([u, whole[len(u) :]]) for whole in wholes]
-        return self.renderer.pictures([self._inputs(one) for one in wholes], color, places)
+        inputs = [self._inputs(one) for one in wholes]
+        if key is None:
+            return self.renderer.shown(self.renderer.looks(inputs), inputs, color, places)
+        if key not in self._looks:
+            self._looks[key] = list(self.renderer.looks(inputs))
+        return self.renderer.shown(self._looks[key], inputs, color, places)
 
     # ---- comparisons ------------------------------------------------------------------------------------------------
 

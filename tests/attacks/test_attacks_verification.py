@@ -484,8 +484,9 @@ def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[
         ("1" * 200, (30, 30), 30, Ending.FOUND),
         ("-1" * 100, (30, 30), 60, Ending.FOUND),
         ("0" + "1" * 199, (59, 60), 60, Ending.FOUND),
-        ("000" + "1" * 197, (97, 100), 100, Ending.FOUND),
-        ("0000" + "1" * 196, (196, 200), 200, Ending.FOUND),
+        ("00000" + "1" * 195, (95, 100), 100, Ending.FOUND),
+        ("000000" + "1" * 194, (144, 150), 150, Ending.FOUND),
+        ("0" * 10 + "1" * 190, (190, 200), 200, Ending.FOUND),
         ("-000" + "1" * 197, (97, 100), 101, Ending.FOUND),
         ("1" * 20 + "0" * 180, (20, 41), 60, Ending.NOT_VERIFIED),
         ("--1" * 67, (66, 66), 200, Ending.ALREADY_WRONG),
@@ -500,7 +501,7 @@ def test_trials_over_conditions_end_with_the_verdict(
     found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)
     assert (found.adversarial.successes, found.adversarial.trials, found.ending) == (*made, ending)
     assert len(found.clean_trials) == clean
-    assert found.adversarial.interval[0] < clopper_pearson(*made)[0], "it allows for four looks"
+    assert found.adversarial.interval[0] < clopper_pearson(*made)[0], "it allows for all looks"
 
 
 def test_an_answer_over_conditions_goes_on_where_a_control_group_of_another_has_more_trials() -> None:

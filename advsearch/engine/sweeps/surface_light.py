@@ -121,7 +121,7 @@ class SweptSurfaceLight(SweptPredictor):
             inputs = [of.scene.assembly(of.space.inputs(u)) for u in us]
             for begin in range(0, len(us), together):
                 some = slice(begin, begin + together)
-                found += of.under(made.light, inputs[some], of.there, us[some])
+                found += of.shown(of.looks(inputs[some], made.light), inputs[some], of.there, us[some])
         return found
 
     def _compared(self, made: LitGroup, shown: Sequence[tuple[Tensor, int]]) -> list[Deviation]:

@@ -7,7 +7,7 @@ is reflected. Where a pixel's rays go through it is the same for all pixels, so 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,8 +135,9 @@ class Views:
         self._recorded: dict[tuple[Any, ...], Any] = {}
         self._recorded_at = (0, 0)
 
-    def __call__(self, cameras: Sequence[Mapping[str, Tensor]], lit: Lit) -> Seen:
-        """Look at a lit scene.
+    def __call__(self, cameras: Sequence[Mapping[str, Tensor]], lit: Lit) -> Callable[[], Seen]:
+        """Begin to look at a lit scene. What is returned waits until Dr.Jit has done all that it was asked for, and says
+        what is seen; until then the processor may do other things.
 
         Args:
             cameras: the inputs of each: `camera.to_world` (4, 4), and of a pinhole `camera.fov`, `camera.shift_x` and
@@ -167,17 +168,7 @@ class Views:
             lane = dr.arange(mi.UInt32, count * height * width * RAYS)
             dr.eval(lane)  # a recording takes its size from what it is given, the size of the scene's map else
             found = self._recorded[key](self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred)
-            rest, covered, (u, v, weight) = found[:3], found[3], (_by_ray(found[k::3]) for k in (4, 5, 6))
-            size = (count, height, width)
-            (met,) = np.nonzero(weight)
-            return Seen(
-                rest=torch.from_numpy(np.stack([one.numpy() for one in rest], axis=-1)).reshape(*size, 3),
-                covered=torch.from_numpy(covered.numpy().copy()).reshape(*size, 1),
-                sample=torch.from_numpy(met // (len(weight) // len(lane))),
-                uv=torch.from_numpy(np.stack([u[met], v[met]], axis=1)),
-                weight=torch.from_numpy(np.abs(weight[met])),
-                back=torch.from_numpy(weight[met] < 0.0),
-            )
+        return lambda: _seen(found, (count, height, width))
 
     def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, lit: Lit) -> list[Any]:
         """The kernel: radiance but for the searched texture, coverage, and where and how much each ray sees of it."""
@@ -330,6 +321,21 @@ def _through(model: CameraModel, height: int, width: int) -> Floats:
     directions, inside = model.rays(torch.from_numpy(places))
     found = torch.cat([directions * torch.tensor([-1.0, -1.0, 1.0]), inside[:, None]], dim=1)
     return found.float().numpy().ravel()
+
+
+def _seen(found: Sequence[Any], size: tuple[int, int, int]) -> Seen:
+    """What the kernel has found, in memory of torch's own; `size` in cameras, rows and columns."""
+    with one_at_a_time:
+        rest, covered, (u, v, weight) = found[:3], found[3], (_by_ray(found[k::3]) for k in (4, 5, 6))
+        (met,) = np.nonzero(weight)
+        return Seen(
+            rest=torch.from_numpy(np.stack([one.numpy() for one in rest], axis=-1)).reshape(*size, 3),
+            covered=torch.from_numpy(covered.numpy().copy()).reshape(*size, 1),
+            sample=torch.from_numpy(met // (len(weight) // (math.prod(size) * RAYS))),
+            uv=torch.from_numpy(np.stack([u[met], v[met]], axis=1)),
+            weight=torch.from_numpy(np.abs(weight[met])),
+            back=torch.from_numpy(weight[met] < 0.0),
+        )
 
 
 def _by_ray(layers: Sequence[Any]) -> Floats:

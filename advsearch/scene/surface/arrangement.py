@@ -11,7 +11,7 @@ with the shares and the lobe of the surface measured by sampling its BSDF. Nothi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -193,8 +193,8 @@ class Arrangement:
         """Memory of all matrices."""
         return 8 * self.entries
 
-    def seen(self, cameras: Sequence[Mapping[str, Tensor]], light: Light) -> Seen:
-        """Return what cameras see under a light; see `Views`."""
+    def look(self, cameras: Sequence[Mapping[str, Tensor]], light: Light) -> Callable[[], Seen]:
+        """Begin to look through cameras under a light; see `Views`."""
         self._stand()
         return self._views(cameras, light.lit)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +13,16 @@ from torch import Tensor
 from advsearch.files import scaled
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light
+from advsearch.scene.surface.view import SurfaceView
 from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
+
+
+class Look(NamedTuple):
+    """What one of several cameras sees, by its number, and under which light."""
+
+    number: int
+    view: SurfaceView
+    light: Light
 
 
 class SurfaceRenderer(PredictingRenderer):
@@ -90,33 +100,47 @@ class SurfaceRenderer(PredictingRenderer):
             color: (h, w, 3) base colour.
             wholes: (d,) configurations of the space, for what controls do to the finished picture.
         """
-        lights = [self.light(one) for one in inputs]
-        found: dict[int, Tensor] = {}
-        for light in dict.fromkeys(lights):
-            numbers = [number for number, one in enumerate(lights) if one is light]
-            some = self.under(light, [inputs[number] for number in numbers], color, [wholes[n] for n in numbers])
-            found |= dict(zip(numbers, some, strict=True))
-        return torch.stack([found[number] for number in range(len(lights))])
+        return self.shown(self.looks(inputs), inputs, color, wholes)
 
-    def under(
-        self, light: Light, inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]
+    def looks(self, inputs: Sequence[Mapping[str, Tensor]], light: Light | None = None) -> Iterator[Look]:
+        """Look through cameras; those under one environment in one launch, while the last launch's are made use of.
+
+        Args:
+            inputs: of the scene, for each.
+            light: in place of theirs.
+        """
+        groups: dict[Light, list[int]] = {}
+        for number, one in enumerate(inputs):
+            groups.setdefault(self.light(one) if light is None else light, []).append(number)
+        looks = (self.arrangement.look([self._camera(inputs[n]) for n in some], lit) for lit, some in groups.items())
+        begun = next(looks)
+        for lit, numbers in groups.items():
+            seen = begun()
+            begun = next(looks, begun)
+            for place, number in enumerate(numbers):
+                yield Look(number, self.arrangement.view(seen, place), lit)
+
+    def shown(
+        self,
+        looks: Iterable[Look],
+        inputs: Sequence[Mapping[str, Tensor]],
+        color: Tensor,
+        wholes: Sequence[Tensor],
     ) -> Tensor:
-        """Return the pictures under one light, in one launch; arguments as of `pictures`."""
-        seen = self.arrangement.seen([self._camera(one) for one in inputs], light)
-        reflected = light.reflected(self.arrangement.finer(color))
-        self.products += len(inputs)
-        return torch.stack(
-            [
-                self._shown(self.arrangement.view(seen, place).radiance(reflected), one, wholes[place])
-                for place, one in enumerate(inputs)
-            ]
-        )
+        """Return the pictures of what cameras see; arguments as of `pictures`."""
+        fine, reflected, found = self.arrangement.finer(color), dict[Light, Tensor](), dict[int, Tensor]()
+        for look in looks:
+            if look.light not in reflected:
+                reflected[look.light] = look.light.reflected(fine)
+            radiance = look.view.radiance(reflected[look.light])
+            found[look.number] = self._shown(radiance, inputs[look.number], wholes[look.number])
+        self.products += len(found)
+        return torch.stack([found[number] for number in range(len(inputs))])
 
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
-        light = self.light(inputs)
-        view = self.arrangement.view(self.arrangement.seen([self._camera(inputs)], light), 0)
+        (look,) = self.looks([inputs])
         self.products += 1
-        return view.radiance(light.reflected(self.arrangement.finer(self.color(inputs))))
+        return look.view.radiance(look.light.reflected(self.arrangement.finer(self.color(inputs))))
 
     def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {name: inputs.get(name, self._base[name]) for name in CAMERAS if name in self._base}

@@ -147,7 +147,7 @@ def test_rays_go_where_those_of_the_camera_do(size: tuple[int, int]) -> None:
     made = SurfaceRenderer(of, of.start, seed=0)
     inputs = of.scene.assembly(of.space.inputs(of.start))
     cameras = [{name: inputs.get(name, of.scene.base(name)) for name in arrangement.CAMERAS}]
-    covered = made.arrangement.seen(cameras, made.light(inputs)).covered[0, ..., 0]
+    covered = made.arrangement.look(cameras, made.light(inputs))().covered[0, ..., 0]
     same = (covered > 0.5) == (of.surfaces(of.start).id > 0)
     assert 0.1 < float((covered > 0.5).float().mean()) < 0.9
     assert float(same.float().mean()) > 0.97
