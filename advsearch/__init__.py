@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from advsearch.engine.attack_result import AttackResult as AttackResult
     from advsearch.engine.loading import Scene as Scene
     from advsearch.engine.loading import load_scene as load_scene
-    from advsearch.engine.sweeps.answer import SweepResult as SweepResult
+    from advsearch.engine.sweeps.summary import SweepResult as SweepResult
     from advsearch.models import Model as Model
     from advsearch.questions.attack.carry_out import attack as attack
     from advsearch.questions.check.carry_out import check as check
@@ -46,7 +46,7 @@ _HOMES = {
     "Model": "advsearch.models",
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
-    "SweepResult": "advsearch.engine.sweeps.answer",
+    "SweepResult": "advsearch.engine.sweeps.summary",
     "attack": "advsearch.questions.attack.carry_out",
     "check": "advsearch.questions.check.carry_out",
     "compare": "advsearch.questions.compare.carry_out",

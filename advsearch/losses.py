@@ -7,7 +7,7 @@ Those of logits are **maximised**: they rise as the answer gets worse, or nearer
 and labels: (N,) int64, one right answer for each picture, or the indices of a label set of which every answer is right.
 Each is an objective by itself: `attack("mug", objective=losses.log_odds)`. Those of colours are a **cost**, which is
 subtracted. All return (N,) and are differentiable; formulas and sources stand in `advsearch.attacks.logit_objectives`
-and `advsearch.engine.print_terms`.
+and `advsearch.engine.objective`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import logit_objectives as of_logits
-from advsearch.engine import print_terms
+from advsearch.engine import objective
 from advsearch.errors import InputError
 
 __all__ = [
@@ -108,7 +108,7 @@ def total_variation(colors: Tensor) -> Tensor:
         colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of which only pixels with a last
             channel over 0 count.
     """
-    return torch.stack([print_terms.variation(one) for one in _pictures(colors)])
+    return torch.stack([objective.variation(one) for one in _pictures(colors)])
 
 
 def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
@@ -121,7 +121,7 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
         colors: as for `total_variation`.
         palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the 125 of `printable`.
     """
-    return torch.stack([print_terms.off_print(one, palette) for one in _pictures(colors)])
+    return torch.stack([objective.off_print(one, palette) for one in _pictures(colors)])
 
 
 # ---- as objectives --------------------------------------------------------------------------------------------------

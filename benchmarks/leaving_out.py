@@ -26,8 +26,8 @@ import torch
 from advsearch import seeds
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import problem_from_config
-from advsearch.engine.bounces import bounces_of
 from advsearch.engine.gradients import inside, smooth_loss
+from advsearch.engine.planning import bounces_of
 from advsearch.engine.problem import Problem
 from advsearch.scene.leaving_out import NOTHING
 

@@ -42,8 +42,8 @@ threads.configure()
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.engine.surface_light import CHECK_SPP, COMPARED, levels_off, over_all  # noqa: E402
-from advsearch.engine.sweeps.answer import SweepResult  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
+from advsearch.engine.sweeps.summary import SweepResult  # noqa: E402
 from advsearch.engine.transport import BOUND, Deviation  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402

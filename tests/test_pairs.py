@@ -18,8 +18,8 @@ from advsearch.attacks import Query
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, NumberControl, compose, make_control, make_space
 from advsearch.engine.attack_parts import problem_from_config
-from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import framed, make_renderer
+from advsearch.engine.objective import domain_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.sweeps.axes import on_grid, read_axes
 from advsearch.engine.sweeps.points import Points

@@ -19,7 +19,7 @@ from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as plan_text
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.sweeps.worst import OneModel
+from advsearch.engine.sweeps.swept_scene import OneModel
 from advsearch.questions.plan.carry_out import plan_from_config
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.questions.precision.settings import PrecisionConfig

@@ -58,7 +58,7 @@ AROUND = (
     "engine/memory.py",
     "engine/record.py",
     "engine/rows.py",
-    "engine/machines.py",
+    "engine/journal.py",
     "runs/",
     "cli/",
     "progress.py",

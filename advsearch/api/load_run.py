@@ -11,7 +11,7 @@ from torch import Tensor
 
 from advsearch.engine.attack_parts import parts_in
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import InputError
 from advsearch.files import read_bytes
 from advsearch.runs.answer import read_answer

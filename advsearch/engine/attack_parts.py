@@ -43,8 +43,7 @@ from advsearch.engine.naming import (
     scene_of,
     several,
 )
-from advsearch.engine.objective import AnyObjective, objective_for, task_for
-from advsearch.engine.print_terms import print_terms
+from advsearch.engine.objective import AnyObjective, objective_for, print_terms, task_for
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.errors import InputError

@@ -1,23 +1,206 @@
-"""What a search maximises, for one model or for several at once."""
+"""What a search maximises, over which domain, and what `printable` takes from it.
+
+An objective may ask for more than a model's output, the pictures and the truth (docs/objectives.md). As the terms of
+`printable` this depends on u alone, so that it is the same for rendered and for predicted pictures.
+
+The terms of `printable`: how rough the colours to be printed are, and how far from ink. Sharif et al. 2016,
+*Accessorize to a Crime*, sections 5.2.2 (total variation) and 5.2.3 (the non-printability score). Theirs are sums over pixels; these
+are means, so that a weight means the same at every resolution. Their score is a product of distances to all printable
+colours; here it is the distance to the nearest, which is zero at the same colours.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.attacks import Objective, get_objective
+from advsearch.attacks import Block, Domain, Evaluation, Objective, get_objective
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.own_objective import More, nothing_more
-from advsearch.errors import InputError
+from advsearch.controls import Space
+from advsearch.controls.base import BoundControl
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
 from advsearch.models.ensemble import Ensemble, Outputs, of_each
 from advsearch.models.features import features_of
+from advsearch.runs.results.attack import PrintTerms
 from advsearch.scene.renderer import Renderer
 from advsearch.tasks import Task
 from advsearch.tasks.together import Together
+
+
+def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **more: Any) -> Domain:
+    """Return where a search over some controls may look: the budgets of all their groups, in the order of u.
+
+    Args:
+        controls: of a space, or some of them.
+        start: (d,) float32; by default the controls' own, which leaves the scene as it is.
+        **more: other fields of `Domain`: `gradient_cost`, `partial_gradients`.
+    """
+    blocks = tuple(
+        Block(
+            group.size,
+            group.budget.norm,  # type: ignore[arg-type]
+            group.budget.epsilon,
+            periodic=group.periodic,
+            name=f"{control.name}.{group.parameter}",
+            options=group.options,
+        )
+        for control in controls
+        for group in control.groups
+    )
+    if start is None:
+        start = torch.cat([control.start for control in controls]) if controls else torch.zeros(0)
+    return Domain(start, blocks, **more)
+
+
+class Named(Mapping[str, Tensor]):
+    """Tensors by name, of N configurations: each (N, ...).
+
+    Args:
+        what: a name stands for, for messages.
+        each: of each configuration.
+    """
+
+    def __init__(self, what: str, each: Sequence[Mapping[str, Tensor]]) -> None:
+        self._what, self._each = what, each
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self:
+            raise UnknownNameError(self._what, name, self._each[0])
+        return torch.stack([one[name] for one in self._each])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._each[0]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._each[0])
+
+    def __len__(self) -> int:
+        return len(self._each[0])
+
+
+class Asked:
+    """Gives what is asked for at N configurations, which differ in nothing that is searched.
+
+    Args:
+        space: the controls behind the whole of u.
+        searched: the controls that are searched, which come first there.
+        wholes: the configurations, (d,) each, of the whole space.
+
+    Attributes:
+        used: whether anything was asked for.
+    """
+
+    def __init__(self, space: Space, searched: Space, wholes: Sequence[Tensor]) -> None:
+        self._space, self._searched, self._wholes = space, searched, wholes
+        self.used = False
+
+    def __call__(self, name: str) -> Any:
+        """Return what an objective asks for.
+
+        Args:
+            name: "u", (N, d) of the searched controls; "texture", (N, h, w, 3) display-referred sRGB in [0, 1], the
+                searched colours of the control that has some, or (N, h, w, 4) with 1 where they are searched and 0
+                elsewhere; "textures", the same by control, where several have some; "inputs", the scene inputs by
+                name; "configuration", the numbers by parameter.
+
+        Raises:
+            InputError: there is not exactly one texture.
+        """
+        self.used = True
+        if name == "inputs":
+            return Named("input of the scene", [self._space.inputs(whole) for whole in self._wholes])
+        if name == "configuration":
+            return Named("number of the configuration", [self._space.numbers(whole) for whole in self._wholes])
+        u = self._wholes[0][: len(self._searched.start)]
+        if name == "u":
+            return u.expand(len(self._wholes), *u.shape)
+        printed = self._searched.printed(u)
+        if name == "textures":
+            return Named("control whose colours are searched:", [printed] * len(self._wholes))
+        if len(printed) != 1:
+            got = ", ".join(printed or (control.name for control in self._searched.controls)) or "nothing"
+            instead = "ask for `textures`, which has them by name" if printed else "add `texture` or `patch`"
+            raise InputError(
+                f"objective: it asks for `texture`, the colours of one control that are searched, got {got}; {instead}"
+            )
+        (colors,) = printed.values()
+        return colors.expand(len(self._wholes), *colors.shape)
+
+
+LOW, HIGH, STEP = 0.1, 0.9, 0.2
+"""The printable colours: all 125 of which each channel is 0.1, 0.3, 0.5, 0.7 or 0.9 in sRGB. No printer was measured:
+that ink on paper reaches neither the black, nor the white, nor the pure colours of a screen is all that they say."""
+WEIGHT = 10.0
+"""Of either term, in the objective's unit (logits for a margin) per unit of sRGB."""
+
+
+LEAST = 2.0**-40
+"""Shortest step in sRGB that has a gradient."""
+
+
+def variation(colors: Tensor) -> Tensor:
+    """Return the mean length of the step from a pixel (h, w, 3) to its right and lower neighbours, by channel; of a
+    picture (h, w, 4) only between pixels that its last channel has."""
+    colors, there = colors[..., :3], colors[..., 3:]
+    right, down = colors.diff(dim=1), colors.diff(dim=0)
+    if there.shape[-1]:
+        right, down = right * there[:, 1:], down * there[1:]
+    squared = F.pad(right.square(), (0, 0, 0, 1)) + F.pad(down.square(), (0, 0, 0, 0, 0, 1))
+    length = squared.clamp(min=LEAST**2).sqrt() - LEAST
+    return length[there[..., 0] > 0.0].mean() if there.shape[-1] else length.mean()
+
+
+def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
+    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest printable colour, of a palette
+    (P, 3) where one is given; of a picture (h, w, 4) of those that its last channel has."""
+    colors = colors if colors.shape[-1] == 3 else colors[colors[..., 3] > 0][:, None, :3]
+    if palette is None:
+        nearest = (LOW + STEP * ((colors.detach() - LOW) / STEP).round()).clamp(LOW, HIGH)
+    else:
+        palette = palette.to(colors)
+        nearest = palette[torch.cdist(colors.detach().reshape(-1, 3), palette).argmin(dim=1)].reshape(colors.shape)
+    distance: Tensor = torch.linalg.vector_norm(colors - nearest, dim=2).mean()
+    return distance
+
+
+def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Both terms, summed over what is to be printed."""
+    found = list(space.printed(u).values())
+    if not found:
+        raise InputError(
+            "printable: expected a search over the colours of a texture or a patch, got "
+            f"{', '.join(control.name for control in space.controls)}; add `texture` or `patch`, or leave it out"
+        )
+    return torch.stack([variation(one) for one in found]).sum(), torch.stack([off_print(one) for one in found]).sum()
+
+
+def print_terms(space: Space, u: Tensor) -> PrintTerms:
+    """Return both terms of a configuration (d,), without their weight.
+
+    Raises:
+        InputError: nothing that can be printed is searched.
+    """
+    with torch.no_grad():
+        rough, off = _terms(space, u)
+    return PrintTerms(variation=float(rough), off_print=float(off))
+
+
+def penalised(found: Evaluation, space: Space, u: Tensor) -> Evaluation:
+    """Return an evaluation of u whose objective is less by both weighted terms, and its derivative by theirs."""
+    at = u.detach().clone().requires_grad_()
+    with torch.enable_grad():
+        penalty = WEIGHT * torch.stack(_terms(space, at)).sum()
+        (slope,) = torch.autograd.grad(penalty, at)
+    derivative = None if found.gradient is None else found.gradient - slope
+    return replace(found, objective=found.objective - float(penalty.detach()), gradient=derivative)
+
 
 AnyObjective = str | Callable[..., Tensor]
 """An objective: its name, or the user's own function."""

@@ -14,12 +14,11 @@ from advsearch.attacks.domain import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.domains import domain_of
 from advsearch.engine.driving import answer_along
 from advsearch.engine.failures import described_failures, write_failures
 from advsearch.engine.journal import Journal
+from advsearch.engine.objective import domain_of, print_terms
 from advsearch.engine.pictures import KeptPicture, trial_to_show, write_artifacts, write_object, write_pictures
-from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate

@@ -1,24 +1,30 @@
-"""Chooses estimators, steps and sample counts by measurement on the scene and the loss at hand.
+"""Chooses estimators, steps, sample counts and bounces of light by measurement on the scene and the loss at hand.
 
 Which estimator: the one with the least (squared error) x time, error against differences of the same loss. Which step
 and sample count: the cheapest whose gradient has a cosine of at least `GOAL` with the converged one, of the model's
 own loss (docs/gradients.md, "The model's own loss": over poses that loss is rough at the scale of a pixel and sensitive
 to noise).
+
+How many bounces: as many as change the picture. Renders of other path lengths with the same seed draw the same paths,
+cut off earlier, so that their difference is the light of the bounces left out, almost without noise. A search may leave
+out what the eye could not see; a verification leaves out nothing, so that no answer rests on it.
 """
 
 from __future__ import annotations
 
 import itertools
 import statistics
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from advsearch import seeds
 from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
-from advsearch.runs.results.derivatives import CosineRow, GradientStatus
+from advsearch.engine.problem import Problem
+from advsearch.runs.results.derivatives import CosineRow, GradientStatus, PathCut, PathLength
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, compared
 from advsearch.scene.renderer import Renderer
@@ -291,3 +297,124 @@ def _shortfall(chosen: CosineRow) -> str:
     if chosen.converged < TELLS:
         return f"which says little, two converged ones have {chosen.converged:.2f}"
     return f"below {GOAL:g}, the best that was found"
+
+
+SHORTEST = 2
+"""Segments of the shortest path tried: light that reaches the camera from a surface that it falls on directly."""
+BOUND = 0.5
+"""Root-mean-square change of the displayed picture, in 8-bit levels, that a search accepts."""
+LEVELS = 255.0
+
+
+def measured_bounces(
+    renderer: Renderer,
+    configurations: Sequence[Tensor],
+    *,
+    seed: int,
+    spp: int,
+    bound: float = BOUND,
+    tick: Callable[[], None] = lambda: None,
+) -> PathLength:
+    """Return the shortest paths whose pictures agree with those of the full length to within a bound.
+
+    Args:
+        renderer: at the full length.
+        configurations: where to look, each (d,).
+        seed: root of the noise, which is the same for all lengths.
+        spp: samples a pixel of each of two halves; few are enough.
+        bound: in 8-bit levels, see `PathCut.levels`.
+        tick: called after each picture.
+
+    Returns:
+        The depth, with what was measured: from the full length downwards, to the first that misses the bound.
+    """
+    raw = renderer.like(denoiser="none")  # a denoiser would spread a change over its neighbours
+    full = raw.scene.max_depth
+    noises = [seeds.stream(seed, "half", half) for half in range(2)]
+
+    def pictures(u: Tensor, depth: int) -> list[tuple[Tensor, Tensor]]:
+        rendered = []
+        for noise in noises:
+            rendered.append(_pictures(raw, u, noise, spp, depth))
+            tick()
+        return rendered
+
+    wholes = [pictures(u, full) for u in configurations]
+    cuts, chosen = [], full
+    for depth in range(full - 1, SHORTEST - 1, -1):
+        light = levels = 0.0
+        for u, whole in zip(configurations, wholes, strict=True):
+            cut = pictures(u, depth)
+            light = max(light, _missing(whole, cut))
+            levels = max(levels, LEVELS * _bias(whole, cut))
+        cuts.append(PathCut(depth=depth, light=light, levels=levels))
+        if not levels <= bound:
+            break
+        chosen = depth
+    reason = _reason(chosen, full, {cut.depth: cut for cut in cuts})
+    return PathLength(depth=chosen, full=full, cuts=cuts, configurations=len(configurations), reason=reason)
+
+
+def _reason(depth: int, full: int, cuts: Mapping[int, PathCut]) -> str:
+    """Why a search renders paths of this length, by what cuts at other lengths leave out."""
+    said = []
+    if depth < full:
+        cut = cuts[depth]
+        said.append(
+            f"paths of {depth} segments leave out {cut.light:.2%} of the light, which moves the picture by "
+            f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
+        )
+    if depth - 1 in cuts:
+        rejected = cuts[depth - 1]
+        said.append(f"{rejected.depth} would leave out {rejected.light:.2%} and move it by {rejected.levels:.2f}")
+    return "; ".join(said) or f"all {full} segments"
+
+
+def _missing(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:
+    """The share of the radiance that is missing."""
+    full = sum(float(radiance.mean()) for radiance, _ in whole)
+    return 1.0 - sum(float(radiance.mean()) for radiance, _ in cut) / full if full > 0.0 else 0.0
+
+
+def _bias(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:
+    """The root-mean-square bias: the product of two independent differences has no noise in its mean."""
+    first, second = (one[1] - other[1] for one, other in zip(whole, cut, strict=True))
+    return float((first * second).mean().clamp_min(0.0).sqrt())
+
+
+def _pictures(renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int) -> tuple[Tensor, Tensor]:
+    """Radiance and displayed picture."""
+    with torch.no_grad(), renderer.scene.shorter(depth):
+        radiance = renderer.radiance(u, seed, spp)
+        return radiance, renderer.space.picture(u, renderer.formation.display(radiance))
+
+
+DRAWS = 2
+"""Configurations, beside the clean one, that the measurement looks at."""
+BOUNCE_SPP = 4
+"""Samples a pixel: the same paths are compared, so that few are enough."""
+WORTH_BOUNCES = 200
+"""Renders of a search from which the measurement pays; each path length costs a compilation."""
+
+
+def most_pictures(problem: Problem) -> int:
+    """Return how many pictures `bounces_of` renders at most."""
+    return (1 + DRAWS) * 2 * (1 + problem.renderer.scene.max_depth - SHORTEST)
+
+
+def bounces_of(problem: Problem, seed: int, tick: Callable[[], None] = lambda: None) -> PathLength:
+    """Measure the bounces that a problem's search needs, over its clean configuration and random ones of its space.
+
+    Args:
+        problem: whose scene and space.
+        seed: root of the noise and of the draws.
+        tick: called after each picture.
+    """
+    drawn = [
+        problem.domain.sample(torch.Generator().manual_seed(seeds.stream(seed, "bounces", number)))[0]
+        for number in range(DRAWS)
+    ]
+    conditions = [seeds.stream(seed, "conditions of bounces", number) for number in range(DRAWS)]
+    wholes = [problem.whole(problem.domain.start)]
+    wholes += [problem.whole(u, draw) for u, draw in zip(drawn, conditions, strict=True)]
+    return measured_bounces(problem.renderer, wholes, seed=seeds.stream(seed, "bounces"), spp=BOUNCE_SPP, tick=tick)

@@ -18,11 +18,9 @@ from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.described import Value
-from advsearch.engine.answers import Described, Looked
-from advsearch.engine.asked import Asked
-from advsearch.engine.domains import domain_of
+from advsearch.engine.answers import Described, KnownTruths, Looked
 from advsearch.engine.metrics import Metrics, judgements, mean_metrics
-from advsearch.engine.truths import KnownTruths
+from advsearch.engine.objective import Asked, domain_of
 from advsearch.models import Model
 from advsearch.runs.results.derivatives import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP

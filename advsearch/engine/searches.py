@@ -25,7 +25,7 @@ from advsearch.config import AttackConfig
 from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.journal import Journal
-from advsearch.engine.print_terms import penalised
+from advsearch.engine.objective import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight

@@ -26,7 +26,7 @@ from advsearch.controls import LightControl, PoseControl
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.loading import as_controls, instances_in, settings_of
 from advsearch.engine.run_settings import given_to
-from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.questions.gap.answer import GapResult

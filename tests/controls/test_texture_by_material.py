@@ -19,7 +19,7 @@ from trimesh.visual.material import PBRMaterial
 import advsearch
 from advsearch.cli.main import main
 from advsearch.controls import make_control, make_space
-from advsearch.engine.print_terms import off_print, variation
+from advsearch.engine.objective import off_print, variation
 from advsearch.engine.printing import printable
 from advsearch.engine.transport import remark
 from advsearch.errors import InputError

@@ -13,7 +13,7 @@ from small_models import easy
 import advsearch
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig
-from advsearch.engine.print_terms import off_print, variation
+from advsearch.engine.objective import off_print, variation
 from advsearch.engine.record import Stages
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import attack_once

@@ -39,7 +39,7 @@ from advsearch.cli.question import QuestionCommand
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
-from advsearch.engine.domains import domain_of
+from advsearch.engine.objective import domain_of
 from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.axes import axis_values, on_grid, read_axes
 from advsearch.engine.sweeps.job import KIND

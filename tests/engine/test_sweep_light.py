@@ -10,7 +10,7 @@ from stand_ins import rows
 
 import advsearch
 from advsearch.attacks.product import Product
-from advsearch.engine.sweeps import light
+from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.predicting import Groups, combined
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.transport import Deviation
@@ -23,7 +23,7 @@ GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}
 @pytest.fixture(autouse=True)
 def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few dozen pictures are enough here."""
-    monkeypatch.setattr(light, "PAYS", 0.3)
+    monkeypatch.setattr(swept_scene, "PAYS", 0.3)
 
 
 def test_pictures_fall_into_groups_that_differ_in_light_alone() -> None:
@@ -86,7 +86,7 @@ def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_en
 
 
 def test_a_group_whose_prediction_is_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(light, "deviation_under_light", lambda *given: Deviation(9.0, 0.0, 2.0, pictures=2))
+    monkeypatch.setattr(swept_scene, "deviation_under_light", lambda *given: Deviation(9.0, 0.0, 2.0, pictures=2))
     found = advsearch.sweep("mug", "reference", GRID, **SMALL)
     told, renders = found.summary.transport, found.summary.renders
     assert told is not None and "1 of 1 groups were rendered" in str(told.reason)

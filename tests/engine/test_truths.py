@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 import torch
 
-from advsearch.engine.truths import KnownTruths
+from advsearch.engine.answers import KnownTruths
 from advsearch.tasks import Facts
 
 

@@ -17,7 +17,7 @@ from advsearch.config import AttackConfig
 from advsearch.controls import LightControl, TextureControl
 from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import inside, smooth_loss
-from advsearch.engine.path_length import BOUND, measured_bounces
+from advsearch.engine.planning import BOUND, measured_bounces
 from advsearch.questions.plan.carry_out import plan_from_config
 from advsearch.questions.plan.leaving_out import ALL, RENDERS, WHAT, measured_gains, resolved_texels
 from advsearch.questions.plan.settings import PlanConfig

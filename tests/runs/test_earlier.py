@@ -18,7 +18,7 @@ from advsearch.api import carry_out
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.sweep import SweepSummary

@@ -15,9 +15,9 @@ from advsearch.config import SweepConfig
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
 from advsearch.engine.answers import Looked, check_truth, facts_of
-from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import Scene, framed
 from advsearch.engine.metrics import Metrics
+from advsearch.engine.objective import domain_of
 from advsearch.engine.sharing import Sent
 from advsearch.engine.sweeps.axes import Axis, on_grid
 from advsearch.engine.sweeps.points import Drawn, Points

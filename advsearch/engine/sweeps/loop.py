@@ -18,22 +18,19 @@ from typing import Any
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.product import batches
 from advsearch.cluster.executor import Executor, InProcess
-from advsearch.engine.going_on import finite, same
-from advsearch.engine.journal import Journal, other_answers
+from advsearch.engine.journal import Journal, finite, other_answers, same
 from advsearch.engine.loading import framed
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import LOST, judgement_of, lost_remarks
 from advsearch.engine.sharing import Sent, Shared, answering, lost
-from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.drives import Drives, time_axis
 from advsearch.engine.sweeps.job import KIND, Job, check_all
 from advsearch.engine.sweeps.points import Picks
 from advsearch.engine.sweeps.predicting import combined
-from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
+from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, SweepResult, Tally, rate
 from advsearch.engine.sweeps.surface import map_surface
-from advsearch.engine.sweeps.swept_scene import Scenes
-from advsearch.engine.sweeps.worst import check_worst
+from advsearch.engine.sweeps.swept_scene import Scenes, check_worst
 from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
 from advsearch.report.studies import sweep_figure

@@ -1,36 +1,116 @@
 """The scenes of a sweep: each answers queries about its pictures, rendered or predicted, by all models of the sweep.
 
 What comes of a query depends on it and on the job alone, so it may be answered anywhere, in whatever company.
+
+Pictures that differ in light alone are put together from basis pictures, once these pay (docs/transport.md). A group
+is a pose, say, under all of its light, and has basis pictures of its own.
+
+The worst configuration is checked again: fresh seeds, enough samples, 8 bits. A sweep has no clean configuration, so
+there is no control group: a trial counts where the model is wrong. Its place in the answer: docs/sweeps.md, "What it
+says".
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluation, Query
+from advsearch.attacks import Evaluation, Query, Trials, choose_spp, run_trials
+from advsearch.attacks.sample_count import margins_of, most_samples
 from advsearch.described import Value
+from advsearch.engine.journal import Journal
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.metrics import judgements
+from advsearch.engine.record import Stages
+from advsearch.engine.rows import rate_of
+from advsearch.engine.sharing import Shared
 from advsearch.engine.sweeps.job import Job
-from advsearch.engine.sweeps.light import SweptLight
 from advsearch.engine.sweeps.points import Picks, Points
-from advsearch.engine.sweeps.predicting import SweptPicture, SweptPredictor, WantedPicture
+from advsearch.engine.sweeps.predicting import PAYS, SweptPicture, SweptPredictor, WantedPicture
 from advsearch.engine.sweeps.surface_light import SweptSurfaceLight
+from advsearch.engine.transport import CHECK_SPP, Deviation, deviation_under_light
+from advsearch.engine.verifier import ladder_of
+from advsearch.files import scaled
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.sweep import WorstVerified
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.transport.lights import BasisRenderer, Lights, lighting
+from advsearch.scene.transport.plan import NOISE
+from advsearch.scene.transport.renderer import MOST_BYTES, SPP
 from advsearch.tasks import Judgement, Mark
 from advsearch.tasks.base import Truth
 from advsearch.viewer import thumbnails
+
+
+@dataclass
+class SweptLight(SweptPredictor):
+    """Predicts pictures of one scene at one size from basis pictures."""
+
+    way: ClassVar[str] = "basis pictures"
+    samples: ClassVar[int] = SPP
+    checks: ClassVar[tuple[int, int]] = (3, 1)
+    for_a_check: ClassVar[int] = 2
+
+    def _follows(self) -> frozenset[str]:
+        self._moving, self._lights = lighting(self.renderer), 0
+        return frozenset(self._moving.groups)
+
+    def _reason(self) -> str | None:
+        if not any(self._moving.groups.values()):
+            return ""
+        if not self.specialise:
+            return "nothing is left out"
+        if self.renderer.formation.denoiser != "oidn":
+            return NOISE
+        groups, inputs = self._groups, self.renderer.scene.assembly(self.renderer.space.inputs(self.renderer.start))
+        self._lights = len(Lights(self.renderer, self._moving, inputs).alone)
+        samples = self._lights * SPP + self._checks * (CHECK_SPP + self.spp)
+        least = math.ceil(PAYS * samples / self.spp)
+        if groups.size < least:
+            return f"basis pictures pay where {least} pictures or more differ in light alone; here {groups.size} do"
+        height, width = self.renderer.formation.resolution
+        if groups.at_once * self._lights * 8 * height * width > scaled(MOST_BYTES):
+            return f"basis pictures of {groups.count} groups take too much memory; make light the last axes of the grid"
+        return None
+
+    @property
+    def _traced(self) -> int:
+        return self._lights
+
+    @property
+    def _bytes(self) -> int:
+        return sum(one.bytes for one in self._held.values() if one is not None)
+
+    @property
+    def not_finite(self) -> int:
+        return sum(one.non_finite for one in self._held.values() if one is not None)
+
+    def _made(self, u: Tensor, seed: int) -> BasisRenderer:
+        return BasisRenderer(self.renderer, u, seed, moving=self._moving)
+
+    def _predicted(self, made: BasisRenderer, us: Sequence[Tensor]) -> list[Tensor]:
+        return [made(u) for u in us]
+
+    def _compared(self, made: BasisRenderer, shown: Sequence[tuple[Tensor, int]]) -> list[Deviation]:
+        found = []
+        for u, seed in shown:
+
+            def loss(picture: Tensor, u: Tensor = u) -> float:
+                return self.score(picture, u)
+
+            found.append(deviation_under_light(self.renderer, loss, made, u, seed, self.spp))
+        return found
 
 
 class SweptScene:
@@ -225,3 +305,70 @@ class Scenes:
         """Return the picture (H, W, 3) with this number as the first model sees it."""
         sent = self.job.queries(range(number, number + 1))
         return self.named(sent[0][0]).pictures([query for _, _, query in sent])[0]
+
+
+PROBES = "sample count worst"
+"""Rows of the renders that chose the sample count."""
+
+
+@dataclass(frozen=True)
+class OneModel:
+    """A swept scene as one of the models sees it: what a `Problem` is to an attack."""
+
+    view: SweptScene
+    model: int
+
+    def evaluate(self, query: Query) -> Evaluation:
+        """Answer one query: a trial."""
+        picture = self.view.picture(self.model, query.u, query.seed, query.spp)
+        return Evaluation.of(self.view.judge(self.model, query.u, picture))
+
+
+def check_worst(
+    view: SweptScene, job: Job, model: int, u: Tensor, run: RunDirectory | None, stages: Stages
+) -> WorstVerified | None:
+    """Render a configuration again, and say how often the model is wrong.
+
+    Trials that the run has stored already are not made again.
+
+    Args:
+        view: its scene.
+        job: says how many trials.
+        model: number of the model.
+        u: (d,).
+        run: gets a row for every trial, and has those of a run that was stopped.
+        stages: told how far it is.
+
+    Returns:
+        As `verified` in the summary; None without trials.
+    """
+    config = job.config
+    if config.trials == 0:
+        return None
+    seed, ladder = config.seed, ladder_of(config)
+    stages.begin(
+        "verification",
+        "finding how many samples the check needs",
+        most_samples(1, ladder),
+        hint="the worst configuration, counted in samples a pixel; `verify_spp=NUMBER` leaves it out",
+        at_most=True,
+    )
+    problem: Any = OneModel(view, model)
+    journal = Journal(run, Shared(problem))
+
+    def answers(queries: Sequence[Query], *, in_samples: bool = False) -> Iterator[Evaluation]:
+        asked = [replace(one, drawn=False, sought=False) for one in queries]
+        for query, answer in zip(asked, journal.answers(asked), strict=True):
+            stages.progress.advance(query.spp if in_samples else 1)
+            yield answer
+
+    margins = margins_of(partial(answers, in_samples=True), PROBES, u, sought=False)
+    count = choose_spp({"worst": margins}, seed=seed, ladder=ladder)
+    hint = f"{config.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
+    stages.begin("verification", "checking the worst configuration with fresh renders", config.trials, hint=hint)
+    tried = run_trials(answers, u, spp=count.spp, seed=seed, trials=config.trials)
+    settled = count.converged or len(ladder) == 1
+    renders = count.renders + len(tried)
+    wrong = [trial for trial in tried if trial.success]
+    rate = rate_of(Trials(len(wrong), len(tried), count.spp), tried, wrong)
+    return WorstVerified(**vars(rate), converged=settled, renders=renders)

@@ -31,8 +31,7 @@ from advsearch.engine.attack_parts import (
     with_derivatives,
 )
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.going_on import check_made_of
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, check_made_of
 from advsearch.engine.loading import (
     Controls,
     Scene,

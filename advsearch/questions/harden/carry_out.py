@@ -20,7 +20,7 @@ from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.engine import run_settings
 from advsearch.engine.attack_parts import LOADING, executor_for
-from advsearch.engine.going_on import check_made_of
+from advsearch.engine.journal import check_made_of
 from advsearch.engine.loading import Controls
 from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name
 from advsearch.errors import ClusterError, InputError

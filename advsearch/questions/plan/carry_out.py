@@ -10,12 +10,20 @@ from typing import TYPE_CHECKING, Any
 from advsearch import seeds
 from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, configured
 from advsearch.engine.attack_parts import LOADING, problem_from_config
-from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
 from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.naming import AnyModel
-from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
+from advsearch.engine.planning import (
+    GOAL,
+    bounces_of,
+    cosine_samples,
+    cosines,
+    measured_plan,
+    most_pictures,
+    plan_gradients,
+    tuned,
+)
 from advsearch.engine.problem import Problem
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, GainRow, PlanResult, TexelRow

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
 from advsearch.controls import Space, make_control, make_space
-from advsearch.engine import domains
+from advsearch.engine import objective
 from advsearch.engine.gradients import Agreement, Loss, Probe, agreement, estimates, probes, reference, smooth_loss
 from advsearch.questions.stability.case import Check, Outcome, holds
 from advsearch.scene import library
@@ -258,7 +258,7 @@ def search_domain(renderer: Renderer, start: Tensor | None = None) -> Domain:
     """Return where a search of a renderer's space may look, from its start or another one."""
     space = renderer.space
     assert isinstance(space, Space)
-    return domains.domain_of(
+    return objective.domain_of(
         space.controls,
         renderer.start if start is None else start,
         gradient_cost=renderer.plan.renders,

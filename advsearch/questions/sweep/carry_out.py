@@ -19,7 +19,7 @@ from advsearch.engine import run_settings
 from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.attack_parts import LOADING, executor_for, is_named
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.going_on import check_made_of
+from advsearch.engine.journal import check_made_of
 from advsearch.engine.loading import Controls, Scene, load_scene, named_camera, only_here, settings_of
 from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
 from advsearch.engine.metrics import only_here as metrics_only_here
@@ -35,11 +35,11 @@ from advsearch.engine.naming import (
     several,
 )
 from advsearch.engine.sharing import answering
-from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
 from advsearch.engine.sweeps.drives import with_frames
 from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
+from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
