@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 
 from advsearch import seeds
-from advsearch.attacks.product import batches
+from advsearch.attacks.draws import batches
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.rows import judgement_of
 from advsearch.engine.sweeps.association import Association, PartCounts, association
