@@ -186,7 +186,7 @@ FAULTS = (
     ),
     Fault(
         "policies: every generation has the same noise",
-        "advsearch/attacks/policies/nes.py",
+        "advsearch/attacks/policies/evolution.py",
         "seeded(state.seed, state.generation * (state.population // 2) + pair)",
         "seeded(state.seed, pair)",
         ("tests/attacks/policies/test_policy_evolution.py",),

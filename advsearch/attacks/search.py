@@ -12,10 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.attacks.candidates import Candidate, admit, best, contenders, with_last
+from advsearch.attacks.candidates import Candidate, Failures, admit, best, contenders, with_last
 from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
 from advsearch.attacks.evaluation import Evaluate, Evaluation, Phase, Query, most_at_once, usable
-from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.verification import Ending

@@ -27,8 +27,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.controls.base import Choice, Parameter
-from advsearch.controls.corruption.digital import coded
-from advsearch.controls.corruption.tools import picture, planes, warped
+from advsearch.controls.corruption import coded
+from advsearch.controls.corruption_filters import picture, planes, warped
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult, count_right
-from advsearch.attacks.failures import FoundFailure
+from advsearch.attacks.candidates import FoundFailure
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from advsearch.config import AttackConfig
 from advsearch.controls.base import Control
-from advsearch.controls.patch.control import enlarged
+from advsearch.controls.patch import enlarged
 from advsearch.controls.space import file_name
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import as_controls, load_scene

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluation, SearchResult, Verification, choose_spp, run_trials, verify
+from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import Query, most_at_once
-from advsearch.attacks.product import batches
 from advsearch.attacks.sample_count import LADDER, margins_of, most_samples
 from advsearch.config.scene import SceneConfig
 from advsearch.engine.journal import Journal, digest

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from advsearch.attacks.failures import most_different
+from advsearch.attacks.candidates import most_different
 
 LINE = torch.tensor([[0.0], [0.1], [0.5], [0.9]])
 NUMBER = torch.tensor([False])

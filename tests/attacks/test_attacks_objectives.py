@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from advsearch import losses
 from advsearch.attacks import OBJECTIVES, get_objective, logit_objectives, margin
-from advsearch.attacks.feature_distance import NEARBY, feature_distance
 from advsearch.attacks.logit_objectives import (
     RELIEF,
     SUREST,
@@ -28,7 +27,14 @@ from advsearch.attacks.logit_objectives import (
     targeted_log_odds,
     targeted_margin,
 )
-from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective, objective_summaries
+from advsearch.attacks.objectives import (
+    NEARBY,
+    OBJECTIVE_KINDS,
+    asked_by,
+    check_objective,
+    feature_distance,
+    objective_summaries,
+)
 from advsearch.engine import objective
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import load_model

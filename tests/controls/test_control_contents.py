@@ -12,8 +12,7 @@ import torch
 
 import advsearch
 from advsearch.controls import make_space
-from advsearch.controls.contents.control import INGREDIENTS, BoundContents, ContentsControl, liquid
-from advsearch.controls.contents.vessel import BRIM, interior
+from advsearch.controls.contents import BRIM, INGREDIENTS, BoundContents, ContentsControl, interior, liquid
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset

@@ -13,8 +13,8 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control
-from advsearch.controls.geometry.control import BoundGeometry, GeometryControl
-from advsearch.controls.geometry.modes import WALL_STRAIN, Limits, body, shape_modes
+from advsearch.controls.geometry import BoundGeometry, GeometryControl
+from advsearch.controls.geometry_modes import WALL_STRAIN, Limits, body, shape_modes
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, describe

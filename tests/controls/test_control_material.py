@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls.material.control import NUMBERS, MaterialControl
-from advsearch.controls.material.patterns import PATTERNS, SIDE, covering, tile
+from advsearch.controls.material import NUMBERS, MaterialControl
+from advsearch.controls.material_patterns import PATTERNS, SIDE, covering, tile
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe

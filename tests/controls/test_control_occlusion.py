@@ -14,8 +14,7 @@ import torch
 import advsearch
 from advsearch.controls import make_space
 from advsearch.controls.camera import CameraControl
-from advsearch.controls.occlusion.control import BUNDLED, OPTIONS, OcclusionControl, Placement
-from advsearch.controls.occlusion.occluders import loaded, made, sphere
+from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement, loaded, made, sphere
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.cameras.model import bundled, pinhole

@@ -15,8 +15,8 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control, make_space
-from advsearch.controls.patch.control import BASE_COLOR, BoundPatch, PatchControl
-from advsearch.controls.patch.sticker import towards_camera
+from advsearch.controls.patch import BASE_COLOR, BoundPatch, PatchControl
+from advsearch.controls.patch_sticker import towards_camera
 from advsearch.controls.texture import TextureControl
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh

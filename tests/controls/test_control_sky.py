@@ -11,8 +11,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.sky.control import METERED_IRRADIANCE, SkyControl
-from advsearch.controls.sky.dome import COLUMNS, ROWS, SUN_APERTURE, Sky, angle_between, direction, sun_irradiance
+from advsearch.controls.sky import (
+    COLUMNS,
+    METERED_IRRADIANCE,
+    ROWS,
+    SUN_APERTURE,
+    Sky,
+    SkyControl,
+    angle_between,
+    direction,
+    sun_irradiance,
+)
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.exposure import irradiance

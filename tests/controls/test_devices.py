@@ -11,7 +11,7 @@ from elsewhere import ELSEWHERE, Away, elsewhere
 
 import advsearch
 from advsearch.controls import CONTROLS, compose, make_control
-from advsearch.controls.corruption.control import NAMES
+from advsearch.controls.corruption import NAMES
 
 PICTURE = str(ROOT / "scenes/data/objects/book/base_color.png")
 

@@ -13,7 +13,7 @@ from stand_ins import StandInProblem, attack_on, configuration
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult, make_policy
-from advsearch.attacks.failures import Failures, FailureShare, FoundFailure
+from advsearch.attacks.candidates import Failures, FailureShare, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, Rule
 from advsearch.cli.output import shown_text as answer
 from advsearch.engine.failures import TRIED, check_failures, described_failures

@@ -13,7 +13,7 @@ from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, RenderConfig, SweepConfig
 from advsearch.controls import CONTROLS, make_control
-from advsearch.controls.patch.control import PatchControl
+from advsearch.controls.patch import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.attack_parts import with_derivatives

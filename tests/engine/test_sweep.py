@@ -30,8 +30,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import clopper_pearson
-from advsearch.attacks.draws import NET, Draws, Seeds
-from advsearch.attacks.product import Product, batches
+from advsearch.attacks.draws import NET, Draws, Product, Seeds, batches
 from advsearch.cli.flags import READERS, help_text, with_flags
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer

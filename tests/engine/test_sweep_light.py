@@ -9,7 +9,7 @@ import pytest
 from stand_ins import rows
 
 import advsearch
-from advsearch.attacks.product import Product
+from advsearch.attacks.draws import Product
 from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.predicting import Groups, combined
 from advsearch.engine.sweeps.swept_scene import SweptScene

@@ -12,7 +12,7 @@ import torch
 from stand_ins import rows
 
 import advsearch
-from advsearch.attacks.product import Product
+from advsearch.attacks.draws import Product
 from advsearch.cluster.executor import Done, Workforce
 from advsearch.config import SweepConfig
 from advsearch.engine.sharing import answering

@@ -15,8 +15,7 @@ from small_models import SIDE
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.attacks.feature_distance import NEARBY
-from advsearch.attacks.objectives import check_objective, get_objective
+from advsearch.attacks.objectives import NEARBY, check_objective, get_objective
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning

@@ -1,4 +1,4 @@
-"""Policies: the rules that propose configurations. One file each, over the contract of `base`."""
+"""Policies: the rules that propose configurations, over the contract of `base`."""
 
 from __future__ import annotations
 
@@ -8,17 +8,13 @@ from typing import Any
 
 from advsearch.attacks.policies.adam import Adam
 from advsearch.attacks.policies.archive import MapElites
-from advsearch.attacks.policies.auto import Auto
+from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.choices import Choices
-from advsearch.attacks.policies.cmaes import CMAES
-from advsearch.attacks.policies.grid import Grid
+from advsearch.attacks.policies.evolution import CMAES, NES
 from advsearch.attacks.policies.mixture import Mixture
-from advsearch.attacks.policies.nes import NES
 from advsearch.attacks.policies.pgd import PGD
-from advsearch.attacks.policies.portfolio import Portfolio, Restarts
-from advsearch.attacks.policies.random import Random
-from advsearch.attacks.policies.sobol import Sobol
+from advsearch.attacks.policies.sampling import Grid, Random, Sobol
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry

@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from advsearch.attacks.candidates import Failures, FoundFailure, most_different
 from advsearch.attacks.domain import Domain, half_widths, wraps
-from advsearch.attacks.failures import Failures, FoundFailure, most_different
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
-from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
-from advsearch.attacks.policies.surrogate import MOST_OWN, Observed, Surrogate
+from advsearch.attacks.policies.surrogate import MOST_OWN, Coordinates, Observed, Surrogate, box_coordinates
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
 
@@ -138,8 +137,7 @@ class MapElites(Policy[ArchiveState]):
         dims = [sizes[place] for place in spanned.tolist()]
         if math.prod(dims) > MOST_CELLS:
             raise InputError(f"cells: expected at most {MOST_CELLS} in all, got {math.prod(dims)}; set `cells` lower")
-        # import the archives of ribs, which takes seconds
-        from ribs import archives
+        from ribs import archives  # an extra, and it takes seconds
 
         archive = archives.GridArchive(
             solution_dim=domain.dim,

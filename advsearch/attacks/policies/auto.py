@@ -1,10 +1,14 @@
-"""The policy to use first: looks everywhere, then where a model of what it has seen promises most, then uphill."""
+"""The policy to use first, and what wraps others: several policies on one budget, or several starts of one.
+
+`auto` looks everywhere, then where a model of what it has seen promises most, then uphill. Of several policies, what
+does better gets more of the budget.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -21,9 +25,11 @@ from advsearch.attacks.policies.base import (
     one_thread,
     seeded,
 )
-from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
+from advsearch.attacks.policies.choices import Race, Raced, line_up, with_choices
+from advsearch.attacks.policies.evolution import CMAES
 from advsearch.attacks.policies.pgd import PGD, PGDState
-from advsearch.attacks.policies.surrogate import Observed
+from advsearch.attacks.policies.surrogate import Coordinates, Observed, box_coordinates
+from advsearch.errors import InputError
 
 SCREEN, SCREEN_MIXED = 0.5, 0.25
 """Share of the renders that the screen takes, in a box alone and beside a norm ball."""
@@ -262,3 +268,95 @@ def _climb(state: AutoState, proposal: Proposal) -> tuple[Proposal, AutoState]:
         u = state.domain.project(state.box.put(proposal.u, moved))
         return replace(proposal, u=u, gradient=state.plan.gradient), replace(state, trial=Trial(x, state.last))
     return replace(proposal, gradient=state.plan.gradient), state
+
+
+@dataclass(frozen=True)
+class Restarts(Raced):
+    """Lets a policy search `times` times, each with an equal share of the renders; they take turns, step by step.
+
+    The first begins where the policy would begin by itself, the others at samples of the domain (`Domain.sample`); the
+    norm balls stay where they are. One that has nothing more to propose leaves its renders to the rest. For an
+    objective with several peaks, where a gradient finds the nearest. Discrete choices are fixed outside (`Choices`), so
+    every combination of options has its own restarts.
+
+    Attributes:
+        policy: what searches; in `make_policy` a name, or a mapping with a name and options.
+        times: at least 1; fewer if the renders do not suffice for one evaluation each.
+
+    Raises:
+        InputError: a value is outside what is said here.
+    """
+
+    policy: Policy[Any] = field(default_factory=PGD)
+    times: int = 4
+
+    name: ClassVar[str] = "restarts"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.policy, Policy):
+            raise InputError(f"policy of restarts: expected a policy, got {self.policy!r}; use make_policy for names")
+        if self.times < 1:
+            raise InputError(f"times: expected at least 1, got {self.times}")
+
+    @property
+    def uses_gradient(self) -> bool:
+        return self.policy.uses_gradient
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
+        seed = draw_seed(generator)
+        each = 1 + (domain.gradient_cost if self.policy.uses_gradient else 0)
+        count = max(1, min(self.times, steps // each))
+        begins = (domain.begin, *(domain.sample(seeded(seed, number))[0] for number in range(1, count)))
+        return line_up([(self.policy, replace(domain, first=begin)) for begin in begins], steps, seed, rounds=1)
+
+
+@dataclass(frozen=True)
+class Portfolio(Raced):
+    """Lets several policies search side by side and goes on with those that reached more.
+
+    With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see `choices`. Within a round every
+    policy that is still in has an equal share; after it the better half goes on, by the largest objective reached so far. So
+    of two policies each has a quarter of the renders, and the better one the other half. Each plans for what it gets
+    if it stays in.
+
+    A policy that cannot search the domain (it says so with an InputError: a grid over a texture) is left out; if none
+    can, the first one's error is passed on.
+
+    Attributes:
+        policies: at least one; in `make_policy` a list of names, or of mappings with a name and options.
+
+    Raises:
+        InputError: there is no policy.
+    """
+
+    policies: tuple[Policy[Any], ...] = (Auto(), CMAES())
+
+    name: ClassVar[str] = "portfolio"
+    handles_choices: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "policies", tuple(self.policies))
+        if not self.policies or not all(isinstance(policy, Policy) for policy in self.policies):
+            raise InputError(f"policies of portfolio: expected one policy or more, got {self.policies!r}")
+
+    @property
+    def uses_gradient(self) -> bool:
+        return any(policy.uses_gradient for policy in self.policies)
+
+    def takes_differences(self, domain: Domain, steps: int) -> bool:
+        return any(policy.takes_differences(domain, steps) for policy in self.policies)
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
+        seed = draw_seed(generator)
+        searches, errors = [], []
+        for policy in self.policies:
+            whole = with_choices(policy, domain)
+            try:
+                whole.start(domain, seeded(seed, 0), max(1, steps // len(self.policies)))
+            except InputError as error:
+                errors.append(error)
+            else:
+                searches.append((whole, domain))
+        if not searches:
+            raise errors[0]
+        return line_up(searches, steps, seed)

@@ -17,9 +17,9 @@ from typing import ClassVar, Generic, TypeVar
 import torch
 from torch import Tensor
 
+from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Distribution, Domain
 from advsearch.attacks.evaluation import Evaluation, WhichGradient
-from advsearch.attacks.failures import Failures
 from advsearch.seeds import stream
 
 State = TypeVar("State")
@@ -54,7 +54,7 @@ class Counts:
     """What a policy had to do about the evaluations it was told; for the summary of a run.
 
     Attributes:
-        cut: gradients of which single numbers were outliers and cut (see `clipping`).
+        cut: gradients of which single numbers were outliers and cut (see `pgd.clipped`).
         shortened: gradients that were outliers as a whole.
         rejected: steps that were taken back: the search went on from a configuration before them.
     """

@@ -9,8 +9,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from advsearch.attacks.candidates import Failures, FoundFailure, failure_share, most_different
 from advsearch.attacks.domain import Domain, centre_of_option, wraps
-from advsearch.attacks.failures import Failures, FoundFailure, failure_share, most_different
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.errors import InputError
 

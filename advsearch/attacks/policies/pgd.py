@@ -1,4 +1,10 @@
-"""Projected gradient ascent with momentum and a step size that halves when the objective stalls, or falls in a line."""
+"""Projected gradient ascent with momentum and a step size that halves when the objective stalls, or falls in a line.
+
+A gradient through a renderer has finite mean and, at times, no useful variance: one path in ten thousand may outweigh
+all others. Averages then follow the outliers. So what is far out of the usual is cut to the edge of it: clipping (Zhang
+et al. 2020, Why are adaptive methods good for attention models?) bounds them at the price of a bias, which the
+stability suite measures.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +17,55 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
-from advsearch.attacks.policies.clipping import clipped
 from advsearch.errors import InputError
+
+CLIP = 3.0
+"""What exceeds the median so many times is out of the usual."""
+
+MEMORY = 15
+"""Latest gradients whose lengths say what is usual."""
+
+CLIP_L2 = 10.0
+"""The same of single numbers in an l2 block, whose true gradient may well be uneven: its direction is at stake."""
+
+FEWEST_NUMBERS = 8
+"""Fewer numbers than this have no median to speak of."""
+
+
+def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tuple[Tensor, tuple[float, ...], Counts]:
+    """Return a gradient without outliers, the lengths of the latest gradients, and what was an outlier.
+
+    - In a ball of at least `FEWEST_NUMBERS`, each is cut to so many medians of those that are not zero: `CLIP` in an
+      l-infinity ball, where the step follows the signs, so that this changes how gradients are averaged and no single
+      step; `CLIP_L2` in an l2 ball.
+    - A gradient that is longer than `CLIP` times the median of the last `MEMORY` is shortened to that.
+    - In a domain that is `exact` or `drawn` nothing is an outlier.
+
+    Args:
+        domain: whose blocks count.
+        gradient: (d,) float32, finite.
+        lengths: of the gradients before, the latest last.
+    """
+    if domain.exact or domain.drawn:
+        return gradient, lengths, NO_COUNTS
+    out, cut, shortened = gradient, False, False
+    for block, part in domain.parts():
+        if block.norm != "box" and block.size >= FEWEST_NUMBERS:
+            sizes = out[part].abs()
+            some = sizes[sizes > 0]
+            if some.numel():
+                limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(some.median())
+                if float(sizes.amax()) > limit:
+                    out, cut = out.clone() if out is gradient else out, True
+                    out[part] = out[part].clamp(-limit, limit)
+    length = float(torch.linalg.vector_norm(out))
+    lengths = (*lengths, length)[-MEMORY:]
+    usual = sorted(lengths)[len(lengths) // 2]
+    if length > CLIP * usual > 0.0:
+        shortened = True
+        out = out * (CLIP * usual / length)
+    return out, lengths, Counts(int(cut), int(shortened))
+
 
 FIRST_WINDOW, SHORTEN, SHORTEST = 0.22, 0.03, 0.06
 """Length of the first window, how much each next one is shorter, and the shortest, as fractions of the steps (Auto-
@@ -145,7 +198,7 @@ class PGD(Policy[PGDState]):
         m <- momentum * m + g / mean|g|                (MI-FGSM, Dong et al. 2018, eq. 6)
         u <- P(u + step_size * steepest(m))
 
-    g is clipped first (see `clipping`). Accumulating gradients before the sign is taken matters here: each comes from
+    g is clipped first (see `clipped`). Accumulating gradients before the sign is taken matters here: each comes from
     another seed, and the sign of one noisy gradient is a coin toss wherever the noise exceeds it.
 
     The step size is halved at checkpoints when the objective stalls, by the two conditions of Auto-PGD (Croce and

@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 from advsearch.attacks import Evaluation, Query
-from advsearch.attacks.product import batches
+from advsearch.attacks.draws import batches
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.engine.journal import Journal, finite, other_answers, same
 from advsearch.engine.loading import framed

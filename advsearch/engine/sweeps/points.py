@@ -19,8 +19,7 @@ from scipy.special import ndtri
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain
-from advsearch.attacks.draws import Draws
-from advsearch.attacks.product import Product
+from advsearch.attacks.draws import Draws, Product
 from advsearch.controls import NumberControl, Parameter, Space
 from advsearch.controls.base import BoundControl, Value
 from advsearch.controls.numbers import BoundNumbers

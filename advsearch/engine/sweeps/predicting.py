@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks.product import Product
+from advsearch.attacks.draws import Product
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.points import Points
 from advsearch.engine.transport import Deviation

@@ -25,7 +25,7 @@ import torch
 from scipy.special import ndtri, xlogy
 
 from advsearch import seeds
-from advsearch.attacks.product import batches
+from advsearch.attacks.draws import batches
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.rows import judgement_of

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.keywords import NamedKeywords, Names, PictureKeywords, asks, configured
+from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import most_at_once
-from advsearch.attacks.product import batches
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.journal import Journal

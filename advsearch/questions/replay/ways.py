@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.controls.corruption.digital import coded
+from advsearch.controls.corruption import coded
 from advsearch.controls.sensor import through_sensor
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, unchanged

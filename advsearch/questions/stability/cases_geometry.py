@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.occlusion.occluders import sphere
+from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
 from advsearch.questions.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.questions.stability.scene import (

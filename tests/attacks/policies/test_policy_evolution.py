@@ -28,7 +28,7 @@ from advsearch.attacks import (
     search,
     seeded,
 )
-from advsearch.attacks.policies.nes import WIDEST, utilities
+from advsearch.attacks.policies.evolution import WIDEST, utilities
 from advsearch.errors import InputError
 
 both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: policy.name)

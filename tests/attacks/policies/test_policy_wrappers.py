@@ -35,7 +35,7 @@ from advsearch.attacks import (
     search,
     seeded,
 )
-from advsearch.attacks.policies import racing
+from advsearch.attacks.policies import choices
 from advsearch.attacks.policies.base import affordable
 from advsearch.attacks.policies.choices import MOST, Stay, with_choices
 from advsearch.errors import InputError, UnknownNameError
@@ -100,15 +100,15 @@ def first(u: Tensor) -> float:
 
 @pytest.mark.parametrize(("n", "rounds"), [(1, 1), (2, 2), (3, 3), (4, 3), (5, 4), (8, 4), (9, 5)])
 def test_rounds(n: int, rounds: int) -> None:
-    assert racing.count_rounds(n) == rounds
+    assert choices.count_rounds(n) == rounds
 
 
 @pytest.mark.parametrize(("steps", "each", "limit"), [(1, 1, 9), (40, 1, 999), (40, 13, 9), (1000, 1, 64), (39, 2, 8)])
 def test_as_many_run_as_can_have_a_whole_evaluation_in_every_round(steps: int, each: int, limit: int) -> None:
-    n = racing.most_runners(steps, each, limit)
+    n = choices.most_runners(steps, each, limit)
     assert 1 <= n <= limit
-    assert n == 1 or n * racing.count_rounds(n) * each <= steps
-    assert n == limit or (n + 1) * racing.count_rounds(n + 1) * each > steps
+    assert n == 1 or n * choices.count_rounds(n) * each <= steps
+    assert n == limit or (n + 1) * choices.count_rounds(n + 1) * each > steps
 
 
 def test_who_reached_more_goes_on_with_an_equal_share_of_every_round() -> None:

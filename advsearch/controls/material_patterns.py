@@ -16,6 +16,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from advsearch.scene.assets import Floats, Material, Mesh
 from advsearch.scene.surface_map import looked_up, texel_positions
@@ -107,8 +108,6 @@ def _scattered(count: int, seed: int) -> Doubles:
 
 def _cells(at: Grid, points: Doubles, count: int = 2) -> tuple[Doubles, npt.NDArray[np.int64]]:
     """Distances (SIDE, SIDE, count) to the nearest points on the torus, nearest first, and which points they are."""
-    from scipy.spatial import cKDTree
-
     place = np.stack([at[0] % 1.0, at[1] % 1.0], axis=-1)
     distance, index = cKDTree(points, boxsize=1.0).query(np.minimum(place, np.nextafter(1.0, 0.0)), k=count)
     return np.asarray(distance), np.asarray(index, dtype=np.int64)

@@ -15,7 +15,7 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from advsearch.controls.corruption.tools import at_level, between, generator, reference_size, resized, streaked
+from advsearch.controls.corruption_filters import at_level, between, generator, reference_size, resized, streaked
 
 FOG = ((1.5,), (2.0,), (2.5,), (2.5,), (3.0,))
 """How dense the fog is."""

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Parameter
-from advsearch.controls.material.patterns import PATTERNS, covering
+from advsearch.controls.material_patterns import PATTERNS, covering
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError

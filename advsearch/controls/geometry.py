@@ -4,7 +4,7 @@
     large-steps    d = g R (I + lambda L)^-2 (2 u - 1)         a push for each vertex, spread out over its surroundings
     offsets        epsilon s(d) d                              s: one factor that keeps the mesh whole
 
-u = 0.5 leaves the shape as it is. See `modes` for the fields, for `s`, and for where they come
+u = 0.5 leaves the shape as it is. See `geometry_modes` for the fields, for `s`, and where they come
 from. No vertex moves by more than epsilon, no face turns over and no wall meets the other, for any u.
 """
 
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Choice, Control, Group, Parameter, Value
-from advsearch.controls.geometry.modes import Limits, Preconditioner, body, shape_modes
+from advsearch.controls.geometry_modes import Limits, Preconditioner, body, shape_modes
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import SceneDescription

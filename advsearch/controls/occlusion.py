@@ -1,7 +1,8 @@
 """The `occlusion` control: a second object between the camera and the object, hiding a wanted share of it.
 
-The occluder comes in from one side of the picture and stops where it hides as much as was asked for. It moves on a
-sphere around the camera and keeps its side towards it, so its distance and its size in the picture stay the same:
+The occluder is a card, a sphere, a bundled object or a mesh from a file. It comes in from one side of the picture and
+stops where it hides as much as was asked for. It moves on a sphere around the camera and keeps its side towards it, so
+its distance and its size in the picture stay the same:
 
     place = camera + distance * turned(line of sight, direction, angle),    hidden(angle) = coverage
 
@@ -13,8 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -25,13 +26,15 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.occlusion.occluders import MADE, loaded, made
 from advsearch.controls.values import Fixed, OneOf
 from advsearch.errors import InputError
-from advsearch.scene.assets import ObjectAsset
+from advsearch.files import reading
+from advsearch.scene import library
+from advsearch.scene.assets import Material, Mesh, ObjectAsset, normalised
 from advsearch.scene.cameras.model import CameraModel
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, object_to_world
+from advsearch.scene.importing.objects import import_object
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT, moving
 from advsearch.scene.silhouettes import (
@@ -48,6 +51,7 @@ from advsearch.scene.silhouettes import (
 Doubles = npt.NDArray[np.float64]
 _moving = partial(moving, ORBIT)
 
+MADE = ("card", "sphere")
 BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
 OPTIONS = (*MADE, *BUNDLED)
 EASE = 0.02
@@ -58,6 +62,64 @@ PARKED = 1e-3
 """Size of an occluder that is put away, behind the camera."""
 SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "camera.lens", "object.to_world", "object.offsets")
 """Inputs of other controls that an occluder goes by."""
+
+
+@cache
+def loaded(spec: str) -> ObjectAsset:
+    """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin.
+
+    Raises:
+        InputError: there is no such object, or the file cannot be used.
+    """
+    is_file = "/" in spec or "\\" in spec or Path(spec).suffix != ""
+    with reading(spec):
+        return centred(import_object(Path(spec)) if is_file else library.load_object(spec))
+
+
+def centred(asset: ObjectAsset) -> ObjectAsset:
+    """Return an object with its largest extent 1 and the middle of its bounding box at the origin."""
+    mesh = normalised(asset.mesh)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - (low + high) / 2.0).astype(np.float32)))
+
+
+@cache
+def made(name: str) -> ObjectAsset:
+    """Return one of the occluders made here, one object size large around the origin: "card" or "sphere"."""
+    generator = np.random.Generator(np.random.PCG64(7))
+    if name == "card":
+        texels = np.array([0.70, 0.53, 0.36]) + generator.normal(0.0, 0.012, (64, 64, 1)) * np.ones(3)
+        texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]  # the flutes under the paper
+        return ObjectAsset(name, _card(), texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
+    grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
+    return ObjectAsset(name, sphere(24, 48), grey, Material(roughness=0.6))
+
+
+def _card() -> Mesh:
+    """A square in the y-z plane that faces +x."""
+    uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
+    vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
+    normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
+    return Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
+
+
+def sphere(rows: int, columns: int) -> Mesh:
+    """Return a sphere of diameter 1 around the origin: `rows` bands from pole to pole, 2 (rows - 1) columns faces."""
+    v, u = (
+        one.ravel() for one in np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
+    )
+    theta, phi = math.pi * (1.0 - v), 2.0 * math.pi * u
+    normals = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]).ravel()
+    above = corner + columns + 1
+    lower, upper = np.stack([corner, corner + 1, above + 1], 1), np.stack([corner, above + 1, above], 1)
+    faces = np.concatenate([lower[columns:], upper[:-columns]])  # without those that are points at the poles
+    return Mesh(
+        (0.5 * normals).astype(np.float32),
+        faces.astype(np.uint32),
+        normals.astype(np.float32),
+        np.stack([u, v], axis=1).astype(np.float32),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,64 +151,29 @@ class OcclusionControl(NumberControl):
     summary: ClassVar[str] = "A second object between the camera and the object, hiding a wanted share of it."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "which",
-            (),
-            "name",
-            0.0,
-            len(OPTIONS) - 1.0,
-            "card",
-            "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
-            moves_silhouettes=True,
+            "which", (), "name", 0.0, len(OPTIONS) - 1.0, "card",
+            "What it is: a piece of cardboard, a grey sphere, or a bundled object.", moves_silhouettes=True,
             options=OPTIONS,
         ),
         _moving(
-            "coverage",
-            "1",
-            0.0,
-            0.9,
-            0.0,
-            "Share of the object's picture area that it hides; at 0 it is out of the frame.",
-            search=(0.0, 0.5),
+            "coverage", "1", 0.0, 0.9, 0.0,
+            "Share of the object's picture area that it hides; at 0 it is out of the frame.", search=(0.0, 0.5),
         ),
         _moving(
-            "direction",
-            "degrees",
-            -3600.0,
-            3600.0,
-            0.0,
-            "Side of the picture it comes in from: 0 is the right, 90 the top, counter-clockwise.",
-            periodic=True,
+            "direction", "degrees", -3600.0, 3600.0, 0.0,
+            "Side of the picture it comes in from: 0 is the right, 90 the top, counter-clockwise.", periodic=True,
             search=(0.0, 360.0),
         ),
+        _moving("size", "object sizes", 0.05, 5.0, 0.6, "Its largest extent.", search=(0.3, 1.0), log=True),
         _moving(
-            "size",
-            "object sizes",
-            0.05,
-            5.0,
-            0.6,
-            "Its largest extent.",
-            search=(0.3, 1.0),
-            log=True,
+            "distance", "1", 0.1, 0.9, 0.5,
+            "Where between the camera and the object's middle: 0 is the camera, 1 the middle.", search=(0.3, 0.7),
         ),
         _moving(
-            "distance",
-            "1",
-            0.1,
-            0.9,
-            0.5,
-            "Where between the camera and the object's middle: 0 is the camera, 1 the middle.",
-            search=(0.3, 0.7),
-        ),
-        _moving(
-            "turn",
-            "degrees",
-            -3600.0,
-            3600.0,
-            0.0,
-            "Rotation of the occluder about its own upright axis.",
+            "turn", "degrees", -3600.0, 3600.0, 0.0, "Rotation of the occluder about its own upright axis.",
             periodic=True,
         ),
-    )
+    )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("object", None, "Another occluder in place of `which`: any bundled object, or a path to a mesh file."),
     )

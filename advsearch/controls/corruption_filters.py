@@ -1,0 +1,342 @@
+"""Corruptions by noise, blur and shifted pixels, and what all corruptions share: tables by severity, blurs, warps.
+
+Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A. Pictures are (H, W, 3) float32 display-referred sRGB in
+[0, 1]. Lengths in the tables are pixels of a picture whose smaller side has `REFERENCE` pixels, the size for which the
+corruptions were published; `scale` converts them.
+
+The noise is one fixed draw, chosen by the seed: the same at every severity, so that the picture changes smoothly
+with the severity, and the same in every render. Blurs and shifts are linear in the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+import torch
+import torch.nn.functional as F
+from scipy import ndimage
+from torch import Tensor
+
+from advsearch import seeds
+
+REFERENCE = 224
+"""Smaller side in pixels of the pictures that the published tables were made for."""
+LEVELS = 5
+"""Severities run from 1 to this."""
+
+
+def scale(image: Tensor) -> float:
+    """Return pixels of this (H, W, 3) picture for a pixel of the reference size."""
+    return min(image.shape[0], image.shape[1]) / REFERENCE
+
+
+def reference_size(height: int, width: int) -> tuple[int, int]:
+    """Return the size of a picture of the same shape whose smaller side has `REFERENCE` pixels."""
+    side = min(height, width)
+    return round(height * REFERENCE / side), round(width * REFERENCE / side)
+
+
+def generator(seed: int, name: str) -> torch.Generator:
+    """Return a source of random numbers of its own for each corruption."""
+    return torch.Generator().manual_seed(seeds.stream(seed, f"corruption {name}"))
+
+
+def at_level(table: Sequence[Sequence[float]], level: Tensor) -> tuple[Tensor, ...]:
+    """Interpolate the rows of a table, one for each severity, linearly.
+
+    Args:
+        table: five rows of n numbers.
+        level: () severity in [1, 5].
+
+    Returns:
+        n tensors of shape (), the row at the severity; differentiable.
+    """
+    rows = torch.tensor(table, dtype=torch.float32, device=level.device)
+    return between(level, lambda whole: rows[whole - 1]).unbind()
+
+
+def between(level: Tensor, make: Callable[[int], Tensor]) -> Tensor:
+    """Mix what `make` returns for the two whole severities around one in [1, 5], on its device; differentiable."""
+    below = min(int(level.detach()), LEVELS - 1)
+    share = level - below
+    if float(share.detach()) == 0.0 and not share.requires_grad:
+        return make(below).to(level.device)
+    low, high = make(below).to(level.device), make(below + 1).to(level.device)
+    return low + share * (high - low)
+
+
+def planes(image: Tensor) -> Tensor:
+    """(H, W, C) to (1, C, H, W)."""
+    return image.permute(2, 0, 1)[None]
+
+
+def picture(stack: Tensor) -> Tensor:
+    """(1, C, H, W) to (H, W, C)."""
+    return stack[0].permute(1, 2, 0)
+
+
+def blurred(image: Tensor, sigma: Tensor) -> Tensor:
+    """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels; edges are continued."""
+    reach = max(1, math.ceil(4.0 * float(sigma.detach())))
+    offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
+    weights = torch.exp(-0.5 * (offsets / sigma) ** 2)
+    weights = weights / weights.sum()
+    channels = image.shape[2]
+    padded = F.pad(planes(image), (reach,) * 4, mode="replicate")
+    rows = F.conv2d(padded, weights.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels)
+    return picture(F.conv2d(rows, weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels))
+
+
+def streaked(image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: float) -> Tensor:
+    """Blur an (H, W, C) picture along a line: a one-sided Gaussian, cut off at twice the radius.
+
+    Args:
+        image: the picture.
+        radius: () half the length of the streak, in reference pixels.
+        sigma: () standard deviation, in reference pixels.
+        angle: of the line, in radians.
+        step: pixels of this picture for a reference pixel.
+    """
+    count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
+    along = torch.arange(count, device=image.device) / step
+    weights = torch.exp(-0.5 * (along / sigma) ** 2) * (2.0 * radius + 1.0 - along).clamp(0.0, 1.0)
+    weights = weights / weights.sum()
+    height, width = image.shape[:2]
+    padded = F.pad(planes(image), (count,) * 4, mode="replicate")
+    total = torch.zeros_like(image)
+    for number, weight in enumerate(weights):
+        down, across = round(number * math.sin(angle)), round(number * math.cos(angle))
+        moved = padded[:, :, count + down : count + down + height, count + across : count + across + width]
+        total = total + weight * picture(moved)
+    return total
+
+
+def warped(image: Tensor, shift: Tensor) -> Tensor:
+    """Look every pixel up at another place.
+
+    Args:
+        image: (H, W, C).
+        shift: (H, W, 2) how far to the right and down to look, in pixels; places outside are mirrored inwards.
+    """
+    height, width = image.shape[:2]
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(image.device)
+    grid = where * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
+    return picture(F.grid_sample(planes(image), grid[None], padding_mode="reflection", align_corners=False))
+
+
+def resized(field: Tensor, height: int, width: int) -> Tensor:
+    """Resize an (h, w, C) field to (height, width, C), smoothly."""
+    if field.shape[:2] == (height, width):
+        return field
+    stack = F.interpolate(planes(field), (height, width), mode="bilinear", antialias=True, align_corners=False)
+    return picture(stack).contiguous()
+
+
+GAUSSIAN = ((0.08,), (0.12,), (0.18,), (0.26,), (0.38,))
+"""Standard deviation, sRGB."""
+SHOT = ((60.0,), (25.0,), (12.0,), (5.0,), (3.0,))
+"""Photons in a white pixel."""
+IMPULSE = ((0.03,), (0.06,), (0.09,), (0.17,), (0.27,))
+"""Share of the values that are lost."""
+SPECKLE = ((0.15,), (0.2,), (0.35,), (0.45,), (0.6,))
+"""Standard deviation relative to the value."""
+_DARK = 1e-3
+"""Keeps the slope of a square root finite in black."""
+
+
+@lru_cache(maxsize=8)
+def _normal(height: int, width: int, seed: int, name: str) -> Tensor:
+    return torch.randn(height, width, 3, generator=generator(seed, name))
+
+
+@lru_cache(maxsize=8)
+def _uniform(height: int, width: int, seed: int, name: str) -> Tensor:
+    return torch.rand(height, width, 3, generator=generator(seed, name))
+
+
+def gaussian_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Add normal noise, as of a sensor in the dark."""
+    (sigma,) = at_level(GAUSSIAN, level)
+    return image + sigma * _normal(image.shape[0], image.shape[1], seed, "gaussian noise").to(image.device)
+
+
+def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Add normal noise in proportion to the value."""
+    (sigma,) = at_level(SPECKLE, level)
+    return image + image * sigma * _normal(image.shape[0], image.shape[1], seed, "speckle noise").to(image.device)
+
+
+def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Count photons: Poisson numbers with the picture as their mean, by inverting the distribution function.
+
+    The values are exact. Counts have no derivative, so each is taken to keep its place in the distribution, a number
+    of standard deviations from the mean, when the mean or the spread changes a little.
+    """
+    (photons,) = at_level(SHOT, level)
+    share = _uniform(image.shape[0], image.shape[1], seed, "shot noise").to(image.device)
+    with torch.no_grad():
+        counted = poisson(image * photons, share) / photons
+        away = (counted - image) / torch.sqrt(image / photons + _DARK)
+    return image + away * torch.sqrt(image / photons + _DARK)
+
+
+def poisson(mean: Tensor, share: Tensor) -> Tensor:
+    """Return the Poisson numbers of given means at given shares of the distribution; no derivative.
+
+    Args:
+        mean: any shape, 0 to about 80.
+        share: the same shape, in [0, 1).
+    """
+    chance = torch.exp(-mean.double())
+    total, count = chance.clone(), torch.zeros_like(chance)
+    for number in range(1, 400):
+        short = share > total
+        if not bool(short.any()):
+            break
+        count += short
+        chance *= mean / number
+        total += chance
+    return count.to(mean.dtype)
+
+
+def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Replace a share of the values by 0 or 1 ("salt and pepper").
+
+    A value is lost at once, which has no derivative by the share of lost ones; taken instead is that of the average
+    over all draws of which ones are lost.
+    """
+    (lost,) = at_level(IMPULSE, level)
+    height, width = image.shape[:2]
+    turn = _uniform(height, width, seed, "impulse noise").to(image.device)
+    extreme = (_uniform(height, width, seed, "impulse value") < 0.5).float().to(image.device)
+    kept = torch.where(turn < lost.detach(), extreme, image)
+    return kept + (lost - lost.detach()) * (extreme - image.detach())
+
+
+GAUSSIAN_BLUR = ((1.0,), (2.0,), (3.0,), (4.0,), (6.0,))
+"""Standard deviation, reference pixels."""
+DEFOCUS = ((3.0,), (4.0,), (6.0,), (8.0,), (10.0,))
+"""Radius of the disc, reference pixels."""
+GLASS = ((0.7, 1, 2), (0.9, 2, 1), (1.0, 2, 3), (1.1, 3, 2), (1.5, 4, 2))
+"""Standard deviation and farthest neighbour, reference pixels; number of passes."""
+MOTION = ((10.0, 3.0), (15.0, 5.0), (15.0, 8.0), (15.0, 12.0), (20.0, 15.0))
+"""Radius and standard deviation, reference pixels."""
+ZOOM = ((1.11,), (1.15,), (1.2,), (1.24,), (1.3,))
+"""Largest magnification."""
+ZOOM_STEPS = 16
+"""Magnified pictures that are averaged; the published ones take 11 to 16."""
+ELASTIC = ((488.0, 170.8, 24.4), (488.0, 19.52, 48.8), (12.2, 2.44, 4.88), (17.08, 2.44, 4.88), (29.28, 2.44, 4.88))
+"""Height of the wrinkles, their width, and how far a corner of the middle third moves; reference pixels."""
+
+
+def gaussian_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Blur with a Gaussian."""
+    (sigma,) = at_level(GAUSSIAN_BLUR, level)
+    return blurred(image, sigma * scale(image))
+
+
+def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Blur with a disc, the picture of a point that a lens has out of focus."""
+    (radius,) = at_level(DEFOCUS, level)
+    radius = radius * scale(image)
+    reach = math.ceil(float(radius.detach()) + 0.5)
+    offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
+    distance = torch.sqrt(offsets[:, None] ** 2 + offsets[None, :] ** 2)
+    disc = (radius + 0.5 - distance).clamp(0.0, 1.0)
+    return _convolved(image, disc / disc.sum())
+
+
+def _convolved(image: Tensor, kernel: Tensor) -> Tensor:
+    """Convolve an (H, W, 3) picture with a symmetric (2 r + 1, 2 r + 1) kernel; edges are continued."""
+    height, width, reach = image.shape[0], image.shape[1], kernel.shape[0] // 2
+    padded = F.pad(planes(image), (reach,) * 4, mode="replicate")
+    size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
+    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
+    whole = torch.fft.irfft2(product, s=size)
+    return picture(whole[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width])
+
+
+def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Blur along a line, within 45 degrees of the horizontal, as of a camera that moves."""
+    radius, sigma = at_level(MOTION, level)
+    turn = float(torch.rand((), generator=generator(seed, "motion blur")))
+    return streaked(image, radius, sigma, math.radians(90.0 * turn - 45.0), scale(image))
+
+
+def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Average the picture with magnified ones, as of a camera that moves towards the object."""
+    (largest,) = at_level(ZOOM, level)
+    zooms = 1.0 + (largest - 1.0) * torch.linspace(0.0, 1.0, ZOOM_STEPS, device=level.device)
+    matrices = torch.diag_embed((1.0 / zooms)[:, None].expand(-1, 2))
+    theta = torch.cat([matrices, matrices.new_zeros(ZOOM_STEPS, 2, 1)], dim=2).to(image.device)
+    height, width = image.shape[:2]
+    grid = F.affine_grid(theta, [ZOOM_STEPS, 3, height, width], align_corners=False)
+    copies = planes(image).expand(ZOOM_STEPS, -1, -1, -1)
+    zoomed = F.grid_sample(copies, grid, padding_mode="border", align_corners=False)
+    return (image + zoomed.sum(dim=0).permute(1, 2, 0)) / (ZOOM_STEPS + 1)
+
+
+def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
+    """Look through frosted glass: blur, show at each pixel what a neighbour shows, blur again."""
+    sigma = at_level(GLASS, level)[0] * scale(image)
+    shift = between(level, lambda whole: _glass_shift(image.shape[0], image.shape[1], seed, whole))
+    return blurred(warped(blurred(image, sigma), shift * scale(image)), sigma)
+
+
+@lru_cache(maxsize=8)
+def _glass_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
+    """(H, W, 2) how far each pixel looks at a whole severity, in reference pixels.
+
+    One pixel after another, from the bottom right, takes over what a random neighbour shows by then; so what is shown
+    may come from further away than one step.
+    """
+    tall, wide = reference_size(height, width)
+    _, reach, passes = (int(value) for value in GLASS[whole - 1])
+    source = generator(seed, "glass blur")
+    shown = list(range(tall * wide))
+    for _ in range(passes):
+        jumps = torch.randint(-reach, reach, (tall, wide, 2), generator=source)
+        to_neighbour = (jumps[..., 0] * wide + jumps[..., 1]).flatten().tolist()
+        for row in range(tall - reach, reach, -1):
+            for place in range(row * wide + wide - reach, row * wide + reach, -1):
+                shown[place] = shown[place + to_neighbour[place]]
+    came, place_of = torch.tensor(shown), torch.arange(tall * wide)
+    across, down = came % wide - place_of % wide, came // wide - place_of // wide
+    shift = torch.stack([across, down]).view(1, 2, tall, wide).float()
+    return picture(F.interpolate(shift, (height, width), mode="nearest-exact"))
+
+
+def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
+    """Shear the picture and wrinkle it; below severity 1 by less."""
+    height, width = image.shape[:2]
+    if float(severity.detach()) < 1.0:
+        shift = severity * _elastic_shift(height, width, seed, 1).to(severity.device)
+    else:
+        shift = between(severity, lambda whole: _elastic_shift(height, width, seed, whole))
+    return warped(image, scale(image) * shift)
+
+
+@lru_cache(maxsize=8)
+def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
+    """(H, W, 2) how far each pixel looks at a whole severity, in reference pixels."""
+    tall, wide = reference_size(height, width)
+    wrinkle, smooth, corner = ELASTIC[whole - 1]
+    source = generator(seed, "elastic")
+    corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner
+    noise = torch.rand(tall, wide, 2, generator=source) * 2.0 - 1.0
+    waves = ndimage.gaussian_filter(noise.numpy(), (smooth, smooth, 0.0), mode="reflect", truncate=3.0)
+    shift = torch.from_numpy(waves) * wrinkle + _shear(tall, wide, corners)
+    return resized(shift, height, width)
+
+
+def _shear(height: int, width: int, corners: Tensor) -> Tensor:
+    """(H, W, 2) the affine shift that moves three corners of the middle square, (+, +), (+, -), (-, -), as asked."""
+    third = REFERENCE // 3
+    by_row = (corners[0] - corners[1]) / (2 * third)
+    by_column = (corners[0] - corners[2]) / (2 * third) - by_row
+    rows = torch.arange(height)[:, None, None] - (height - 1) / 2.0
+    columns = torch.arange(width)[None, :, None] - (width - 1) / 2.0
+    return (corners[0] + corners[2]) / 2.0 + rows * by_row + columns * by_column
