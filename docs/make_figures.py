@@ -20,7 +20,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
 
-from pydantic.fields import FieldInfo
+from pydantic.fields import ComputedFieldInfo, FieldInfo
 
 from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import add_command
@@ -273,10 +273,10 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
     """The fields of a result in the order in which they are written, those that say themselves in one row."""
 
     def make(record: Record) -> str:
-        names = list(kind.model_fields)
-        names.sort(key=lambda name: name in END)
-        told = {name: _field(kind.model_fields[name]) for name in names}
-        written = {name: kind.model_fields[name].alias or name for name in names}
+        described = kind.described()
+        names = sorted(described, key=lambda name: name in END)
+        told = {name: _field(described[name]) for name in names}
+        written = {name: described[name].alias or name for name in names}
         plain = [f"`{name}`" for name in ("schema", "command") if issubclass(kind, Result)]
         plain += [f"`{name}`" for name in names if not told[name]]
         first = [[", ".join(plain), "what was asked for, and of what"]] if plain else []
@@ -285,9 +285,10 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
     return make
 
 
-def _field(field: FieldInfo) -> str:
+def _field(field: FieldInfo | ComputedFieldInfo) -> str:
     """What a field holds: its description, and the fields of what is in it."""
-    inside = [one for one in _types(field.annotation) if isinstance(one, type) and issubclass(one, Fields)]
+    annotation = field.annotation if isinstance(field, FieldInfo) else field.return_type
+    inside = [one for one in _types(annotation) if isinstance(one, type) and issubclass(one, Fields)]
     text = field.description or (_first_sentence(inside[0]) if inside else "")
     parts = [
         f"`{part.alias or name}`" + (f" ({part.description})" if part.description else "")

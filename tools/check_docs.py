@@ -195,7 +195,7 @@ def results() -> Iterator[str]:
     """Fields of results say what they hold; columns and files of a run are in the page about runs."""
     kinds: list[type[Result]] = [AttackSummary, SweepSummary, GapResult, CurveResult, MatrixResult, RenderResult]
     for kind in kinds:
-        silent = {name for name, field in kind.model_fields.items() if not script("make_figures")._field(field)}
+        silent = {name for name, field in kind.described().items() if not script("make_figures")._field(field)}
         if not (kind.__doc__ and kind.command) or silent - PLAIN:
             yield f"{kind.__name__}: expected a docstring, a command and descriptions of {sorted(silent - PLAIN)}"
     text = page("runs.md")
