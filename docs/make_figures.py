@@ -20,7 +20,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
 
-from pydantic.fields import FieldInfo
+from pydantic.fields import ComputedFieldInfo, FieldInfo
 
 from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import add_command
@@ -72,7 +72,10 @@ def differing(record: Record | None = None) -> dict[Path, str]:
     wanted: dict[Path, str] = {}
     for (page, name), make in PARTS.items():
         path = DOCS / page
-        wanted[path] = replaced(wanted.get(path) or path.read_text(encoding="utf-8"), name, make(record))
+        try:
+            wanted[path] = replaced(wanted.get(path) or path.read_text(encoding="utf-8"), name, make(record))
+        except ValueError as error:
+            raise ValueError(f"docs/{page}: {error}") from None
     if measured(record):
         wanted[DOCS / DIAGRAM] = reliability_diagram(record["figures"]["heldout"])
     return {path: text for path, text in wanted.items() if not path.exists() or path.read_text("utf-8") != text}
@@ -86,7 +89,7 @@ def replaced(page: str, name: str, content: str) -> str:
     """
     begin, end = f"<!-- made by docs/make_figures.py: {name} -->\n", f"<!-- end of {name} -->"
     if page.count(begin) != 1 or page.count(end) != 1:
-        raise ValueError(f"expected one part named {name!r} in the page")
+        raise ValueError(f"expected one part named {name!r}, two lines in the page: {begin.strip()} and {end}")
     before, rest = page.split(begin)
     return f"{before}{begin}{content}{end}{rest.split(end)[1]}"
 
@@ -181,13 +184,19 @@ def environments(record: Record) -> str:
 
 
 def controls(record: Record) -> str:
-    """Every control with one sentence and its picture."""
+    """Every control with one sentence and its picture; below, in full, those that have no page."""
     from advsearch.controls import CONTROLS
 
-    rows = [
-        [f"[{kind}]({kind}.md)", CONTROLS[kind].summary, f"![{kind}](../images/controls/{kind}.png)"] for kind in OWN
-    ]
-    return table(["control", "what may vary", "examples"], rows)
+    rows, below = [], ""
+    for kind in OWN:
+        place = f"{kind}.md" if (f"controls/{kind}.md", kind) in PARTS else f"#{kind}"
+        drawn = (DOCS / "images" / "controls" / f"{kind}.png").is_file()
+        picture = f"![{kind}](../images/controls/{kind}.png)" if drawn else ""
+        rows.append([f"[{kind}]({place})", CONTROLS[kind].summary, picture])
+        if place.startswith("#"):
+            example = f"```sh\nadvsearch attack --object mug --control {kind}\n```\n"
+            below += f"\n### {kind}\n\n{CONTROLS[kind].summary}\n\n{example}\n{control(kind)(record)}"
+    return table(["control", "what may vary", "examples"], rows) + below
 
 
 def _searched(parameter: Any) -> str:
@@ -264,10 +273,10 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
     """The fields of a result in the order in which they are written, those that say themselves in one row."""
 
     def make(record: Record) -> str:
-        names = list(kind.model_fields)
-        names.sort(key=lambda name: name in END)
-        told = {name: _field(kind.model_fields[name]) for name in names}
-        written = {name: kind.model_fields[name].alias or name for name in names}
+        described = kind.described()
+        names = sorted(described, key=lambda name: name in END)
+        told = {name: _field(described[name]) for name in names}
+        written = {name: described[name].alias or name for name in names}
         plain = [f"`{name}`" for name in ("schema", "command") if issubclass(kind, Result)]
         plain += [f"`{name}`" for name in names if not told[name]]
         first = [[", ".join(plain), "what was asked for, and of what"]] if plain else []
@@ -276,9 +285,10 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
     return make
 
 
-def _field(field: FieldInfo) -> str:
+def _field(field: FieldInfo | ComputedFieldInfo) -> str:
     """What a field holds: its description, and the fields of what is in it."""
-    inside = [one for one in _types(field.annotation) if isinstance(one, type) and issubclass(one, Fields)]
+    annotation = field.annotation if isinstance(field, FieldInfo) else field.return_type
+    inside = [one for one in _types(annotation) if isinstance(one, type) and issubclass(one, Fields)]
     text = field.description or (_first_sentence(inside[0]) if inside else "")
     parts = [
         f"`{part.alias or name}`" + (f" ({part.description})" if part.description else "")
@@ -458,7 +468,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("scenes.md", "objects"): objects,
     ("scenes.md", "environments"): environments,
     ("controls/README.md", "controls"): controls,
-    **{(f"controls/{kind}.md", kind): control(kind) for kind in OWN},
+    **{(f"controls/{kind}.md", kind): control(kind) for kind in OWN if (DOCS / "controls" / f"{kind}.md").is_file()},
     ("policies/pgd.md", "pgd"): policy("pgd"),
     ("design.md", "endings"): endings,
     ("design.md", "attack-fields"): result_fields(AttackSummary),
@@ -481,7 +491,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
 
 def parts_in(page: str) -> set[str]:
     """Return the names of the made parts of a page."""
-    return set(re.findall(r"<!-- made by docs/make_figures\.py: ([a-z-]+) -->", page))
+    return set(re.findall(r"<!-- made by docs/make_figures\.py: ([\w-]+) -->", page))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks import Query
 from advsearch.config import AttackConfig
-from advsearch.controls import CONTROLS, NumberControl, compose, make_control, make_space
+from advsearch.controls import CONTROLS, OWN, NumberControl, compose, make_control, make_space
 from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.objective import domain_of
@@ -58,6 +58,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "corruption": {"which": ["fog", "jpeg", "gaussian_noise"], "severity": [0, 5]},
     "mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},
 }
+FORMS |= {kind: {} for kind in OWN if kind not in FORMS}  # another one varies as it declares itself
 EXCLUSIVE = {frozenset(("sky", "environment")), frozenset(("path", "camera"))}
 """Pairs that set the same input and are refused."""
 
@@ -92,8 +93,12 @@ def model() -> advsearch.Model:
     return advsearch.load_model(Weighted(), labels=("mug", "vase", "bowl", "pan"), input_size=SIZE, name="weighted")
 
 
-def test_every_control_is_here() -> None:
-    assert set(FORMS) == {kind for kind in CONTROLS if CONTROLS[kind].__module__.startswith("advsearch.")}
+def test_every_control_is_here_and_varies() -> None:
+    assert set(FORMS) == set(OWN), "FORMS of tests/test_pairs.py names a control that there is not"
+    scene = describe("mug")
+    for kind, form in FORMS.items():
+        varied = compose([make_control(kind, form)], scene).start.numel()
+        assert varied, f"{kind} has no range: give a parameter `search=(low, high)`, or {kind} a form in FORMS"
 
 
 @pytest.mark.parametrize("pair", pairs(QUICK))

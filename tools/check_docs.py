@@ -128,8 +128,10 @@ def commands() -> Iterator[str]:
 
 
 def controls() -> Iterator[str]:
-    """Every control has a page with its parameters, settings and an example."""
+    """A page of a control has its parameters, its settings and an example; of controls without one these are made."""
     for kind, control in CONTROLS.items():
+        if not (DOCS / "controls" / f"{kind}.md").exists():
+            continue
         declared = [one.name for one in control.parameters] + [one.name for one in control.choices]
         yield from absent(f"controls/{kind}.md", [f"--control {kind}", *(f"| `{name}` |" for name in declared)])
 
@@ -138,12 +140,19 @@ def policies() -> Iterator[str]:
     """Every policy has a page or a row with an example, and its options in the row with their defaults."""
     overview = page("policies/README.md")
     for name, policy in POLICIES.items():
-        own = f"policies/{name}.md"
-        yield from absent(own if (DOCS / own).exists() else "policies/README.md", [f"--policy {name}"])
-        start = f"[`{name}`]({name}.md)" if (DOCS / own).exists() else f"`{name}`"
-        yield from absent("policies/README.md", [f"\n| {start} |"])
-        row = re.search(rf"^\| \[?`{name}`.*$", overview, re.MULTILINE)
-        said = dict(re.findall(r"`([a-z0-9_]+)` \(([^)]*)\)", row[0].rpartition(" | ")[2] if row else ""))
+        own = f"policies/{name}.md" if (DOCS / f"policies/{name}.md").exists() else "policies/README.md"
+        if f"--policy {name}" not in page(own):
+            yield f"docs/{own}: expected an example, such as advsearch attack --object mug --policy {name}"
+        row = re.search(rf"^\| (?:`{name}`|\[`{name}`\]\({name}\.md\)) \|.*$", overview, re.MULTILINE)
+        if row is None:
+            options = ", ".join(f"`{one.name}` (its range; {one.default})" for one in fields(policy)) or "none"  # type: ignore[arg-type]
+            gradients = "yes" if getattr(policy, "uses_gradient", True) is True else "no"
+            yield (
+                f"docs/policies/README.md: expected a row, | `{name}` | what it does | when to take it | {gradients} | "
+                f"{options} |"
+            )
+            continue
+        said = dict(re.findall(r"`([a-z0-9_]+)` \(([^)]*)\)", row[0].rpartition(" | ")[2]))
         declared = {one.name: one.default for one in fields(policy)}  # type: ignore[arg-type]
         if set(said) != set(declared):
             yield f"docs/policies/README.md: expected the options {sorted(declared)} of {name}, got {sorted(said)}"
@@ -186,7 +195,7 @@ def results() -> Iterator[str]:
     """Fields of results say what they hold; columns and files of a run are in the page about runs."""
     kinds: list[type[Result]] = [AttackSummary, SweepSummary, GapResult, CurveResult, MatrixResult, RenderResult]
     for kind in kinds:
-        silent = {name for name, field in kind.model_fields.items() if not script("make_figures")._field(field)}
+        silent = {name for name, field in kind.described().items() if not script("make_figures")._field(field)}
         if not (kind.__doc__ and kind.command) or silent - PLAIN:
             yield f"{kind.__name__}: expected a docstring, a command and descriptions of {sorted(silent - PLAIN)}"
     text = page("runs.md")
@@ -206,8 +215,11 @@ def results() -> Iterator[str]:
 def made() -> Iterator[str]:
     """The made parts are there and up to date."""
     figures = script("make_figures")
-    yield from (f"{name_of(path)}: run python docs/make_figures.py" for path in figures.differing())
-    wanted = [f"controls/{kind}.md" for kind in CONTROLS]
+    try:
+        yield from (f"{name_of(path)}: run python docs/make_figures.py" for path in figures.differing())
+    except ValueError as error:
+        yield str(error)
+    wanted = [f"controls/{kind}.md" for kind in CONTROLS if (DOCS / "controls" / f"{kind}.md").exists()]
     own = [name for name in POLICIES if (DOCS / "policies" / f"{name}.md").exists()]
     wanted += [f"policies/{name}.md" for name in own if inspect.signature(POLICIES[name]).parameters]
     having = {name for name, _ in figures.PARTS}

@@ -6,38 +6,35 @@ import argparse
 import io
 import os
 import sys
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 
-from advsearch.cli import output
+from advsearch.cli import exports, output
+from advsearch.cli.exports.print import USUAL_SIZE
 from advsearch.cli.screen import output_errors
 from advsearch.errors import InputError
 
-Written = tuple[dict[str, object], str]
-"""What to tell of a file, as JSON and in words."""
-
-USUAL_SIZE = 100.0
-"""Longest side of a printed object where nobody says it, in millimetres."""
-
-SUFFIXES = {"pdf": "print", "xml": "mitsuba", "glb": "gltf"}
-"""Formats that are not called as their files end."""
+WRITERS = {
+    module.FORMAT: module
+    for module in (import_module(f"{exports.__name__}.{one.name}") for one in iter_modules(exports.__path__))
+}
+"""What is no table, by the word of `--format`: the modules of `advsearch.cli.exports`."""
 
 HELP = "export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an object as glTF"
 EXAMPLES = (
     "export mug-texture-001",
     "export runs/mug-texture-001 --kind search --out search.parquet",
-    "export mug-sweep-001 --format 3db --out folder",
-    "export mug-sweep-001 --format fiftyone --out folder",
-    "export mug-patch-001 --format print --size 95 --out sheets.pdf",
-    "export mug-texture-001 --format mitsuba --out folder",
-    "export mug-texture-001 --format gltf --out mug.glb",
+    *(module.EXAMPLE for module in WRITERS.values()),
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
-    names = ", ".join([*WRITERS, "csv", "json", "parquet"])
-    parser.add_argument("--format", help=f"{names} (default: by the name of --out, or csv)")
+    told = {format: (module.__doc__ or "").rstrip(".") for format, module in WRITERS.items()}
+    known = "; ".join(f"{format}: {text[:1].lower()}{text[1:]}" for format, text in told.items())
+    text = f"csv, json or parquet: the rows as a table; {known} (default: by the name of --out, or csv)"
+    parser.add_argument("--format", help=text.replace("%", "%%"))
     parser.add_argument("--out", metavar="FILE", help="the file to write (default: standard output)")
     parser.add_argument(
         "--json", action="store_true", help="the same as --format json; with --out, tell what was written"
@@ -58,18 +55,18 @@ def run(args: argparse.Namespace) -> int:
     """Write what was asked for."""
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
-    format = args.format or SUFFIXES.get(by_name, by_name)
+    endings = {getattr(module, "ENDING", format): format for format, module in WRITERS.items()}
+    format = args.format or endings.get(by_name, by_name)
     for name in ("size", "sheets", "paper", "icc"):
         if format != "print" and getattr(args, name) is not None:
             raise InputError(f"--{name}: belongs to --format print; leave it out")
     if format not in WRITERS:
         return _table(args, out, by_name)
-    expected, write = WRITERS[format]
     if out is None:
-        raise InputError(f"--out: {format} writes {expected}; give its name")
+        raise InputError(f"--out: {format} writes {WRITERS[format].WRITES}; give its name")
     if args.kind is not None and format != "3db":
         raise InputError("--kind: belongs to tables of rows; leave it out")
-    told, text = write(args, out)
+    told, text = WRITERS[format].write(args, out)
     if args.json:
         output.print_json({"schema": 1, "command": "export", "format": format, **told, "out": str(out)})
     else:
@@ -103,84 +100,3 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     elif out is not None:
         print(f"{count} rows in {out}", file=sys.stderr)
     return 0
-
-
-def _threedb(args: argparse.Namespace, out: Path) -> Written:
-    """Write a folder as 3DB does."""
-    from advsearch.runs.directory import find_run
-    from advsearch.runs.store import NAME, Store
-    from advsearch.runs.threedb import write_threedb
-    from advsearch.viewer.thumbnails import kept_pictures
-
-    folder = find_run(args.run)
-    kept = kept_pictures(folder)
-    with Store(folder / NAME, read_only=True) as store:
-        picture = kept.png_of if kept else lambda _: None
-        count = write_threedb(lambda: store.rows(args.kind or "sweep"), out, picture)
-    return {"rows": count}, f"{count} rows in {out}; look at them with: python -m threedboard {out}"
-
-
-def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
-    """Write a dataset of the pictures that were kept."""
-    from advsearch.runs.directory import find_run
-    from advsearch.runs.fiftyone import write_fiftyone
-    from advsearch.viewer.pictured import name_of_object, pictured
-
-    folder = find_run(args.run)
-    count = write_fiftyone(lambda: pictured(folder), out, folder.resolve().name, name_of_object(folder))
-    return {"samples": count}, f"{count} samples in {out}, a fiftyone.types.FiftyOneDataset"
-
-
-def _print(args: argparse.Namespace, out: Path) -> Written:
-    """Write the sheets."""
-    from advsearch.cli.progress import at_work
-
-    longest = USUAL_SIZE if args.size is None else args.size
-    with at_work(as_json=True, quiet=False):
-        from advsearch.engine.printing import printable
-        from advsearch.report.sheets import MOST_SHEETS, write_sheets
-        from advsearch.runs.files import placed_by, replacing
-
-        pieces = printable(args.run, longest)
-        profile = None if args.icc is None else Path(args.icc)
-        title = f"{Path(args.run).name}, object of {longest:g} mm"
-        with placed_by("out"), replacing(out) as part:
-            paper, most = (args.paper or "a4").lower(), MOST_SHEETS if args.sheets is None else args.sheets
-            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most)
-    sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
-    text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
-    if args.size is None:
-        text += f"\nThe real object's longest side is taken for {longest:g} mm; --size says otherwise."
-    return {"pages": pages, "size_mm": longest, "pieces": sizes}, text
-
-
-def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
-    """Write the adversarial scene."""
-    from advsearch.cli.progress import at_work
-
-    with at_work(as_json=True, quiet=False):
-        from advsearch.api.export_scene import write_mitsuba
-
-        notes = write_mitsuba(args.run, out)
-    return {"notes": notes}, " ".join([f"The scene is in {out}.", *notes])
-
-
-def _gltf(args: argparse.Namespace, out: Path) -> Written:
-    """Write the adversarial object."""
-    from advsearch.cli.progress import at_work
-
-    with at_work(as_json=True, quiet=False):
-        from advsearch.api.export_scene import write_gltf
-
-        notes = write_gltf(args.run, out)
-    return {"notes": notes}, " ".join([f"The object is in {out}.", *notes])
-
-
-WRITERS: dict[str, tuple[str, Callable[[argparse.Namespace, Path], Written]]] = {
-    "3db": ("a folder", _threedb),
-    "fiftyone": ("a folder", _fiftyone),
-    "print": ("a PDF file", _print),
-    "mitsuba": ("an XML file and what belongs to it, or a new folder for them", _mitsuba),
-    "gltf": ("a .glb file", _gltf),
-}
-"""What is no table, by the word of `--format`: what is written, and how."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any
 
 from advsearch.controls.base import BoundControl, Budget, Choice, Control, Group, Parameter
@@ -19,27 +20,27 @@ from advsearch.options import by_key
 from advsearch.registry import Registry
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription
 
+ORDER = (
+    *("pose", "camera", "path", "texture", "material", "light", "environment", "sky", "geometry", "patch", "occlusion"),
+    *("contents", "background", "haze", "lens", "sensor", "corruption", "mitsuba"),
+)
+"""In which lists have controls; one that is not named comes last."""
+SHARED = ("base", "clean", "numbers", "space", "values")
+"""Modules of this folder that are no control."""
+
+
+def _class_of(kind: str) -> str:
+    """Return ``WhiteBalanceControl`` for ``white_balance``."""
+    return "".join(map(str.capitalize, kind.split("_"))) + "Control"
+
+
+_modules = (one.name for one in iter_modules(__path__) if one.name not in SHARED)
 OWN = {
-    "pose": "PoseControl",
-    "camera": "CameraControl",
-    "path": "PathControl",
-    "texture": "TextureControl",
-    "material": "MaterialControl",
-    "light": "LightControl",
-    "environment": "EnvironmentControl",
-    "sky": "SkyControl",
-    "geometry": "GeometryControl",
-    "patch": "PatchControl",
-    "occlusion": "OcclusionControl",
-    "contents": "ContentsControl",
-    "background": "BackgroundControl",
-    "haze": "HazeControl",
-    "lens": "LensControl",
-    "sensor": "SensorControl",
-    "corruption": "CorruptionControl",
-    "mitsuba": "MitsubaControl",
+    kind: _class_of(kind)
+    for kind in sorted(_modules, key=lambda kind: (ORDER.index(kind) if kind in ORDER else len(ORDER), kind))
 }
-"""The package's own controls: the word on the command line is the module's name, and this is its class."""
+"""The package's own controls, one for each other module: the word on the command line is the module's name, and this is
+its class."""
 
 CONTROLS: Registry[type[Control]] = Registry(
     "advsearch.controls",

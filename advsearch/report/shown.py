@@ -138,6 +138,7 @@ def facts_of(result: Result, given: ShownAnswer) -> dict[str, str]:
         "workers": wording.workers_text(getattr(result, "shared", None)),
         "time": wording.seconds_text(seconds["total"]) if seconds else "",
         "seed": str(getattr(result, "seed", "")),
+        **result.facts(),
     }
     return {name: text for name, text in {**given.facts, **own, **given.facts}.items() if text}
 
@@ -147,9 +148,10 @@ def facts_of(result: Result, given: ShownAnswer) -> dict[str, str]:
 
 def fields_shown(result: Result) -> ShownAnswer:
     """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
-    values = {name: getattr(result, name) for name in type(result).model_fields}
+    values = {name: getattr(result, name) for name in type(result).described()}
     tables = {name: found for name, value in values.items() if (found := _rows(value))}
-    plain = {_words(name): _text(one) for name, one in values.items() if name not in (*_ELSEWHERE, *tables)}
+    elsewhere = (*_ELSEWHERE, *tables, *(name.replace(" ", "_") for name in result.facts()))
+    plain = {_words(name): _text(one) for name, one in values.items() if name not in elsewhere}
     sections = [
         AnswerPart(
             _words(name),
@@ -171,7 +173,7 @@ def _meanings(result: Result, plain: set[str], tables: Sequence[Sequence[Fields]
     described += [(rows[0], set(map(_words, _columns(rows)))) for rows in tables]
     found: dict[str, str] = {}
     for one, words in described:
-        for name, about in type(one).model_fields.items():
+        for name, about in type(one).described().items():
             if about.description and _words(name) in words:
                 found.setdefault(_words(name), about.description.replace("`", ""))
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib import import_module
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ from conftest import ROOT
 from hostile import SHORT, shown
 
 from advsearch import load_scene
-from advsearch.controls import CONTROLS, BoundControl, TextureControl, make_control, make_space
+from advsearch.controls import CONTROLS, OWN, BoundControl, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import describe
@@ -26,6 +27,15 @@ NEEDED: dict[str, dict[str, Any]] = {"mitsuba": {"ground.bsdf.brdf_0.reflectance
 def bound(kind: str, object: str = "mug") -> BoundControl:
     """A control with its defaults in a scene, alone."""
     return make_space([make_control(kind, NEEDED.get(kind))], describe(object)).controls[0]
+
+
+def test_every_module_of_the_folder_is_a_control_or_shared_by_several() -> None:
+    for kind, name in OWN.items():
+        found = getattr(import_module(f"advsearch.controls.{kind}"), name, None)
+        assert getattr(found, "kind", None) == kind, (
+            f'advsearch/controls/{kind}.py: expected a class {name} with kind = "{kind}"; a module that is no control '
+            f"is named in SHARED of advsearch/controls/__init__.py"
+        )
 
 
 @every_control

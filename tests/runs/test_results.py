@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from pathlib import Path
 from typing import ClassVar
 
+from pydantic import Field, computed_field
+from samples import attack
+
 from advsearch.cli.output import shown_text as plan_text
+from advsearch.questions.attack.page import RunData, attack_page_html
 from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, PlanResult
-from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result
+from advsearch.report.shown import facts_of, fields_shown
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result, as_fact
 
 
 class Inner(Fields):
@@ -34,6 +42,38 @@ def test_a_result_is_json_without_what_was_not_asked_for_and_reads_back() -> Non
     again = Outer.of(json.loads(written))
     assert again.inner is not None and math.isnan(again.inner.value) and again.extra is None
     assert Outer(inner=None, extra=3).to_dict() == {"schema": 1, "command": "outer", "inner": None, "extra": 3}
+
+
+class Timed(AttackSummary):
+    """An attack with two fields more: one that was measured, one that is computed from others."""
+
+    picture_bytes: int | None = Field(default=None, description="of a picture", json_schema_extra=as_fact())
+
+    @computed_field(description="renders over seconds", json_schema_extra=as_fact("{:.3g}"))  # type: ignore[prop-decorator]
+    @property
+    def renders_a_second(self) -> float:
+        return sum(self.renders.values()) / self.seconds["total"]
+
+
+def test_a_field_that_is_declared_as_a_fact_is_in_terminal_page_and_json(tmp_path: Path) -> None:
+    earlier = attack().to_dict()
+    old, new = Timed.of(earlier), Timed.of({**earlier, "picture_bytes": 768})
+    assert "picture_bytes" not in old.to_dict() and new.to_dict()["picture_bytes"] == 768
+    assert old.to_dict()["renders_a_second"] == Timed.of(old.to_dict()).renders_a_second == 101 / 14.6
+    assert AttackSummary.of(new.to_dict()) == attack()
+    page = attack_page_html(RunData(tmp_path, new, "", {}, {}))
+    for name, text in (("picture bytes", "768"), ("renders a second", "6.92")):
+        assert re.search(rf"^  {name} +{text}$", plan_text(new), re.M)
+        assert re.search(rf"<th[^>]*>{name.capitalize()}</th><td[^>]*>{text}</td>", page)
+    assert "picture bytes" not in plan_text(old)
+
+
+def test_a_fact_is_shown_of_a_question_without_words_too() -> None:
+    class Counted(Result):
+        command: ClassVar[str] = "counted"
+        done: int = Field(description="how many", json_schema_extra=as_fact("{} of 9"))
+
+    assert facts_of(Counted(done=3), fields_shown(Counted(done=3))) == {"done": "3 of 9"}
 
 
 def test_limits_of_a_plan_are_sentences() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import is_dataclass
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any
 
 from advsearch.attacks.policies.adam import Adam
@@ -26,22 +28,21 @@ def _is_policy(name: str, entry: Any) -> bool:
     return issubclass(entry, Policy) and entry.name == name
 
 
+INSIDE = ("choices", "stay")
+"""Policies that only the search asks for."""
+
+
+def _own() -> dict[str, type[Policy[Any]]]:
+    """Return the policies of this folder's modules by their names, sorted."""
+    modules = [import_module(f"{__name__}.{one.name}") for one in iter_modules(__path__)]
+    classes = [entry for module in modules for entry in vars(module).values() if isinstance(entry, type)]
+    found = {entry.name: entry for entry in classes if issubclass(entry, Policy) and "name" in vars(entry)}
+    return {name: entry for name, entry in sorted(found.items()) if name not in INSIDE}
+
+
 POLICIES: Registry[type[Policy[Any]]] = Registry(
     "advsearch.policies",
-    {
-        "adam": Adam,
-        "archive": MapElites,
-        "auto": Auto,
-        "cmaes": CMAES,
-        "grid": Grid,
-        "mixture": Mixture,
-        "nes": NES,
-        "pgd": PGD,
-        "portfolio": Portfolio,
-        "random": Random,
-        "restarts": Restarts,
-        "sobol": Sobol,
-    },
+    _own(),
     "a dataclass over Policy whose name is that of the entry point",
     _is_policy,
 )

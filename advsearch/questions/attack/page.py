@@ -283,6 +283,7 @@ def _cost(summary: AttackSummary) -> Html:
         "Environment": summary.environment,
         "Model": summary.model,
         "Seed": str(summary.seed),
+        **{name.capitalize(): text for name, text in summary.facts().items()},
     }
     return join_html(element("h2", "Cost and conditions"), facts_table(facts), _method(summary))
 

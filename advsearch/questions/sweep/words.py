@@ -114,11 +114,11 @@ def _value(value: Any) -> str:
 
 
 def _facts(summary: SweepSummary) -> dict[str, str]:
-    speed, worst = summary.renders_per_second, summary.worst
+    worst = summary.worst
     return {
         "worst": _configuration(worst) if worst else "",
         "there": _said(worst, summary.task) if worst else "",
-        "renders": f"{summary.renders['sweep']}" + (f", {speed:.3g} a second" if speed else ""),
+        "renders": str(summary.renders["sweep"]),
         "worst drive": f"{summary.run}/images/drive.webp" if summary.drives and summary.run else "",
         "map of the surface": f"{summary.run}/images/surface.png" if summary.surface else "",
     }

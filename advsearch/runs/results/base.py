@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
+from pydantic.fields import ComputedFieldInfo, FieldInfo
 
 from advsearch.files import JsonObject
 
@@ -43,6 +44,17 @@ def having(*names: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+def as_fact(form: str = "{}") -> dict[str, JsonValue]:
+    """Return the `json_schema_extra` of a field that terminal, page and notebook show under its name, as in
+
+        speed: float | None = Field(default=None, description="pictures a second", json_schema_extra=as_fact("{:.3g}"))
+
+    Args:
+        form: how its value becomes a text.
+    """
+    return {"fact": form}
+
+
 class Fields(BaseModel):
     """Named fields of a result.
 
@@ -56,6 +68,11 @@ class Fields(BaseModel):
     def of(cls, source: object) -> Self:
         """Return the fields with the values that the attributes, or the keys, of something have."""
         return cls.model_validate(source)
+
+    @classmethod
+    def described(cls) -> dict[str, FieldInfo | ComputedFieldInfo]:
+        """Return the fields by name, and behind them those that are computed from others (`computed_field`)."""
+        return {**cls.model_fields, **cls.model_computed_fields}
 
     def to_dict(self) -> JsonObject:
         """Return the fields as JSON values; NaN and infinity are None."""
@@ -71,6 +88,15 @@ class Result(Fields):
     def to_dict(self) -> JsonObject:
         """Return `schema`, `command` and the fields as JSON values; NaN and infinity are None."""
         return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
+
+    def facts(self) -> dict[str, str]:
+        """Return the fields that are declared with `as_fact`, as texts by their names; None and NaN are left out."""
+        found = {}
+        for name, about in self.described().items():
+            extra, value = about.json_schema_extra, getattr(self, name)
+            if isinstance(extra, dict) and "fact" in extra and value is not None and value == value:
+                found[name.replace("_", " ")] = str(extra["fact"]).format(value)
+        return found
 
     @property
     def goes_on(self) -> bool:

@@ -7,7 +7,17 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork, VerifiedRate
-from advsearch.runs.results.base import Fields, Formation, Interval, JsonFloat, Payload, RunResult, VariedValue, having
+from advsearch.runs.results.base import (
+    Fields,
+    Formation,
+    Interval,
+    JsonFloat,
+    Payload,
+    RunResult,
+    VariedValue,
+    as_fact,
+    having,
+)
 
 AxisValue = int | float | str | tuple[float, float]
 """A number, a name, or both ends of a part of a range."""
@@ -212,7 +222,9 @@ class SweepSummary(CountedAnswers, RunResult):
     shared: SharedWork | None = Field(
         default=None, description="how [workers](cluster.md) did that shared the work; absent without"
     )
-    renders_per_second: float | None = Field(description="pictures of the sweep; null where nothing was rendered now")
+    renders_per_second: float | None = Field(
+        description="pictures of the sweep; null where nothing was rendered now", json_schema_extra=as_fact("{:.3g}")
+    )
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property

@@ -60,8 +60,8 @@ def test_a_policy_reaches_the_optimum_within_its_stated_budget(name: str, object
     assert all(closed_form.reached(make_policy(name), objective, d, renders, seed) for seed in range(3))
 
 
-def test_every_policy_states_a_budget_for_every_objective() -> None:
-    assert set(BUDGETS) == set(POLICIES)
+def test_a_policy_that_states_budgets_states_them_for_every_objective() -> None:
+    assert set(BUDGETS) <= set(POLICIES)
     for rows in BUDGETS.values():
         assert {name: len(row) for name, row in rows.items()} == {name: len(d) for name, d in DIMENSIONS.items()}
     assert set(closed_form.OBJECTIVES) == set(DIMENSIONS)
@@ -70,7 +70,7 @@ def test_every_policy_states_a_budget_for_every_objective() -> None:
 def test_a_gradient_pays_in_many_dimensions() -> None:
     """In a thousand dimensions it takes tens of renders with a gradient, and thousands without one at least."""
     for objective in ("linear, linf", "linear, l2", "quadratic, box"):
-        for name, policy in ((name, make_policy(name)) for name in POLICIES):
+        for name, policy in ((name, make_policy(name)) for name in BUDGETS):
             renders = BUDGETS[name][objective][DIMENSIONS[objective].index(1000)]
             if policy.uses_gradient:
                 assert renders is not None and renders <= 200, name
@@ -100,7 +100,7 @@ def test_an_optimum_is_the_largest_value(objective: str) -> None:
 
 def test_the_page_shows_the_stated_budgets() -> None:
     assert PAGE == closed_form.with_table(PAGE), "run python benchmarks/closed_form.py --write"
-    assert closed_form.table().count("\n") == 2 + len(POLICIES)
+    assert closed_form.table().count("\n") == 2 + len(BUDGETS)
 
 
 @pytest.mark.parametrize("name", POLICIES)
