@@ -22,7 +22,7 @@ def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
     """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
     with output_kept_clean() if as_json else nullcontext(), watch_progress(quiet=quiet) as watcher:
         progress = LoadingProgress(watcher)
-        progress.stage("starting: PyTorch and Mitsuba are loaded")
+        progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
         progress.end()
 

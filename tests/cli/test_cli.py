@@ -1046,7 +1046,7 @@ def test_what_loads_much_says_that_it_starts(
     begun: list[str] = []
     monkeypatch.setattr(LineProgress, "stage", lambda self, name, *_, **__: begun.append(name))
     assert main(argv) == 0
-    assert begun == ["starting: PyTorch and Mitsuba are loaded"] and capsys.readouterr().out
+    assert begun == ["starting: loading PyTorch and Mitsuba"] and capsys.readouterr().out
 
 
 def test_who_watches(monkeypatch: pytest.MonkeyPatch) -> None:

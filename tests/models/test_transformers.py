@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -18,10 +19,12 @@ from torch import Tensor, nn
 from advsearch.errors import InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.zoo import timm as timm_networks
+from advsearch.models.zoo.transformers import PATIENCE
 from advsearch.tasks import Detection, Similarity
 from advsearch.tasks.detection import Place
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
+huggingface_hub = pytest.importorskip("huggingface_hub")
 
 NAMES = ("mug", "bowl", "vase")
 SIDE = 16
@@ -296,6 +299,25 @@ def test_a_folder_with_nearly_that_name_is_meant(tmp_path: Path, monkeypatch: py
         load_model("hf:another")
     with pytest.raises(ModelError, match="is a file; give the folder in which it is"):
         load_model("hf:some/model.safetensors")
+
+
+def test_a_hub_out_of_reach_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its client would try each of several files six times, which takes a minute."""
+    asked: list[float] = []
+
+    def out_of_reach(url: str, timeout: float) -> None:
+        asked.append(timeout)
+        raise ConnectionError("Name or service not known")
+
+    (tmp_path / "models--owner--good").mkdir()
+    monkeypatch.setattr(huggingface_hub, "get_hf_file_metadata", out_of_reach)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(time, "sleep", lambda seconds: pytest.fail("the hub is asked again"))
+    with pytest.raises(
+        ModelError, match=r"in the cache \(did you mean 'hf:owner/good'\?\).*Check the name and the net"
+    ):
+        load_model("hf:owner/goood")
+    assert asked == [PATIENCE]
 
 
 def test_it_never_unpickles(tmp_path: Path) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,9 @@ def _called(part: str) -> Callable[[str, Any], bool]:
     return lambda architecture, network: part in architecture
 
 
+PATIENCE = 5.0
+"""Seconds that the hub has for its first answer. Its client would ask for each file again for half a minute."""
+
 ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has made as 'hf:FOLDER'"
 
 
@@ -73,8 +77,10 @@ def load(spec: str) -> Source:
         raise ModelError(f"model {spec}: no such folder{_near_folders(name)}; a repository is written hf:OWNER/NAME")
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
-    where = {"revision": revision} if revision else {}
+    where: dict[str, Any] = {"revision": revision} if revision else {}
     with reading(spec, ADVICE):
+        if not Path(name).is_dir() and _out_of_reach(name):
+            where["local_files_only"] = True
         told = _config(transformers, name, spec, where)
         if told.get("model_type") == "timm_wrapper" and "architectures" not in told:  # which timm itself has saved
             return timm.load_repository(spec, name, revision)
@@ -153,16 +159,38 @@ def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -
             raise
         raise ModelError(
             f"model {spec}: {name} is no folder here{_near_folders(name)}, and no repository of that name is in the "
-            f"cache or can be had ({first_line(error)})"
+            f"cache{_meant(resembling(name, _cached()))} or can be had ({first_line(error)}). Check the name and the "
+            "network, or give a folder"
         ) from error
+
+
+def _out_of_reach(name: str) -> bool:
+    """Return whether the hub gives no answer about a repository, not even that there is none."""
+    hub = import_module("huggingface_hub")
+    try:
+        hub.get_hf_file_metadata(hub.hf_hub_url(name, "config.json"), timeout=PATIENCE)
+    except Exception as error:  # its client's libraries have errors of their own
+        return getattr(error, "response", None) is None
+    return False
+
+
+def _cached() -> list[str]:
+    """Return the names of the repositories in the hub's cache."""
+    cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
+    return [one.name.partition("--")[2].replace("--", "/") for one in cache.glob("models--*")]
 
 
 def _near_folders(name: str) -> str:
     """Return the question whether a folder with nearly that name is meant; "" if there is none."""
     place = Path(name).expanduser()
     there = [one.name for one in place.parent.iterdir() if one.is_dir()] if place.parent.is_dir() else []
-    near = [f"'hf:{place.parent / one}'" for one in resembling(place.name, there)[:3]]
-    return f" (did you mean {' or '.join(near)}?)" if near else ""
+    return _meant([str(place.parent / one) for one in resembling(place.name, there)])
+
+
+def _meant(names: Sequence[str]) -> str:
+    """Return the question whether one of these folders or repositories is meant; "" if there is none."""
+    specs = [f"'hf:{one}'" for one in names[:3]]
+    return f" (did you mean {' or '.join(specs)}?)" if specs else ""
 
 
 def _check_whole(network: Any, told: Any, spec: str) -> None:
