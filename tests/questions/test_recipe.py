@@ -20,10 +20,9 @@ from advsearch.errors import AdvsearchError, FileFormatError, InputError, Unknow
 from advsearch.explanations.answered import Answered
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult
-from advsearch.questions.recipe.description import Recipe, check_figures, read_recipe, recipe_names, titles
-from advsearch.questions.recipe.figures import FIGURES, compute, draw_figure, heat_map, read_options
-from advsearch.questions.recipe.figures.answers import fitting
-from advsearch.questions.recipe.parts import planned
+from advsearch.questions.recipe.description import Recipe, check_figures, planned, read_recipe, recipe_names, titles
+from advsearch.questions.recipe.figures import FIGURES, accuracy, compute, draw_figure, read_options
+from advsearch.questions.recipe.figures.given import fitting
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, count_of
 from advsearch.questions.recipe.words import figure_table, told_once
@@ -345,7 +344,7 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
 def test_of_few_answers_it_is_not_said_that_none_is_right() -> None:
     def told(counts: dict[str, tuple[int, int]]) -> list[str]:
         cells = [count_of(name, *one) for name, one in counts.items()]
-        return heat_map._said(cells, "objects", "environments")
+        return accuracy._said_pairs(cells, "objects", "environments")
 
     few = told({"mug with noon": (0, 4), "bowl with noon": (3, 4)})
     assert few[-1] == "1 of the pairs without a right answer has under 20 configurations: too few to say."

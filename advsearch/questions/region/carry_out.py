@@ -19,8 +19,8 @@ from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.journal import Journal
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel
-from advsearch.engine.problem import Problem
 from advsearch.engine.outcome import transport_of
+from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.sharing import Shared
 from advsearch.engine.surface_light import COMPARED, LIGHTS, SurfaceLight
