@@ -13,9 +13,11 @@ import pytest
 
 import advsearch
 from advsearch.api import carry_out, subruns
-from advsearch.attacks import clopper_pearson
+from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
-from advsearch.config import SweepConfig
+from advsearch.config import AttackConfig, SweepConfig
+from advsearch.engine.attack_parts import parts_of, problem_of_parts
+from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.explanations.answered import Answered
 from advsearch.questions.recipe import carry_out as carrying_out
@@ -221,6 +223,18 @@ def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> Non
         return
     with pytest.raises(InputError, match="task: texture-shape asks whether answers are classes of the texture"):
         carrying_out._check(described, config)
+
+
+def test_the_recipe_for_viewpoints_searches_predicted_pictures_and_counts_rendered_ones() -> None:
+    runs = {
+        one.part: one.config
+        for one in planned(read_recipe("viewpoints"), RecipeConfig(recipe="viewpoints", object="mug"))
+    }
+    search, drawn = runs["search"], [runs["all"], runs["worst"]]
+    assert isinstance(search, AttackConfig) and search.steps is not None
+    problem, _ = problem_of_parts(parts_of(search))
+    assert reason_against(problem, search.steps, make_policy(search.policy_name), search.specialise) is None
+    assert [isinstance(one, SweepConfig) and one.specialise for one in drawn] == [False, False]
 
 
 def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -371,7 +371,7 @@ def _compute_surface(table: Table, options: Options) -> SurfaceFigure:
 
 
 def _draw_surface(made: SurfaceFigure, figure: Any, run: Path) -> None:
-    from matplotlib.image import imread
+    from matplotlib.image import imread  # matplotlib takes half a second
 
     for axes, one in zip(figure.subplots(len(made.maps), squeeze=False)[:, 0], made.maps, strict=True):
         axes.imshow(imread(run / PARTS / one.run / IMAGES / "surface.png"))

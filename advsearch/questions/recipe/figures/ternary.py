@@ -183,7 +183,7 @@ def _draw(made: TernaryFigure, figure: Any, run: Path) -> None:
 
 
 def _panel(axes: Any, one: TernaryAnswer, made: TernaryFigure) -> Any:
-    from matplotlib.collections import PolyCollection
+    from matplotlib.collections import PolyCollection  # matplotlib takes half a second
 
     values = [_value(cell, bool(made.leads)) for cell in one.cells]
     places = [[_place(corner) for corner in cell.corners] for cell in one.cells]
