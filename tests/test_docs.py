@@ -39,9 +39,8 @@ from advsearch.files import MESHES
 from advsearch.questions.compare.settings import CompareConfig
 from advsearch.questions.explain.settings import ExplainConfig
 from advsearch.questions.harden.settings import ALL, HardenConfig
-from advsearch.questions.recipe.description import read_recipe
+from advsearch.questions.recipe.description import planned, read_recipe
 from advsearch.questions.recipe.description import recipe_names as recipes
-from advsearch.questions.recipe.parts import planned
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.replay.settings import WAYS, ReplayConfig
 from advsearch.questions.stability.settings import StabilityConfig

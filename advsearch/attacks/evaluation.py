@@ -82,7 +82,7 @@ class Evaluation:
         judgement: what the task says of it, for the log; None where there is no task. No policy looks at it.
         picture: (H, W, 3) 8-bit values in [0, 1], where it was asked for.
         light: what was asked for as "light"; of the last row of a batch of a sweep, what was predicted so far.
-        predicted: 0 if its picture was rendered; in a sweep samples a pixel of what predicted it, in a search 1.
+        predicted: 0 if its picture was rendered; samples a pixel of what predicted it, 1 of a matrix.
         small: JPEG file of the picture of a row of a sweep, where it is kept.
         layers: ground truth of it by name, and notes, where they are kept.
         seconds: that it took; None where whoever asks has to look at the clock.

@@ -255,9 +255,12 @@ class Journal:
         """The trials of a kind by their numbers: those of earlier lives, and of this one."""
         if kind not in self._trials:
             rows = () if self.run is None or kind not in self._counts else self.run.store.rows(kind)
-            stored = {row.step: judgement_of(row) for row in rows if row.correct is not None}  # old ones don't say it
-            self._trials[kind] = {step: Evaluation.of(judgement) for step, judgement in stored.items()}
-            self.lost += sum(judgement.answer.label == LOST for judgement in stored.values())
+            stored = {row.step: row for row in rows if row.correct is not None}  # old ones don't say it
+            self._trials[kind] = {
+                step: Evaluation.of(judgement_of(row), predicted=0 if row.seed is not None else row.spp or 1)
+                for step, row in stored.items()
+            }
+            self.lost += sum(one.said.answer.label == LOST for one in self._trials[kind].values())
         return self._trials[kind]
 
     def _holds(self, query: Query) -> bool:

@@ -187,7 +187,7 @@ def _summary(
         printability=_printability(problem, findings) if config.printable else None,
         distribution=_distribution(search.distribution, problem) if search and search.distribution else None,
         failures=described_failures(problem, findings),
-        transport=_transport(findings),
+        transport=transport_of(findings),
         sample_count=None if count is None else VerificationSamples(spp=count.spp, converged=count.converged),
         claimed=None
         if search is None
@@ -307,8 +307,8 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
     return found
 
 
-def _transport(findings: Findings) -> LinearTransport:
-    """What predicted the pictures of the searches, and how far it was off; or why nothing did."""
+def transport_of(findings: Findings) -> LinearTransport:
+    """Return what predicted the pictures of the searches, and how far it was off; or why nothing did."""
     transport = findings.transport
     if transport is None:
         return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")

@@ -45,6 +45,7 @@ class Findings:
         rendered_because: why nothing did, in words.
         surface_refused: why matrices did and not light on surfaces, where that was tried.
         verification_renders: renders spent on choosing the sample count and on trials.
+        predicted_trials: trials whose picture was predicted.
     """
 
     first_look: tuple[Judgement, ...] = ()
@@ -67,6 +68,7 @@ class Findings:
     rendered_because: str = ""
     surface_refused: str = ""
     verification_renders: int = 0
+    predicted_trials: int = 0
 
     @property
     def spp(self) -> int:

@@ -1,6 +1,6 @@
 """Searches in which cameras move, by light kept on surfaces: cameras are searched, or vary by chance.
 
-Where environments vary by chance, too, they are those of a bank. Before the search, and every `EVERY` evaluations,
+Where environments vary by chance, too, they are those of a bank. Before the search, and within it,
 pictures are traced beside predicted ones. Where these are further off than two levels, and than a rendered evaluation's
 own noise, the light is found anew for the present base colours, if these are searched; where that was so the time
 before, too, or before the search, pictures are traced from there on, or predicted by matrices instead.
@@ -26,6 +26,7 @@ from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import BOUND, Conditions, Deviation, Predictor, Tick
 from advsearch.scene.formation import to_8_bit
+from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import plan
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
@@ -47,6 +48,8 @@ TOGETHER = 8
 AGAIN = 4
 """Evaluations of a random search from which on cameras and environments come again: nothing learns from them, and what
 each camera sees is known then."""
+MOST_RAYS = 1 << 21
+"""Rays of cameras of one launch."""
 
 
 def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise: bool) -> str | None:
@@ -73,6 +76,8 @@ class SurfaceLight(Predictor):
     Attributes:
         problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
+        at: (d,) the configuration whose light is found; None for the start.
+        places: which numbers of u move; None for those of cameras and environments.
         renewals: the evaluations at which light was found anew.
         ended: the evaluation from which on pictures are traced; None where they never are.
     """
@@ -80,13 +85,15 @@ class SurfaceLight(Predictor):
     way: ClassVar[str] = "surface light"
     problem: Problem
     steps: int
+    at: Tensor | None = None
+    places: Tensor | None = None
     deviations: list[Deviation] = field(default_factory=list)
     renewals: list[int] = field(default_factory=list)
     ended: int | None = None
     seconds: float = 0.0
     _renderer: SurfaceRenderer | None = None
     _lights: list[Tensor] = field(default_factory=list)
-    _compared: int = 0
+    _next: int = 0
     _looks: dict[tuple[int, int], list[Look]] = field(default_factory=dict)
 
     # ---- what a predictor says --------------------------------------------------------------------------------------
@@ -132,7 +139,8 @@ class SurfaceLight(Predictor):
     def prepare(self, tick: Tick = lambda samples: None) -> None:
         """Find the light, under every environment of the bank, and see how far its pictures are off."""
         begun, problem = time.perf_counter(), self.problem
-        start = problem.whole(problem.domain.start)
+        at = problem.domain.start if self.at is None else self.at
+        start = problem.whole(at)
         self._renderer = SurfaceRenderer(problem.renderer, start, seeds.stream(problem.seed, "surface light"))
         self._lights = [start[problem.domain.dim :]]
         if problem.conditions is not None:
@@ -140,14 +148,16 @@ class SurfaceLight(Predictor):
             self._lights = [stratified(problem.conditions, number, seed) for number in range(count)]
         with torch.no_grad():
             for numbers in self._lights:
-                self.renderer.light(self._inputs(torch.cat([problem.domain.start, numbers])))
+                self.renderer.light(self._inputs(torch.cat([at, numbers])))
                 tick(LIGHTS // len(self._lights))
         self.seconds += time.perf_counter() - begun
-        self._compare(problem.domain.start, 0)
+        self._compare(at, 0)
 
     @cached_property
     def _moving(self) -> Tensor:
-        """(d,) which numbers of u are those of cameras and environments."""
+        """(d,) which numbers of u move."""
+        if self.places is not None:
+            return torch.zeros(self.problem.domain.dim, dtype=torch.bool).index_fill_(0, self.places, True)
         return self._changing(CAMERAS | {MAP})[: self.problem.domain.dim]
 
     @cached_property
@@ -189,7 +199,8 @@ class SurfaceLight(Predictor):
         self._come_to(query)
 
     def answered(self, queries: Sequence[Query], traced: Evaluate) -> Iterator[Evaluation]:
-        """Answer queries of one search, by what else answers them from the first that is not predicted."""
+        """Answer queries of one search, or trials, by what else answers them from the first that is not predicted."""
+        ahead: dict[int, Tensor] = {}
         for place, query in enumerate(queries):
             self._come_to(query)
             end = self._end(query.kind)
@@ -197,9 +208,30 @@ class SurfaceLight(Predictor):
             if differences or (end is not None and query.number >= end):
                 yield from traced(queries[place:])
                 return
-            yield self.evaluate(query)
+            if place not in ahead and self.problem.conditions is None and not self._colored:
+                ahead = self._ahead(queries, place)
+            yield self.evaluate(query, ahead.get(place))
 
-    def evaluate(self, query: Query) -> Evaluation:
+    def _ahead(self, queries: Sequence[Query], place: int) -> dict[int, Tensor]:
+        """The pictures of the next queries, made at once; by the places of these."""
+        height, width = self.renderer.formation.resolution
+        some = [one.u for one in queries[place : place + max(1, MOST_RAYS // (height * width * RAYS))]]
+        with torch.no_grad():
+            pictures = self.renderer.pictures([self._inputs(u) for u in some], self.renderer.there, some)
+        return dict(enumerate(pictures, place))
+
+    def evaluate(self, query: Query, picture: Tensor | None = None) -> Evaluation:
+        """Answer a query; its picture (H, W, 3) may be there already."""
+        if query.phase is None:
+            whole = self.problem.whole(query.u)
+            with torch.no_grad():
+                shown = to_8_bit(self.renderer(whole) if picture is None else picture)
+            said = self.problem.judge(shown, whole)
+            return Evaluation.of(said, cost=0, predicted=RAYS, picture=shown if query.keep else None)
+        if picture is not None:
+            ((answer, _),), _ = self.problem.judged(lambda at: picture[None], [query.u], query.u, False)
+            kept = to_8_bit(picture) if query.keep else None
+            return replace(answer, cost=query.samples, predicted=RAYS, picture=kept)
         again = query.kind == "baseline" and self.problem.conditions is not None and not bool(self._moving.any())
         number = query.number % AGAIN if again else query.number
         drawn = self._drawn(replace(query, number=number), self.problem.draws)
@@ -211,7 +243,7 @@ class SurfaceLight(Predictor):
             query.gradient,
             TOGETHER,
         )
-        answer = replace(answer, cost=query.samples, predicted=1)
+        answer = replace(answer, cost=query.samples, predicted=RAYS)
         if not query.keep:
             return answer
         with torch.no_grad():
@@ -253,13 +285,15 @@ class SurfaceLight(Predictor):
     # ---- comparisons ------------------------------------------------------------------------------------------------
 
     def _come_to(self, query: Query) -> None:
-        """Compare where that is due."""
-        due = query.kind == "search" and query.phase == "search" and query.number % EVERY == 0
-        if due and query.number > self._compared and self.ended is None:
-            self._compared = query.number
+        """Compare where that is due: every `EVERY` evaluations where base colours are searched, as their light gets
+        old; otherwise after twice as many each time, until predictions are too far off."""
+        due = query.kind == "search" and query.phase == "search" and query.number >= (self._next or EVERY)
+        if due and self.ended is None:
             before = self.deviations[-1]
             found = self._compare(query.u, query.number)
-            if found.levels <= found.most:
+            good = found.levels <= found.most
+            self._next = query.number + (query.number if good and not self._colored else EVERY)
+            if good:
                 return
             if before.levels > before.most:
                 self.ended = query.number

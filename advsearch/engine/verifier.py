@@ -18,6 +18,7 @@ from advsearch.config.scene import SceneConfig
 from advsearch.engine.journal import Journal, digest
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages
+from advsearch.engine.transport import Predictor
 from advsearch.report.wording import count as plural
 from advsearch.scene.formation import next_count
 from advsearch.tasks import Judgement
@@ -63,17 +64,23 @@ class Verifier:
         """Trials of each group, at most."""
         return self.looks[-1]
 
-    def answers(self, queries: Sequence[Query], *, in_samples: bool = False) -> Iterator[Evaluation]:
+    def answers(
+        self, queries: Sequence[Query], *, in_samples: bool = False, predictor: Predictor | None = None
+    ) -> Iterator[Evaluation]:
         """Answer trials, keep their pictures, and count each once; the bar counts them, or their samples a pixel.
 
-        A trial of which the search for the sample count has the answer already is not rendered again.
+        A trial of which the search for the sample count has the answer already is not rendered again. A `predictor`
+        answers what it can in place of renders, which alone are counted.
         """
-        for query, answer in zip(queries, self.journal.answers(queries, self._made), strict=True):
+        made = self._made if predictor is None else partial(predictor.answered, traced=self._made)
+        for query, answer in zip(queries, self.journal.answers(queries, made), strict=True):
             if answer.picture is not None:
                 self.findings.pictures[query.kind, query.number] = answer.picture
             if in_samples and self.problem.conditions is None:
                 self._known[_asked(query)] = answer
-            if in_samples or _asked(query) not in self._known:
+            if answer.predicted:
+                self.findings.predicted_trials += 1
+            elif in_samples or _asked(query) not in self._known:
                 self._asked.add((query.kind, query.number))
             self.findings.verification_renders = len(self._asked)
             self.stages.progress.advance(query.spp if in_samples else 1, **self.journal.traced.told)
@@ -152,14 +159,22 @@ class Verifier:
             self.findings.clean = checked.clean_trials
         return checked
 
-    def trials(self, kind: str, configurations: Mapping[int, Tensor], *, sought: bool = True) -> Iterator[Judgement]:
-        """Try configurations once each, every one with a seed of its own, by their numbers among those of a kind."""
+    def trials(
+        self,
+        kind: str,
+        configurations: Mapping[int, Tensor],
+        *,
+        sought: bool = True,
+        predictor: Predictor | None = None,
+    ) -> Iterator[Judgement]:
+        """Try configurations once each, every one with a seed of its own, by their numbers among those of a kind; a
+        `predictor` as for `answers`."""
         problem, queries = self.problem, list[Query]()
         for number, u in configurations.items():
             seed = seeds.stream(problem.seed, kind, number)
             values = problem.describe(u, seed) if problem.domain.dim <= MANY else {}
             queries.append(Query(u, seed, kind, number, spp=self.findings.spp, values=values, sought=sought))
-        for answer in self.answers(queries):
+        for answer in self.answers(queries, predictor=predictor):
             yield answer.said
 
     def average(self, count: int) -> None:

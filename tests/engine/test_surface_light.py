@@ -113,12 +113,12 @@ def viewpoints(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AttackRe
 
 
 def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoints: tuple[Path, AttackResult]) -> None:
-    """Two searches of 40 pictures, eight traced ones of each ranking; seven comparisons of two places. Rows say which
-    pictures were traced."""
+    """Two searches of 40 pictures, eight traced ones of each ranking; comparisons of two places after 0, 6, 12 and 24
+    pictures. Rows say which were traced."""
     told, renders = viewpoints[1].summary.transport, viewpoints[1].summary.renders
     assert told is not None and (told.way, told.reason, told.conditions) == ("surface light", None, None)
     assert (renders["products"], renders["baseline"]) == (80, 8)
-    assert renders["search"] == 8 + 7 * surface_light.COMPARED * 3
+    assert renders["search"] == 8 + 4 * surface_light.COMPARED * 3
     with Store(viewpoints[0] / STORE, read_only=True) as store:
         spp = {(row.phase, row.spp, row.renders) for kind in ("search", "baseline") for row in store.rows(kind)}
     assert spp == {("search", None, 0), ("ranking", 8, 1)}

@@ -12,11 +12,13 @@ import pytest
 import torch
 
 import advsearch
+from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import executor_for
+from advsearch.engine.attack_parts import executor_for, problem_of
 from advsearch.engine.loading import Scene
+from advsearch.engine.surface_light import reason_against
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.reference import load
@@ -135,6 +137,16 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
         assert isinstance(one, TextureLesson) and isinstance(other, TextureLesson)
         assert len(other.numbers) == len(one.numbers) + 6 and not torch.equal(one.plain, other.plain)
     shutil.rmtree(run.path)
+
+
+def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
+    """Its searches are those of `attack`; a quick one looks at too few pictures."""
+    config = HardenConfig(**{**SMALL, "object": "mug", "model": "reference", "controls": "camera", "epsilon": None})
+    work = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
+    name, scene = work.splits["held out"].scene(0)
+    problem = problem_of(work._of(("camera",), name), scene, work.model)
+    against = [reason_against(problem, steps, make_policy("auto"), True) for steps in (config.steps, QUICK["steps"])]
+    assert against == [None, "light on surfaces pays from 32 pictures on"]
 
 
 @pytest.mark.slow

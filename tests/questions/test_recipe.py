@@ -13,17 +13,18 @@ import pytest
 
 import advsearch
 from advsearch.api import carry_out, subruns
-from advsearch.attacks import clopper_pearson
+from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
-from advsearch.config import SweepConfig
+from advsearch.config import AttackConfig, SweepConfig
+from advsearch.engine.attack_parts import parts_of, problem_of_parts
+from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.explanations.answered import Answered
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult
-from advsearch.questions.recipe.description import Recipe, check_figures, read_recipe, recipe_names, titles
-from advsearch.questions.recipe.figures import FIGURES, compute, draw_figure, heat_map, read_options
-from advsearch.questions.recipe.figures.answers import fitting
-from advsearch.questions.recipe.parts import planned
+from advsearch.questions.recipe.description import Recipe, check_figures, planned, read_recipe, recipe_names, titles
+from advsearch.questions.recipe.figures import FIGURES, accuracy, compute, draw_figure, read_options
+from advsearch.questions.recipe.figures.given import fitting
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, count_of
 from advsearch.questions.recipe.words import figure_table, told_once
@@ -224,6 +225,18 @@ def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> Non
         carrying_out._check(described, config)
 
 
+def test_the_recipe_for_viewpoints_searches_predicted_pictures_and_counts_rendered_ones() -> None:
+    runs = {
+        one.part: one.config
+        for one in planned(read_recipe("viewpoints"), RecipeConfig(recipe="viewpoints", object="mug"))
+    }
+    search, drawn = runs["search"], [runs["all"], runs["worst"]]
+    assert isinstance(search, AttackConfig) and search.steps is not None
+    problem, _ = problem_of_parts(parts_of(search))
+    assert reason_against(problem, search.steps, make_policy(search.policy_name), search.specialise) is None
+    assert [isinstance(one, SweepConfig) and one.specialise for one in drawn] == [False, False]
+
+
 def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(TINY.replace("spp: 1", "spp: 1, model: 'os.path:join'"))
@@ -345,7 +358,7 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
 def test_of_few_answers_it_is_not_said_that_none_is_right() -> None:
     def told(counts: dict[str, tuple[int, int]]) -> list[str]:
         cells = [count_of(name, *one) for name, one in counts.items()]
-        return heat_map._said(cells, "objects", "environments")
+        return accuracy._said_pairs(cells, "objects", "environments")
 
     few = told({"mug with noon": (0, 4), "bowl with noon": (3, 4)})
     assert few[-1] == "1 of the pairs without a right answer has under 20 configurations: too few to say."

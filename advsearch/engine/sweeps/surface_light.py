@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.surface_light import levels_off, over_all
+from advsearch.engine.surface_light import MOST_RAYS, levels_off, over_all
 from advsearch.engine.sweeps.predicting import PAYS, Groups, SweptPredictor
 from advsearch.engine.transport import BOUND, Deviation
 from advsearch.files import scaled
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.mitsuba_backend.surface import RAYS
+from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Light
 from advsearch.scene.surface.plan import varied, why_not_kept
 from advsearch.scene.surface.renderer import SurfaceRenderer
@@ -38,8 +39,20 @@ ARRANGED_BYTES = 50_000_000
 """Memory of an arrangement, about."""
 LIT_BYTES = 4_000_000
 """Memory of the light of an environment beside its map, about."""
-MOST_RAYS = 1 << 21
-"""Rays of cameras of one launch."""
+
+
+def pays_from(renderer: Renderer, spp: int, checks: int, arrangements: float = 1.0) -> int:
+    """Return how many pictures under one light have to be wanted for it to pay.
+
+    Args:
+        renderer: the one that traces.
+        spp: samples a pixel of a rendered picture.
+        checks: pictures that are compared.
+        arrangements: what texels see is found so many times for each light.
+    """
+    height, width = renderer.formation.resolution
+    samples = (ARRANGED * arrangements + LIT) / (height * width) + checks * (2 * CHECK_SPP + spp)
+    return math.ceil(PAYS * samples / (spp - SHOWN))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +88,7 @@ class SweptSurfaceLight(SweptPredictor):
         if not self.specialise:
             return "nothing is left out"
         groups, arranged = self._groups, self._arrangements
-        height, width = self.renderer.formation.resolution
-        found = (ARRANGED * arranged.count / groups.count + LIT) / (height * width)
-        samples = found + self._checks * (2 * CHECK_SPP + self.spp)
-        least = math.ceil(PAYS * samples / (self.spp - SHOWN))
+        least = pays_from(self.renderer, self.spp, self._checks, arranged.count / groups.count)
         if groups.size < least:
             return f"light on surfaces pays where {least} pictures differ in the camera alone; here {groups.size} do"
         reason = why_not_kept(self.renderer)

@@ -25,9 +25,18 @@ from advsearch.explanations.answered import TRIAL, WORKERS, Answered, rows_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.recipe.answer import RecipeFigure, RecipePart, RecipeResult
-from advsearch.questions.recipe.description import ANY, Recipe, check_figures, read_recipe, recipe_of
+from advsearch.questions.recipe.description import (
+    ANY,
+    Planned,
+    Recipe,
+    check_figures,
+    made_of,
+    names_listed,
+    planned,
+    read_recipe,
+    recipe_of,
+)
 from advsearch.questions.recipe.figures import compute, draw_figure, read_options
-from advsearch.questions.recipe.parts import Planned, made_of, names_listed, planned
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, photographs_of
 from advsearch.questions.sweep.carry_out import job_of

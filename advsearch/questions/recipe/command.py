@@ -30,7 +30,7 @@ class _Recipe(QuestionCommand):
 
     def file(self, args: argparse.Namespace) -> Path | None:
         """Return the recipe if it is a file."""
-        from advsearch.questions.recipe.description import is_file_name
+        from advsearch.questions.recipe.description import is_file_name  # it brings torch, which takes a second
 
         return Path(args.recipe) if is_file_name(args.recipe) else None
 

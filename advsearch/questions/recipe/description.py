@@ -1,21 +1,31 @@
-"""A recipe as its YAML file describes it: runs of the commands there are, and figures of what they answer."""
+"""A recipe as its YAML file describes it, and the runs that it comes to.
+
+A part is carried out once for each object, as a run of its command; figures are made of what these answer.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from advsearch import seeds
+from advsearch.config import CONFIGS
+from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.explanations.answered import ANSWER, GROUP, PART, PHOTOGRAPHS
 from advsearch.questions.recipe.figures import read_options
-from advsearch.questions.recipe.figures.base import Options
-from advsearch.settings import read_yaml
-from advsearch.settings.configuration import PLACE
+from advsearch.questions.recipe.settings import RecipeConfig
+from advsearch.questions.recipe.table import Options
+from advsearch.runs.directory import default_name
+from advsearch.settings import read_yaml, split_names
+from advsearch.settings.configuration import PLACE, SettingsError
 from advsearch.settings.yaml_files import merged
 
 COMMANDS = ("attack", "sweep")
@@ -23,8 +33,6 @@ COMMANDS = ("attack", "sweep")
 
 OWN = (*PLACE, "object", "seed", "threads", "deterministic", "label")
 """Settings that a part has from the recipe's command and may not say itself."""
-
-"""What stands for the part of photographs, which none renders."""
 
 MOST_PARTS, MOST_FIGURES = 64, 32
 
@@ -137,7 +145,9 @@ class Recipe(_Described):
 
 def recipe_names() -> tuple[str, ...]:
     """Return the names of the bundled recipes."""
-    return tuple(sorted(path.name.removesuffix(".yaml") for path in _folder().iterdir() if path.name.endswith(".yaml")))
+    return tuple(
+        sorted(path.name.removesuffix(".yaml") for path in _bundled().iterdir() if path.name.endswith(".yaml"))
+    )
 
 
 def titles() -> dict[str, str]:
@@ -153,7 +163,7 @@ def recipe_yaml(name: str) -> str:
     """
     if name not in recipe_names():
         raise UnknownNameError("recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path.")
-    return str((_folder() / f"{name}.yaml").read_text(encoding="utf-8"))
+    return str((_bundled() / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
 def read_recipe(name: str) -> Recipe:
@@ -169,7 +179,7 @@ def read_recipe(name: str) -> Recipe:
     if is_file_name(name):
         return recipe_of(read_yaml(name), name)
     recipe_yaml(name)
-    with resources.as_file(_folder() / f"{name}.yaml") as path:
+    with resources.as_file(_bundled() / f"{name}.yaml") as path:
         return recipe_of(read_yaml(path), name)
 
 
@@ -200,7 +210,7 @@ def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
         raise FileFormatError(f"{where}: expected a recipe, got {type(error).__name__}") from None
 
 
-def _folder() -> Any:
+def _bundled() -> Any:
     return resources.files("advsearch.questions.recipe")
 
 
@@ -255,3 +265,93 @@ def _named(options: Options) -> list[tuple[str, str]]:
 
 def _has(columns: Collection[str], column: str) -> bool:
     return column in columns or f"{column.partition('.')[0]}.{ANY}" in columns
+
+
+MOST_RUNS = 1000
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One run of a recipe.
+
+    Attributes:
+        name: of its folder.
+        part: that it belongs to.
+        config: what it does.
+        around: the folder of the run whose answer says what is drawn; None where the settings say it.
+    """
+
+    name: str
+    part: str
+    config: SceneConfig
+    around: str | None
+
+
+def planned(recipe: Recipe, config: RecipeConfig) -> list[Planned]:
+    """Return the runs of a recipe in the order in which they are carried out.
+
+    A run is about one object. Where a part's command takes one environment or one model only, it has a run for each.
+
+    Raises:
+        InputError: a part has a setting that its command has not, or too many runs; the message names the part.
+    """
+    chosen = made_of(recipe, config)
+    runs = [one for name in chosen.parts for one in _runs(chosen, name, config)]
+    if len(runs) > MOST_RUNS:
+        raise InputError(f"{config.recipe}: expected at most {MOST_RUNS} runs, got {len(runs)}; name fewer objects")
+    return runs
+
+
+def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
+    """Return the recipe as it was asked for: quick or not, with the objects, environments and models of `config`."""
+    chosen = recipe.made_quick() if config.quick else recipe
+    names = ("object", "environment", "model", "labels", "prompt", "task", "up", "resolution")
+    given = {name: value for name in names if (value := getattr(config, name)) is not None}
+    settings: Settings = {**chosen.settings, **given}
+    if "object" not in settings:
+        raise InputError(f"object: expected one, since {config.recipe} names none")
+    return chosen.model_copy(update={"settings": settings})
+
+
+def names_listed(value: object) -> list[str]:
+    """Return names that stand in a list, or in a text with commas between them."""
+    return [str(one) for one in value] if isinstance(value, (list, tuple)) else list(split_names(str(value)))
+
+
+def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[Planned]:
+    part, kind = recipe.parts[name], CONFIGS[recipe.parts[name].command]
+    settings = {**recipe.settings, **part.settings}
+    several = kind.several if issubclass(kind, SceneConfig) and part.command != "attack" else ()
+    axes = {
+        axis: names_listed(settings.get(axis) or default)
+        for axis, default in (("object", ""), ("environment", DEFAULT_ENVIRONMENT), ("model", "reference"))
+        if axis not in several or axis == "object"
+    }
+    for number, values in enumerate(product(*axes.values())):
+        one = dict(zip(axes, values, strict=True))
+        words = [value for axis, value in one.items() if axis == "object" or len(axes[axis]) > 1]
+        where, stream = f"{config.recipe}: parts: {name}", f"{part.drawn_as or name} {number}"
+        made = _config(part, {**settings, **one}, where, config, stream)
+        yield Planned(_folder(name, number, words), name, made, part.around and _folder(part.around, number, words))
+
+
+def _config(part: Part, settings: Settings, where: str, config: RecipeConfig, stream: str) -> SceneConfig:
+    """The configuration of one run; its seed is its own, so that no two runs draw the same."""
+    label = config.label_of(str(settings["object"]))
+    own: Settings = {"seed": seeds.stream(config.seed, f"recipe {stream}")}
+    own |= {"threads": config.threads} if not config.deterministic else {"deterministic": True}
+    own |= {} if label is None else {"label": label}
+    try:
+        made = CONFIGS[part.command](**{**settings, **own})
+    except SettingsError as error:
+        raise SettingsError(error.problems, where) from None
+    except UnknownNameError:
+        raise
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    assert isinstance(made, SceneConfig)
+    return made
+
+
+def _folder(part: str, number: int, words: Sequence[str]) -> str:
+    return f"{part}-{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from advsearch.report.notebook import InNotebook
+from advsearch.runs.results.attack import LinearTransport
 from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, JsonFloat, SceneResult, having
 
 
@@ -56,7 +57,12 @@ class RegionResult(InNotebook, GrownRegion, SceneResult):
     image_formation: Formation
     clean: CleanScene
     warnings: list[str] = Field(description="sentences that a reader has to know")
-    renders: Annotated[dict[str, int], having("verification")] = Field(description="of the `verification`: everything")
+    transport: LinearTransport | None = Field(
+        default=None, description="what predicted pictures from new viewpoints; absent where no camera moves"
+    )
+    renders: Annotated[dict[str, int], having("verification")] = Field(
+        description="of the `verification`: all that were rendered; of the `products`: all that were predicted"
+    )
 
     @property
     def brief(self) -> str:

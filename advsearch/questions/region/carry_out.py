@@ -19,21 +19,26 @@ from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.journal import Journal
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel
+from advsearch.engine.outcome import transport_of
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Stages
+from advsearch.engine.record import Findings, Stages
 from advsearch.engine.sharing import Shared
+from advsearch.engine.surface_light import COMPARED, LIGHTS, SurfaceLight
+from advsearch.engine.sweeps.surface_light import pays_from
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult
-from advsearch.questions.region.growing import ATTEMPTS, MOST_PROBED, GrownBox, grow
+from advsearch.questions.region.growing import ATTEMPTS, MOST_PROBED, USUAL, GrownBox, grow
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.questions.region.words import map_figure
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
+from advsearch.scene.surface import plan
+from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.settings import split_names
 from advsearch.viewer.pages import write_page
 
@@ -48,6 +53,7 @@ class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
     vary: Names | None
     samples: int
     map: int
+    specialise: bool
     verify_spp: int | None
 
 
@@ -65,10 +71,12 @@ class Varied:
     Attributes:
         names: of each.
         places: (k,) where they lie in u.
+        groups: of numbers that they belong to.
     """
 
     names: tuple[str, ...]
     places: Tensor
+    groups: frozenset[str]
 
 
 @asks(RegionConfig, RegionKeywords)
@@ -113,6 +121,7 @@ def region_from_config(
     centre = _centre(problem, config)
     with RunDirectory.of(config, resumed) as run:
         verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config), stages)
+        findings = verifier.findings
         try:
             with interruptible():
                 answer, ending = _answer(verifier, config, varied, centre, run), "done"
@@ -131,7 +140,8 @@ def region_from_config(
             image_formation=Formation.of(problem.renderer.formation),
             clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
             warnings=warnings,
-            renders={"verification": verifier.findings.verification_renders},
+            transport=transport_of(findings) if findings.transport or findings.rendered_because else None,
+            renders=_renders(findings),
             seconds={**stages.seconds, "total": stages.total},
             seed=config.seed,
             command_line=config.command_line(),
@@ -146,6 +156,7 @@ def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Te
     problem, stages = verifier.problem, verifier.stages
     verifier.choose_spp({"centre": centre})
     verdict, spp = _verdict(verifier, centre), verifier.findings.spp
+    light = _light(verifier, config, varied, centre)
 
     def at(values: Tensor) -> Tensor:
         u = centre.clone()
@@ -165,7 +176,8 @@ def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Te
         checking = True
 
     def same(values: Tensor, number: int) -> bool:
-        (trial,) = verifier.trials("region", {number: at(values)}, sought=False)
+        predictor = None if checking else light
+        (trial,) = verifier.trials("region", {number: at(values)}, sought=False, predictor=predictor)
         return trial.success == verdict and not trial.not_a_number
 
     seed = seeds.stream(config.seed, "region")
@@ -180,8 +192,38 @@ def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Te
         interval=grown.interval,
         volume=grown.volume,
         spp=spp,
-        map=_map(verifier, config.map, at, box, run) if config.map else None,
+        map=_map(verifier, config.map, at, box, run, light) if config.map else None,
     )
+
+
+def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor) -> SurfaceLight | None:
+    """What predicts pictures while the box grows, and those of the map, where a camera moves and that pays; fresh
+    samples of the box are rendered (docs/surface-light.md)."""
+    problem, stages, findings = verifier.problem, verifier.stages, verifier.findings
+    moved = plan.varied(problem.renderer, varied.groups)
+    if not config.specialise or not moved & CAMERAS or not moved <= FREE:
+        return None
+    wanted = USUAL * len(varied.names) + config.map**2
+    least = pays_from(problem.renderer, findings.spp, COMPARED)
+    reason = plan.why_not_kept(problem.renderer)
+    if reason is None and wanted < least:
+        reason = f"light on surfaces pays from {least} pictures on"
+    if reason is None:
+        stages.begin("transport", "finding the light on surfaces", LIGHTS, hint="`specialise=false` leaves it out")
+        light = SurfaceLight(problem, 0, at=centre, places=varied.places)
+        light.prepare(stages.progress.advance)
+        findings.transport, reason = light, light.too_far_off
+        if reason is None:
+            return light
+    findings.transport, findings.rendered_because = None, reason
+    return None
+
+
+def _renders(findings: Findings) -> dict[str, int]:
+    """How many pictures were rendered, comparisons included, and how many were predicted."""
+    traced = findings.verification_renders + (findings.transport.traced if findings.transport else 0)
+    predicted = {"products": findings.predicted_trials} if findings.predicted_trials else {}
+    return {"verification": traced, **predicted}
 
 
 def _budget(around: str) -> dict[str, object]:
@@ -207,11 +249,13 @@ def _centre(problem: Problem, config: RegionConfig) -> Tensor:
 def _varied(problem: Problem, config: RegionConfig) -> Varied:
     """Where the parameters lie that the box grows in."""
     places: dict[str, Tensor] = {}
+    owners: dict[str, str] = {}
     for group in problem.space.groups:
         if group.options:
             continue
         for number, place in enumerate(torch.arange(group.begin, group.begin + group.size)):
-            places[group.name + (f".{number}" if group.size > 1 else "")] = place[None]
+            name = group.name + (f".{number}" if group.size > 1 else "")
+            places[name], owners[name] = place[None], group.name
     names = tuple(places) if config.vary is None else split_names(config.vary)
     for name in names:
         if name not in places:
@@ -220,7 +264,7 @@ def _varied(problem: Problem, config: RegionConfig) -> Varied:
         raise InputError(f"vary: expected 1 to {MOST} parameters, got {len(names)}; name some of {', '.join(places)}")
     if config.map and len(names) != 2:
         raise InputError(f"map: expected two parameters in `vary`, got {len(names)}: {', '.join(names)}")
-    return Varied(names, torch.cat([places[name] for name in names]))
+    return Varied(names, torch.cat([places[name] for name in names]), frozenset(owners[name] for name in names))
 
 
 def _verdict(verifier: Verifier, centre: Tensor) -> bool:
@@ -271,7 +315,9 @@ def _number(described: Any, number: str) -> float:
     return float(value[int(number)] if number else value)
 
 
-def _map(verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory) -> MarginMap:
+def _map(
+    verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory, light: SurfaceLight | None
+) -> MarginMap:
     """The margin on a grid over two parameters, as numbers and as a picture."""
     hint = f"{side * side} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
@@ -280,7 +326,7 @@ def _map(verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: Ru
     scores = list[float]()
     for numbers in batches(0, side * side, most_at_once(verifier.problem.domain.dim)):
         places = {one: at(torch.stack([steps[one % side], steps[one // side]])) for one in numbers}
-        scores += [trial.score for trial in verifier.trials("map", places, sought=False)]
+        scores += [trial.score for trial in verifier.trials("map", places, sought=False, predictor=light)]
     margins = [scores[begin : begin + side] for begin in range(0, len(scores), side)]
     ends = [verifier.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []

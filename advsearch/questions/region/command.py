@@ -30,7 +30,7 @@ class _Region(QuestionCommand):
                     "advsearch region: expected --object NAME, or --around RUN; see advsearch region --help"
                 )
             return super().config(args)
-        from advsearch.cli.flags import config_from
+        from advsearch.cli.flags import config_from  # settings take a third of a second, and help needs none
         from advsearch.config import AttackConfig
         from advsearch.questions.region.settings import RegionConfig
 

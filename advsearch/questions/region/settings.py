@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from advsearch.config.attack import AttackConfig
+from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import setting, setting_as_in
 
@@ -48,6 +49,13 @@ class RegionConfig(SceneConfig):
         unit="points",
         ge=0,
         le=512,
+    )
+    specialise: bool = setting_as_in(
+        DerivativeConfig,
+        "specialise",
+        group="region",
+        description="predict pictures from new viewpoints while the box grows, and those of the map",
+        switched="render every picture",
     )
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", group="region", description="samples per pixel")
 

@@ -11,19 +11,12 @@ from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, UnknownNameError
 from advsearch.questions.recipe.answer import RecipeFigure
+from advsearch.questions.recipe.figures.accuracy import BARS, CORRUPTION_ERROR, HEAT_MAP, POINTS, SURFACE
 from advsearch.questions.recipe.figures.agreement import AGREEMENT
-from advsearch.questions.recipe.figures.answers import ANSWERS
-from advsearch.questions.recipe.figures.bars import BARS
-from advsearch.questions.recipe.figures.base import FigureKind, Options
-from advsearch.questions.recipe.figures.corruptions import CORRUPTION_ERROR
-from advsearch.questions.recipe.figures.cues import CUES
-from advsearch.questions.recipe.figures.curve import CURVE
-from advsearch.questions.recipe.figures.heat_map import HEAT_MAP
-from advsearch.questions.recipe.figures.points import POINTS
-from advsearch.questions.recipe.figures.scaling import SCALING
-from advsearch.questions.recipe.figures.surface import SURFACE
+from advsearch.questions.recipe.figures.along import CURVE, SCALING
+from advsearch.questions.recipe.figures.given import ANSWERS, CUES
 from advsearch.questions.recipe.figures.ternary import TERNARY
-from advsearch.questions.recipe.table import Table
+from advsearch.questions.recipe.table import FigureKind, Options, Table
 from advsearch.report.drawing import Figures, drawn
 
 MODEL = "model"

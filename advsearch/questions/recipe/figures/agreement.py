@@ -15,9 +15,8 @@ from pydantic import Field
 from advsearch.errors import InputError
 from advsearch.explanations.answered import PHOTOGRAPHS, Answered
 from advsearch.questions.recipe.answer import AgreementCount, AgreementFigure, AgreementSeries
-from advsearch.questions.recipe.figures.base import FigureKind, Options, rate_with_interval
-from advsearch.questions.recipe.figures.curve import COLOURS, MARKS
-from advsearch.questions.recipe.table import Table, count_of
+from advsearch.questions.recipe.figures.along import COLOURS, MARKS
+from advsearch.questions.recipe.table import FigureKind, Options, Table, count_of, rate_with_interval
 from advsearch.report.phrases import percent
 
 NO_PHOTOGRAPHS = (

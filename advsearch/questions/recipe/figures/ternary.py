@@ -12,8 +12,7 @@ from pydantic import Field
 
 from advsearch.explanations.answered import Answered
 from advsearch.questions.recipe.answer import MixtureLead, TernaryAnswer, TernaryCell, TernaryFigure
-from advsearch.questions.recipe.figures.base import CONFIDENCE, FigureKind, Options, extremes
-from advsearch.questions.recipe.table import Table, count_of, most_frequent
+from advsearch.questions.recipe.table import CONFIDENCE, FigureKind, Options, Table, count_of, extremes, most_frequent
 from advsearch.questions.recipe.words import bare
 from advsearch.report.phrases import percent
 
@@ -184,7 +183,7 @@ def _draw(made: TernaryFigure, figure: Any, run: Path) -> None:
 
 
 def _panel(axes: Any, one: TernaryAnswer, made: TernaryFigure) -> Any:
-    from matplotlib.collections import PolyCollection
+    from matplotlib.collections import PolyCollection  # matplotlib takes half a second
 
     values = [_value(cell, bool(made.leads)) for cell in one.cells]
     places = [[_place(corner) for corner in cell.corners] for cell in one.cells]

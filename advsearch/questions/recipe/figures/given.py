@@ -1,4 +1,4 @@
-"""Whether the model answers by shape or by texture, where every object has every texture."""
+"""Which answers are given: the most frequent ones for each value of something; whether they go by shape or texture."""
 
 from __future__ import annotations
 
@@ -12,12 +12,101 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.explanations.answered import Answered
-from advsearch.questions.recipe.answer import CuesFigure, CuesRow, NamedCount
-from advsearch.questions.recipe.figures.base import FigureKind, Options, extremes, rate_with_interval
-from advsearch.questions.recipe.table import Table, count_of, counted
-from advsearch.report.drawing import BLUE, RED
+from advsearch.questions.recipe.answer import AnswersFigure, AnswersRow, CuesFigure, CuesRow, GivenAnswer, NamedCount
+from advsearch.questions.recipe.table import (
+    FigureKind,
+    Options,
+    Table,
+    count_of,
+    counted,
+    extremes,
+    most_frequent,
+    plural,
+    rate_with_interval,
+)
+from advsearch.report.drawing import BLUE, GREY, RED
 from advsearch.report.phrases import percent
+from advsearch.report.wording import interval_text
 from advsearch.runs.results.base import Interval
+
+LETTERS = 85
+"""Letters that a bar of the whole width has room for."""
+FEWEST_LETTERS = 4
+"""Of a name that is cut short."""
+
+
+class AnswersOptions(Options):
+    """Options of the most frequent answers.
+
+    Attributes:
+        by: what the rows differ in: object, material.which, ...
+        most: answers of each row.
+    """
+
+    by: str
+    most: int = Field(default=4, ge=1, le=10)
+
+
+def _compute_given(table: Table, options: AnswersOptions) -> AnswersFigure:
+    rows = [_row_given(name, inside, options.most) for name, inside in table.by(options.by).items()]
+    return AnswersFigure(
+        figure="answers",
+        title=options.title or f"Most frequent answers by {options.by}",
+        text=_said(rows, plural(options.by)),
+        by=options.by,
+        rows=rows,
+    )
+
+
+def _row_given(name: str, rows: list[Answered], most: int) -> AnswersRow:
+    answers = [
+        GivenAnswer(
+            **count_of(answer, number, len(rows)).model_dump(),
+            right=sum(row.correct for row in rows if row.answer == answer),
+        )
+        for answer, number in most_frequent(rows)[:most]
+    ]
+    return AnswersRow(**counted(name, rows).model_dump(), answers=answers)
+
+
+def _said(rows: list[AnswersRow], thing: str) -> list[str]:
+    wrong = [row for row in rows if row.answers and 2 * row.answers[0].right < row.answers[0].correct]
+    said = [f"For {len(rows) - len(wrong)} of {len(rows)} {thing} the most frequent answer is mostly a right one."]
+    return said + [f"For {row.name} it is {_given(row.answers[0])}." for row in wrong]
+
+
+def _given(one: GivenAnswer) -> str:
+    share = f"{percent(one.accuracy)}, 95 % interval {interval_text(one.interval)}"
+    return f"{one.name}, given in {one.correct} of {one.configurations} ({share}) and right in {one.right} of these"
+
+
+def fitting(name: str, share: float) -> str:
+    """Return as much of an answer's name as a bar has room for: the first of several names, or its beginning."""
+    room, first = int(share * LETTERS), name.partition(",")[0]
+    fits = next((one for one in (name, first) if len(one) <= room), None)
+    return fits if fits is not None else f"{first[: room - 1].rstrip()}…" if room > FEWEST_LETTERS else ""
+
+
+def _draw_given(made: AnswersFigure, figure: Any, run: Path) -> None:
+    axes = figure.subplots()
+    for place, row in enumerate(reversed(made.rows)):
+        left = 0.0
+        for one in row.answers:
+            share = one.accuracy or 0.0
+            colour = BLUE if 2 * one.right >= one.correct else RED
+            axes.barh(place, share, left=left, color=colour, alpha=0.5, height=0.72, edgecolor="white")
+            axes.text(left + share / 2, place, fitting(one.name, share), ha="center", va="center", fontsize=7)
+            left += share
+        axes.barh(place, max(1.0 - left, 0.0), left=left, color=GREY, alpha=0.15, height=0.72)
+    axes.set_yticks(range(len(made.rows)), [row.name for row in reversed(made.rows)])
+    axes.set(xlabel="share of answers; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
+    axes.set_title(made.title)
+
+
+ANSWERS = FigureKind(
+    AnswersOptions, AnswersFigure, _compute_given, _draw_given, lambda made: (6.4, 1.2 + 0.3 * len(made.rows))
+)
+
 
 SEED, RESAMPLES = 0, 2000
 """Of the answers that predict, and of the bootstrap."""
@@ -40,8 +129,10 @@ class CuesOptions(Options):
     classes: dict[str, list[str]] = Field(default_factory=dict)
 
 
-def _compute(table: Table, options: CuesOptions) -> CuesFigure:
-    rows = [_row(name, inside, options.classes.get(name, [])) for name, inside in table.by(options.texture).items()]
+def _compute_cues(table: Table, options: CuesOptions) -> CuesFigure:
+    rows = [
+        _row_cues(name, inside, options.classes.get(name, [])) for name, inside in table.by(options.texture).items()
+    ]
     cells = _cells(table, options)
     total = sum(one.answers for one in cells)
     predicted = [
@@ -62,7 +153,7 @@ def _compute(table: Table, options: CuesOptions) -> CuesFigure:
     )
 
 
-def _row(name: str, rows: list[Answered], classes: list[str]) -> CuesRow:
+def _row_cues(name: str, rows: list[Answered], classes: list[str]) -> CuesRow:
     return CuesRow(**counted(name, rows).model_dump(), textured=sum(_names(row.answer, classes) for row in rows))
 
 
@@ -163,7 +254,7 @@ def _hardest(rows: list[CuesRow]) -> list[str]:
     return extremes(rows, "The hardest texture", "the easiest", "textures")
 
 
-def _draw(made: CuesFigure, figure: Any, run: Path) -> None:
+def _draw_cues(made: CuesFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     rows = sorted(made.rows, key=lambda one: one.accuracy or 0.0)
     for place, one in enumerate(rows):
@@ -184,4 +275,4 @@ def _draw(made: CuesFigure, figure: Any, run: Path) -> None:
     figure.legend(loc="outside lower center", ncols=2, title="the answer names")
 
 
-CUES = FigureKind(CuesOptions, CuesFigure, _compute, _draw, lambda made: (6.0, 1.7 + 0.27 * len(made.rows)))
+CUES = FigureKind(CuesOptions, CuesFigure, _compute_cues, _draw_cues, lambda made: (6.0, 1.7 + 0.27 * len(made.rows)))

@@ -1,0 +1,91 @@
+"""Regions over viewpoints: pictures are predicted while the box grows, and fresh samples of it are rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stand_ins import Impatient, rows
+
+from advsearch.engine import surface_light
+from advsearch.questions.region import carry_out, growing
+from advsearch.questions.region.answer import RegionResult
+from advsearch.questions.region.settings import RegionConfig
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
+from advsearch.scene.surface import arrangement, texels
+
+SMALL: dict[str, Any] = {
+    "object": "mug", "resolution": 32, "controls": "camera", "vary": "camera.azimuth,camera.elevation", "samples": 8,
+    "map": 3, "verify_spp": 16, "deterministic": True,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def coarse() -> Iterator[None]:
+    """Few texels, rays and pictures; light that always pays and is good enough."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(texels, "GROUND", 32)
+        for module, name, value in (
+            (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (surface_light, "CHECK_SPP", 4),
+            (surface_light, "BOUND", 50.0), (growing, "MOST_PROBED", 20), (carry_out, "pays_from", lambda *_: 1),
+        ):  # fmt: skip
+            patched.setattr(module, name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RegionResult]:
+    """A run that nobody disturbed, and its result."""
+    run = tmp_path_factory.mktemp("region") / "run"
+    return run, carry_out.region_from_config(RegionConfig(**SMALL, run=str(run)))
+
+
+def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Path, RegionResult]) -> None:
+    """Rows say which: a predicted one has the four rays of a pixel, and no seed."""
+    run, result = whole
+    assert result.transport is not None and result.transport.way == "surface light"
+    with Store(run / STORE, read_only=True) as store:
+        found = [(kind, one.seed is None, one.spp) for kind in ("region", "map") for one in store.rows(kind)]
+    predicted, checked = found.count(("region", True, 4)), found.count(("region", False, 16))
+    assert result.samples == 8 and checked % 8 == 0 and checked >= 8
+    assert predicted and found.count(("map", True, 4)) == 9 and len(found) == predicted + checked + 9
+    assert result.renders["products"] == predicted + 9
+    compared = 3 * carry_out.COMPARED
+    assert result.renders["verification"] == carry_out.AT_CENTRE + checked + compared
+
+
+class Stopping(Impatient):
+    """Presses Ctrl-C after so many pictures of growing."""
+
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        self._searching = name == "growing the box"
+
+
+def test_a_region_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, RegionResult], tmp_path: Path) -> None:
+    """Light is found again; pictures that were predicted are counted as such."""
+    config = RegionConfig(**SMALL, run=str(tmp_path / "run"))
+    assert carry_out.region_from_config(config, progress=Stopping(9)).ending == "interrupted"
+    result = carry_out.region_from_config(config, resumed=tmp_path / "run")
+    assert rows(tmp_path / "run") == rows(whole[0]) and result.renders == whole[1].renders
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        ({"specialise": False}, None),
+        ({"controls": "camera,pose", "vary": "camera.azimuth,pose.yaw"}, None),
+        ({}, "light on surfaces pays from 999 pictures on"),
+    ],
+)
+def test_what_is_rendered_says_why(
+    more: dict[str, Any], reason: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is said where that was asked for, or where more moves than a camera."""
+    monkeypatch.setattr(carry_out, "pays_from", lambda *_: 999)
+    config = RegionConfig(**{**SMALL, "map": 0, "verify_spp": 2, **more}, run=str(tmp_path / "run"))
+    result = carry_out.region_from_config(config)
+    assert "products" not in result.renders
+    assert (result.transport and result.transport.reason) == reason
