@@ -1,6 +1,7 @@
 """Kills a run with SIGKILL at random moments, resumes it each time, and compares the rows with those of a whole run.
 
-    python benchmarks/kill.py [--kills 50] [--resolution 32] [--command attack|verdict|sweep|views|workers]
+    python benchmarks/kill.py [--kills 50] [--resolution 32] [--command attack|verdict|sweep|views|workers|
+        drive|drive-workers|over-path]
 
 Every row must agree in every column but times. The attack has an adjoint, so it runs under `--deterministic`; the sweep
 does not. The rows of `views` are predicted by light on surfaces. With workers the process that is killed is the one
@@ -24,14 +25,20 @@ TEXTURE = ["--control", "texture", "--steps", "60", "--trials", "30", "--verify-
 POSE = ["--control", "pose", "--policy", "nes", "--steps", "120", "--average", "60", "--trials", "30", "--spp", "2"]
 VERDICT = ["--control", "texture", "--steps", "20", "--epsilon", "0.02", "--deterministic"]
 VIEWS = [f"--grid=camera.{values}" for values in ("azimuth=0:360:40", "elevation=5:60:10", "distance=2:5:5")]
+DRIVE = ["sweep", "--path", "approach+orbit", "--fps", "4", "--grid", "environment.rotation=0,120,240"]
+DRIVE += ["--trials", "0", "--control", "sensor={shot: [0, 0.1]}", "--samples", "3", "--threads", "1"]
+OVER = ["attack", *TEXTURE, "--over", "path", "--path", "approach"]
 COMMANDS = {
     "attack": ["attack", *TEXTURE],
     "verdict": ["attack", *VERDICT],
     "sweep": ["sweep", "--grid", "pose.yaw=0:360:40", "--grid", "camera.elevation=5:60:10", "--threads", "1"],
     "views": ["sweep", *VIEWS, "--workers", "2"],
     "workers": ["attack", *POSE, "--verify-spp", "8", "--workers", "2"],
+    "drive": DRIVE,
+    "drive-workers": [*DRIVE, "--workers", "2"],
+    "over-path": OVER,
 }
-STARTUP = {"attack": 2.5, "verdict": 2.5, "sweep": 2.5, "views": 6.0, "workers": 6.0}
+STARTUP = {**dict.fromkeys(COMMANDS, 2.5), "views": 6.0, "workers": 6.0, "drive-workers": 4.0}
 """Seconds that pass before the first picture: nothing would come of it if every kill came before."""
 
 

@@ -155,8 +155,9 @@ class AttackConfig(DerivativeConfig):
     )
     path: str | None = setting(
         None, "search",
-        "the path along which the camera travels, with --over path; pictures of the answer along it are kept",
-        "approach, pass, orbit, or a .csv file", otherwise="approach", min_length=1,
+        "the path along which camera or object travel, with --over path; pictures of the answer along it are kept",
+        "approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in approach+orbit",
+        otherwise="approach", min_length=1,
     )
     draws: int | None = setting(
         None, "search", "how many random conditions each step looks at, with --over",

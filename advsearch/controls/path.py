@@ -1,4 +1,4 @@
-"""The `path` control: the camera or the object travels, and `time` says where along the way it is.
+"""The `path` control: the camera, the object or both travel, and `time` says where along the way they are.
 
 A frame of a drive is one time. So `--over path` finds one answer for a whole drive, and a grid over `path.time` has its
 frames in order. Where the scene as it is described is a frame, that is the clean one: the end of `approach`, the middle
@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -29,13 +29,18 @@ from advsearch.scene.settings import GEOMETRIC, ORBIT, moving
 
 APPROACH, PASS, TURN = "approach", "pass", "orbit"
 PATHS = (APPROACH, PASS, TURN)
+CAMERA, THING = MOVERS = "camera", "object"
+BOTH = "+"
+"""Between the camera's path and the object's."""
 CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
 """Share of the time at which the scene is as it is described."""
 
 REACH, SECONDS = 4.0, 10.0
 SHORTEST, LONGEST = 1e-3, 3600.0
 """Seconds between waypoints at least, and of a path at most."""
-COLUMNS, LOOKING = ("time", "x", "y", "z"), ("look_x", "look_y", "look_z")
+TIME, PLACE, LOOKING, HEADING = "time", ("x", "y", "z"), ("look_x", "look_y", "look_z"), "heading"
+SHIFT, TURNING = ("object_x", "object_y", "object_z"), "object_heading"
+"""Columns of the object in a file that is about both."""
 MOST_WAYPOINTS, MOST_BYTES = 100_000, 16 * 2**20
 FARTHEST = 1e5
 """Object sizes that a waypoint may be away."""
@@ -65,11 +70,23 @@ class Waypoints:
         return torch.lerp(of[place - 1], of[place], ((time - begin) / (end - begin)).clamp(0.0, 1.0))
 
 
+class Start(NamedTuple):
+    """A scene as it is described: poses (4, 4) of its camera and its object, and the middle (3,) of that; float32."""
+
+    camera: Tensor
+    middle: Tensor
+    object: Tensor
+
+
+Way = str | Waypoints
+"""One of `PATHS`, or that of a file."""
+
+
 class PathControl(NumberControl):
-    """The camera or the object travels along a path."""
+    """The camera, the object or both travel along a path."""
 
     kind: ClassVar[str] = "path"
-    summary: ClassVar[str] = "The camera or the object travels along a path; a frame is a time."
+    summary: ClassVar[str] = "The camera, the object or both travel along a path; a frame is a time."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         moving(ORBIT, "time", "s", 0.0, LONGEST, "where the scene is as it is", "Time since the path began."),
     )
@@ -78,10 +95,10 @@ class PathControl(NumberControl):
             "path",
             APPROACH,
             "approach (straight up to where it stands), pass (straight past it), orbit (once around), or a .csv file "
-            "with columns time, x, y, z.",
+            "with columns time, x, y, z. Two of them with a + between: the camera's and the object's.",
             "path",
         ),
-        Choice("moves", "camera", "What travels: camera or object.", options=("camera", "object")),
+        Choice("moves", CAMERA, "What travels along a single path: camera or object.", options=MOVERS),
         Choice("seconds", SECONDS, "How long it takes; a file says so itself.", most=LONGEST),
         Choice(
             "reach",
@@ -92,17 +109,26 @@ class PathControl(NumberControl):
     )
 
     def check_choices(self) -> None:
-        asked = self.chosen["path"]
-        if asked not in PATHS and not (isinstance(asked, str) and asked.lower().endswith(".csv")):
-            raise InputError(f"{self.name}.path: expected {', '.join(PATHS)} or a .csv file, got {asked!r}")
-        self._waypoints = None
-        if asked not in PATHS:
-            self._waypoints = read_waypoints(Path(str(asked)), of_object=self.chosen["moves"] == "object")
-            if "seconds" in self._given or "reach" in self._given:
-                raise InputError(
-                    f"{self.name}: the file {asked} says how long and how far; leave seconds and reach out"
-                )
-            self.chosen["seconds"] = float(self._waypoints.times[-1])
+        asked = str(self.chosen["path"])
+        names = two if len(two := asked.split(BOTH)) == 2 and all(map(_is_path, two)) else [asked]
+        alone = len(names) == 1
+        if alone and not _is_path(asked):
+            raise InputError(
+                f"{self.name}.path: expected {', '.join(PATHS)}, a .csv file, or two of them as in "
+                f"{APPROACH}{BOTH}{TURN}, the camera's and the object's, got {asked!r}"
+            )
+        if not alone and "moves" in self._given:
+            raise InputError(f"{self.name}: {asked} says what the camera does and what the object; leave moves out")
+        self._kept: tuple[SceneDescription, Start] | None = None
+        self._ways: dict[str, Way] = {}
+        for mover, name in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
+            self._ways |= {mover: name} if name in PATHS else read_waypoints(Path(name), mover, alone=alone)
+        files = [way for way in self._ways.values() if isinstance(way, Waypoints)]
+        for setting, said in (("seconds", bool(files)), ("reach", len(files) == len(self._ways))):
+            if said and setting in self._given:
+                raise InputError(f"{self.name}: {setting}: the file in {asked} says that itself; leave it out")
+        if files:
+            self.chosen["seconds"] = max(float(one.times[-1]) for one in files)
 
     @property
     def seconds(self) -> float:
@@ -110,7 +136,7 @@ class PathControl(NumberControl):
         return float(str(self.chosen["seconds"]))
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        if self.chosen["moves"] == "camera" and scene.camera != ORBIT_CAMERA:
+        if CAMERA in self._ways and scene.camera != ORBIT_CAMERA:
             raise InputError(
                 f"`controls` {self.name}: moves the camera, and the scene is seen by its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by {ORBIT_CAMERA!r}"
@@ -118,74 +144,83 @@ class PathControl(NumberControl):
         return scene
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
-        return CLEAN_AT.get(str(self.chosen["path"]), 0.0) * self.seconds
+        first, *last = self._ways.values()
+        way = last[0] if last and first == TURN else first  # who goes around is back at the end
+        return CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
 
     def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
         return 0.0, self.seconds
 
     def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
-        return GEOMETRIC if self.chosen["moves"] == "object" else ORBIT
+        return ORBIT if CAMERA in self._ways else GEOMETRIC
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        own = torch.from_numpy(camera_to_world(scene)).float().to(values["time"].device)
-        if self.chosen["moves"] == "camera":
-            place, target = self._camera(scene, own, values["time"])
-            return {"camera.to_world": looking(place, target, scene.number("camera.roll"))}
-        shift, heading = self._object(scene, own, values["time"])
-        return {"object.to_world": turned(scene, shift, heading)}
+        time, start = values["time"], self._start(scene, values["time"])
+        shift, heading = self._object(start, time)
+        inputs = {}
+        if CAMERA in self._ways:
+            place, target = self._camera(start, time, shift)
+            inputs["camera.to_world"] = looking(place, target, scene.number("camera.roll"))
+        if THING in self._ways:
+            inputs["object.to_world"] = turned(start, shift, heading)
+        return inputs
 
     def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        time = values["time"]
-        own, center = torch.from_numpy(camera_to_world(scene)).float().to(time.device), _middle(scene).to(time.device)
-        if self.chosen["moves"] == "camera":
-            away = self._camera(scene, own, time)[0] - center
-        else:
-            away = own[:3, 3] - center - self._object(scene, own, time)[0]
+        time, start = values["time"], self._start(scene, values["time"])
+        shift, _ = self._object(start, time)
+        away = self._camera(start, time, shift)[0] - start.middle - shift
         unit = "object sizes" if scene.object.metres is None else "metres"
         return {"distance": {"value": float(away.norm()) * scene.metres, "unit": unit}}
+
+    def _start(self, scene: SceneDescription, time: Tensor) -> Start:
+        """How the scene stands; of the last scene it is kept, as it takes a look at every vertex."""
+        if self._kept is None or self._kept[0] is not scene:
+            found = (camera_to_world(scene), middle(scene), object_to_world(scene))
+            self._kept = scene, Start(*(torch.from_numpy(one).float() for one in found))
+        return Start(*(one.to(time.device) for one in self._kept[1]))
 
     def _share(self, time: Tensor) -> Tensor:
         return (time / self.seconds).clamp(0.0, 1.0)
 
-    def _camera(self, scene: SceneDescription, own: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the camera is, and what it looks at."""
-        center, start, asked = _middle(scene).to(own), own[:3, 3], str(self.chosen["path"])
-        if (waypoints := self._waypoints) is not None:
-            targets = waypoints.targets
-            target = center if targets is None else center + waypoints.at(time, targets)
-            return center + waypoints.at(time, waypoints.places), target
+    def _camera(self, begin: Start, time: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the camera is, and what it looks at: an object that is shifted, unless a file says something else."""
+        own, center, way = begin.camera, begin.middle, self._ways.get(CAMERA)
+        start = own[:3, 3]
+        if way is None:
+            return start, center
+        if isinstance(way, Waypoints):
+            target = center + (shift if way.targets is None else way.at(time, way.targets))
+            return center + way.at(time, way.places), target
         along, away, reach = own[:3, 2], (start - center).norm(), float(str(self.chosen["reach"]))
         ahead = torch.stack([along[0], along[1], own.new_zeros(())])  # the camera keeps its height, as a car's does
         ahead = ahead / ahead.norm().clamp_min(1e-6)
         share = self._share(time)
-        if asked == APPROACH:
-            return start - ahead * away * (reach - 1.0) * (1.0 - share), center
-        if asked == PASS:
-            return start + own[:3, 0] * away * reach * (1.0 - 2.0 * share), center
+        if way == APPROACH:
+            return start - ahead * away * (reach - 1.0) * (1.0 - share), center + shift
+        if way == PASS:
+            return start + own[:3, 0] * away * reach * (1.0 - 2.0 * share), center + shift
         angle = 2.0 * math.pi * share
         x, y, z = start - center
         turned = torch.stack([angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y, z.expand(())])
-        return center + turned, center
+        return center + turned, center + shift
 
-    def _object(self, scene: SceneDescription, own: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
+    def _object(self, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
         """How far the object is shifted, and how many degrees it is turned by."""
-        asked, still = str(self.chosen["path"]), own.new_zeros(())
-        if (waypoints := self._waypoints) is not None:
-            heading = still if waypoints.headings is None else waypoints.at(time, waypoints.headings)
-            return waypoints.at(time, waypoints.places), heading
+        own, way = begin.camera, self._ways.get(THING)
+        still = own.new_zeros(())
+        if way is None:
+            return own.new_zeros(3), still
+        if isinstance(way, Waypoints):
+            return way.at(time, way.places), still if way.headings is None else way.at(time, way.headings)
         share, reach = self._share(time), float(str(self.chosen["reach"]))
-        if asked == TURN:
+        if way == TURN:
             return own.new_zeros(3), 360.0 * share
-        away = (own[:3, 3] - _middle(scene).to(own)).norm()
-        along = own[:3, 2] if asked == APPROACH else -own[:3, 0]
+        away = (own[:3, 3] - begin.middle).norm()
+        along = own[:3, 2] if way == APPROACH else -own[:3, 0]
         ahead = torch.stack([along[0], along[1], still])
         ahead = ahead / ahead.norm().clamp_min(1e-6)
-        far = away * (reach - 1.0) * (1.0 - share) if asked == APPROACH else away * reach * (1.0 - 2.0 * share)
+        far = away * (reach - 1.0) * (1.0 - share) if way == APPROACH else away * reach * (1.0 - 2.0 * share)
         return ahead * far, still
-
-
-def _middle(scene: SceneDescription) -> Tensor:
-    return torch.from_numpy(middle(scene)).float()
 
 
 def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
@@ -198,36 +233,44 @@ def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
     return affine(torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place)
 
 
-def turned(scene: SceneDescription, shift: Tensor, heading: Tensor) -> Tensor:
+def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
     """Return what turns the object about the vertical through its middle, in degrees, and shifts it: (4, 4)."""
-    angle, center = torch.deg2rad(heading), _middle(scene).to(shift)
+    angle, center = torch.deg2rad(heading), start.middle
     zero, one = torch.zeros_like(angle), torch.ones_like(angle)
     about = torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one])
     about = about.reshape(3, 3)
-    own = torch.from_numpy(object_to_world(scene)).float().to(shift)
-    return affine(about, center - about @ center + shift) @ own
+    return affine(about, center - about @ center + shift) @ start.object
 
 
-def read_waypoints(path: Path, *, of_object: bool) -> Waypoints:
+def _is_path(name: str) -> bool:
+    return name in PATHS or name.lower().endswith(".csv")
+
+
+def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, Waypoints]:
     """Read a file of waypoints.
 
     Args:
         path: a .csv file with the columns time, x, y, z, and look_x, look_y, look_z or heading.
-        of_object: whether the object travels, rather than the camera.
+        mover: what they are about, "camera" or "object".
+        alone: whether a file about the camera may say what the object does at the same times.
+
+    Returns:
+        The way of all that travels.
 
     Raises:
         FileFormatError: it is no table of numbers with the columns that a path needs, or its times do not ascend.
     """
-    further = ("heading",) if of_object else LOOKING
+    further = (HEADING,) if mover == THING else (*LOOKING, *SHIFT, TURNING) if alone else LOOKING
     try:
         text = read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
     except OSError as error:
         raise FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
     header, *rows = [[one.strip() for one in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
-    missing, twice = set(COLUMNS) - set(header), len(set(header)) < len(header)
-    if missing or twice or set(header) - {*COLUMNS, *further} or 0 < len({*LOOKING} & {*header}) < len(LOOKING):
+    columns, parts = (TIME, *PLACE), [0 < len({*group} & {*header}) < len(group) for group in (LOOKING, SHIFT)]
+    missing, twice = set(columns) - set(header), len(set(header)) < len(header)
+    if missing or twice or set(header) - {*columns, *further} or any(parts):
         raise FileFormatError(
-            f"{path}: expected columns {', '.join(COLUMNS)}, and perhaps {', '.join(further)}, got "
+            f"{path}: expected columns {', '.join(columns)}, and perhaps {', '.join(further)}, got "
             f"{', '.join(header)[:200] or 'nothing'}"
         )
     if not 2 <= len(rows) <= MOST_WAYPOINTS:
@@ -236,21 +279,28 @@ def read_waypoints(path: Path, *, of_object: bool) -> Waypoints:
         table = np.array([[float(one) for one in row] for row in rows], np.float64).reshape(len(rows), len(header))
     except ValueError as error:
         raise FileFormatError(f"{path}: expected {len(header)} numbers in each row, got something else") from error
-    times = table[:, header.index("time")] - table[0, header.index("time")]
+    times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
     if not (np.isfinite(times).all() and (np.diff(times) > SHORTEST).all() and times[-1] <= LONGEST):
         raise FileFormatError(
             f"{path}: expected times that ascend, by {SHORTEST:g} s at least and {LONGEST:g} s in all, got others"
         )
-    column = {name: table[:, place] for place, name in enumerate(header) if name != "time"}
+    column = {name: table[:, place] for place, name in enumerate(header) if name != TIME}
     if not all(np.abs(one).max() <= FARTHEST for one in column.values()):
         raise FileFormatError(f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none")
 
-    def several(*names: str) -> Tensor:
+    def several(*names: str) -> Tensor | None:
+        if names[0] not in column:
+            return None
         return torch.from_numpy(np.stack([column[one] for one in names], axis=1).astype(np.float32))
 
-    return Waypoints(
-        times=torch.from_numpy(times.astype(np.float32)),
-        places=several("x", "y", "z"),
-        targets=several(*LOOKING) if LOOKING[0] in column else None,
-        headings=several("heading")[:, 0] if "heading" in column else None,
-    )
+    def way(places: Tensor, targets: Tensor | None, heading: str) -> Waypoints:
+        headings = several(heading)
+        seconds = torch.from_numpy(times.astype(np.float32))
+        return Waypoints(seconds, places, targets, None if headings is None else headings[:, 0])
+
+    places, shift = several(*PLACE), several(*SHIFT)
+    assert places is not None
+    found = {mover: way(places, several(*LOOKING), HEADING)}
+    if shift is not None or TURNING in column:
+        found[THING] = way(torch.zeros_like(places) if shift is None else shift, None, TURNING)
+    return found

@@ -64,6 +64,53 @@ def test_distances_are_those_of_the_geometry(moves: str) -> None:
     assert past == pytest.approx([math.hypot(2.0, 6.0), 2.0, math.hypot(2.0, 6.0)], abs=1e-3)
 
 
+@pytest.mark.parametrize("path", ["approach+orbit", "orbit+approach", "pass+pass", "approach+approach"])
+def test_both_move_as_each_does_alone_and_the_camera_looks_at_the_object(scene: SceneDescription, path: str) -> None:
+    both = bound(scene, path=path)
+    first, second = path.split("+")
+    camera, thing = bound(scene, path=first), bound(scene, path=second, moves="object")
+    center = torch.cat([torch.from_numpy(middle(scene)).float(), torch.ones(1)])
+    base = torch.from_numpy(object_to_world(scene)).float()
+    for share in (0.0, 0.3, 0.8):
+        poses = both.inputs(torch.tensor([share]))
+        assert set(poses) == {"camera.to_world", "object.to_world"}
+        torch.testing.assert_close(poses["object.to_world"], placed(thing, share), atol=1e-5, rtol=0)
+        eye = poses["camera.to_world"][:3, 3]
+        torch.testing.assert_close(eye, placed(camera, share)[:3, 3], atol=1e-5, rtol=0)
+        there = (poses["object.to_world"] @ torch.linalg.inv(base) @ center)[:3]
+        ahead = (there - eye) / (there - eye).norm()
+        torch.testing.assert_close(poses["camera.to_world"][:3, 2], ahead, atol=1e-5, rtol=0)
+        assert distance(both, share) == pytest.approx(float((there - eye).norm()), abs=1e-4)
+    own = {"camera.to_world": torch.from_numpy(camera_to_world(scene)).float(), "object.to_world": base}
+    torch.testing.assert_close(both.inputs(both.start), own, atol=1e-4, rtol=0)
+
+
+def test_a_file_says_where_both_are(scene: SceneDescription, tmp_path: Path) -> None:
+    """The same way in one file, and in one file for each, of which one ends before the other."""
+    file, camera, thing = (tmp_path / name for name in ("both.csv", "camera.csv", "object.csv"))
+    file.write_text("time,x,y,z,object_x,object_y,object_z,object_heading\n0,9,0,1,0,0,0,0\n4,5,0,1,2,0,0,90\n")
+    camera.write_text("time,x,y,z\n0,9,0,1\n4,5,0,1\n8,1,0,1\n")
+    thing.write_text("time,x,y,z,heading\n0,0,0,0,0\n4,2,0,0,90\n")
+    one, two = bound(scene, path=str(file)), bound(scene, path=f"{camera}+{thing}")
+    assert distance(one, 0.5) == pytest.approx(math.hypot(6.0, 1.0), abs=1e-4)
+    for time in (0.0, 1.0, 4.0):
+        poses = one.inputs(torch.tensor([time / 4.0])), two.inputs(torch.tensor([time / 8.0]))
+        torch.testing.assert_close(*poses, atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        one.inputs(torch.ones(1))["object.to_world"], two.inputs(torch.ones(1))["object.to_world"]
+    )
+    file.write_text(
+        "time,x,y,z,look_x,look_y,look_z,object_heading\n0,3,0,1,0,0,1\n1,3,0,1,3,5,1\n".replace("1\n", "1,8\n")
+    )
+    turning = bound(scene, path=str(file)).inputs(torch.ones(1))
+    torch.testing.assert_close(turning["camera.to_world"][:3, 2], torch.tensor([0.0, 1.0, 0.0]), atol=1e-5, rtol=0)
+    file.write_text("time,x,y,z,heading\n0,0,0,0,0\n1,0,0,0,8\n")
+    alone = placed(bound(scene, path=str(file), moves="object"), 1.0)
+    torch.testing.assert_close(turning["object.to_world"], alone, atol=1e-5, rtol=0)
+    with pytest.raises(FileFormatError, match="expected columns"):
+        PathControl(path=f"{file}+orbit")
+
+
 @pytest.mark.parametrize("path", PATHS)
 def test_moving_the_camera_or_the_object_is_the_same_drive(path: str) -> None:
     """Up to the sense of the turn: what the camera sees of the object's middle is as far away."""
@@ -131,10 +178,11 @@ def test_a_file_that_changes_is_read_again(scene: SceneDescription, tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "expected columns time, x, y, z, and perhaps look_x, look_y, look_z, got nothing"),
+        ("", "expected columns time, x, y, z, and perhaps look_x, look_y, look_z, object_x, .*, got nothing"),
         ("time,x,y\n0,1,1\n1,1,1\n", "expected columns .* got time, x, y"),
         ("time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns .* got time, x, y, z, look_x"),
         ("time,x,y,z,heading\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
+        ("time,x,y,z,object_x\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
         ("time,x,x,y,z\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
         ("time,x,y,z\n0,1,1,1\n", "expected 2 to 100000 waypoints, got 1"),
         ("time,x,y,z\n0,1,1,1\n1,a,1,1\n", "expected 4 numbers in each row"),
@@ -171,7 +219,18 @@ def test_a_file_that_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
 def test_what_does_not_go_together_is_refused(scene: SceneDescription, tmp_path: Path) -> None:
     file = tmp_path / "way.csv"
     file.write_text(WAY)
-    with pytest.raises(InputError, match=r"path\.path: expected approach, pass, orbit or a \.csv file, got 'aproach'"):
+    with pytest.raises(
+        InputError, match=r"path\.path: expected approach, pass, orbit, a \.csv file, or two of them .* got 'apr"
+    ):
         PathControl(path="aproach")
-    with pytest.raises(InputError, match="says how long and how far; leave seconds and reach out"):
-        PathControl(path=str(file), seconds=3.0)
+    for path in (str(file), f"approach+{file}"):
+        with pytest.raises(InputError, match=r"path: seconds: the file in .*way\.csv says that itself; leave it out"):
+            PathControl(path=path, seconds=3.0)
+    with pytest.raises(InputError, match="path: reach: the file"):
+        PathControl(path=f"{file}+{file}", reach=3.0)
+    assert PathControl(path=f"approach+{file}", reach=3.0).seconds == 4.0, "the camera's way is no file's"
+    for path in ("approach+turn", "+orbit", "approach+orbit+pass"):
+        with pytest.raises(InputError, match="expected approach"):
+            PathControl(path=path)
+    with pytest.raises(InputError, match=r"approach\+orbit says what .* leave moves out"):
+        PathControl(path="approach+orbit", moves="object")

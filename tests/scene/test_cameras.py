@@ -139,6 +139,14 @@ FILES = {
         f"cam1:\n  camera_model: pinhole\n  distortion_model: radtan\n  distortion_coeffs: {K}\n"
         "  intrinsics: [902.5, 911.75, 645.25, 352.5]\n  resolution: [1280, 720]\n"
     ),
+    "opencv.xml": (
+        '<?xml version="1.0"?>\n<opencv_storage>\n<!-- by a calibration --><image_width>1280</image_width>\n'
+        "<image_height>720</image_height>\n<fisheye_model>0</fisheye_model>\n"
+        '<camera_matrix type_id="opencv-matrix">\n  <rows>3</rows>\n  <cols>3</cols>\n  <dt>d</dt>\n  <data>\n'
+        "    9.025e+02 0. 6.4525e+02 0. 911.75\n    352.5 0. 0. 1.</data></camera_matrix>\n"
+        '<distortion_coefficients type_id="opencv-matrix">\n  <rows>5</rows>\n  <cols>1</cols>\n  <dt>d</dt>\n'
+        "  <data>\n    -2.8e-01 7.0e-02 1e-3 -2.0e-03 0.</data></distortion_coefficients>\n</opencv_storage>\n"
+    ),
     "info.yaml": ros("plumb_bob", [*K, 0.0]),
     "echo.yaml": (
         f"height: 720\nwidth: 1280\ndistortion_model: plumb_bob\nd: {[*K, 0.0]}\nk: {TABLE['matrix']}\n---\nheight: 1\n"
@@ -159,6 +167,19 @@ def test_one_camera_in_each_kind_of_file_is_the_same(name: str, tmp_path: Path) 
     wanted |= dict(zip(("k1", "k2", "p1", "p2"), K, strict=True))
     assert found.kind == "brown-conrady" and found.size == (720, 1280)
     assert found.values == pytest.approx({**dict.fromkeys(NUMBERS, 0.0), **wanted})
+
+
+def test_binned_pixels_are_fewer_and_see_the_same(tmp_path: Path) -> None:
+    """Of a width that is no multiple, the last columns are left out; 0 stands for 1."""
+    path = tmp_path / "info.yaml"
+    path.write_text(GOOD)
+    whole = read_camera(str(path))
+    path.write_text(GOOD + "binning_x: 3\nbinning_y: 0\n")
+    found = read_camera(str(path))
+    assert whole.size == (720, 1280) and found.size == (720, 426)
+    assert found.values["fy"] == whole.values["fy"] and found.values["k1"] == whole.values["k1"]
+    assert found.values["fx"] * 426 * 3 == pytest.approx(whole.values["fx"] * 1280)
+    assert found.values["cx"] * 426 * 3 == pytest.approx(whole.values["cx"] * 1280)
 
 
 @pytest.mark.parametrize(
@@ -202,6 +223,14 @@ HOSTILE = {
     "another projection of COLMAP": ("1 THIN_PRISM_FISHEYE 9 9 1 1 1 1 0 0 0 0 0 0 0 0\n", "got THIN_PRISM_FISHEYE"),
     "a short line": ("1 PINHOLE 9 9 1 1\n", "expected width height fx fy cx cy"),
     "several": ("1 SIMPLE_PINHOLE 9 9 9 4 4\n2 SIMPLE_PINHOLE 9 9 9 4 4\n", "has 2 cameras, 1, 2: say which"),
+    "not calibrated": (ros("", [], [0.0] * 9), "zeros, as ROS says of one that is not calibrated"),
+    "half a pixel": (GOOD + "binning_x: 1.5\n", "binning_x: expected a whole number"),
+    "binned by nothing": (GOOD + "binning_y: -2\n", "binning_y: expected a whole number"),
+    "binned by text": (GOOD + "binning_x: [2]\n", "binning_x: expected a finite number"),
+    "a scene's XML": ("<scene version='3.0.0'/>", "in <opencv_storage>, got <scene>"),
+    "half an XML": ("<opencv_storage><image_width>", "expected XML, got"),
+    "an XML without a matrix": ("<opencv_storage><k>1 2</k></opencv_storage>", "expected a list of 9 numbers"),
+    "entities": ("<!DOCTYPE a [<!ENTITY b 'c'>]><opencv_storage/>", "document type or entities"),
     "a part of the picture": (GOOD + "roi: {x_offset: 100, y_offset: 0, width: 9, height: 9}\n", "whole pictures"),
     "no numbers": (GOOD.replace("902.5", "[]"), "numbers, got"),
 }

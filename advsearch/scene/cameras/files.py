@@ -1,4 +1,4 @@
-"""Camera files: OpenCV's YAML, Kalibr's camchain, `camera_info` of ROS and COLMAP's cameras.txt.
+"""Camera files: OpenCV's YAML and XML, Kalibr's camchain, `camera_info` of ROS and COLMAP's cameras.txt.
 
 The centre of the first pixel is (0, 0) in the first three and (0.5, 0.5) in COLMAP; what comes out is measured from the
 picture's corner.
@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
 from advsearch.files import read_text
@@ -19,6 +21,8 @@ from advsearch.yaml_text import LARGEST, parse_yaml
 
 MOST_PIXELS = 1 << 16
 """Largest side of a picture."""
+MOST_BINNED = 64
+"""Pixels along a side that a sensor makes into one, at most."""
 LARGEST_COEFFICIENT, LARGEST_FOCAL = 1e4, 1e3
 """Coefficients are at most so large, and focal lengths so many sides of the picture."""
 
@@ -81,7 +85,7 @@ def read_camera(spec: str) -> CameraModel:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _of_colmap(spec, path, which, lines)
-    data = _yaml(path, text)
+    data = _xml(path, text) if text.lstrip().startswith("<") else _yaml(path, text)
     cameras = {name: one for name, one in data.items() if isinstance(one, dict) and "intrinsics" in one}
     if cameras:
         return _of_kalibr(spec, _chosen(path, which, cameras))
@@ -110,6 +114,23 @@ def _yaml(path: str, text: str) -> dict[str, Any]:
             f"{path}: expected a camera of OpenCV, Kalibr, ROS or COLMAP, got {got}; docs/cameras.md shows one of each"
         )
     return data
+
+
+def _xml(path: str, text: str) -> dict[str, Any]:
+    """What OpenCV writes as XML, in the form of its YAML."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise FileFormatError(f"{path}: declares a document type or entities, which no camera needs; remove it")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise FileFormatError(f"{path}: expected XML, got {error}; correct the file") from None
+    if root.tag != "opencv_storage":
+        raise FileFormatError(
+            f"{path}: expected a camera of OpenCV in <opencv_storage>, got <{root.tag[:40]}>; docs/cameras.md has the "
+            "formats that are read"
+        )
+    matrices = {one.tag: one.findtext("data") for one in root}
+    return {one.tag: (one.text or "").strip() if (data := matrices[one.tag]) is None else data.split() for one in root}
 
 
 def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
@@ -167,7 +188,7 @@ def _of_kalibr(spec: str, camera: Mapping[str, Any]) -> CameraModel:
 
 
 def _of_opencv(spec: str, data: Mapping[str, Any]) -> CameraModel:
-    """OpenCV's YAML and ROS; their keys are in small letters and without underscores here."""
+    """OpenCV's files and ROS; their keys are in small letters and without underscores here."""
     path = spec.partition("#")[0]
     kind = _kind(path, data.get("distortionmodel", data.get("cameramodel", "")))
     if data.get("fisheyemodel") not in (None, 0, False, "0"):
@@ -178,6 +199,11 @@ def _of_opencv(spec: str, data: Mapping[str, Any]) -> CameraModel:
     if isinstance(roi, Mapping) and any(roi.get(side) for side in ("x_offset", "y_offset", "width", "height")):
         raise FileFormatError(f"{path}: expected a camera_info of whole pictures, got one of a part (roi); set it to 0")
     matrix = _numbers(path, "camera_matrix", _there(path, data, MATRIX, "camera_matrix"), (9,))
+    if not any(matrix):
+        raise FileFormatError(
+            f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, as ROS says of one that is not "
+            "calibrated; calibrate it, and give the file that this writes"
+        )
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got other numbers")
     given: object = next((data[name] for name in DISTORTION if data.get(name) is not None), [])
@@ -189,7 +215,9 @@ def _of_opencv(spec: str, data: Mapping[str, Any]) -> CameraModel:
             f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate without CALIB_TILTED_MODEL"
         )
     found |= {"fx": matrix[0], "skew": matrix[1], "cx": matrix[2], "fy": matrix[4], "cy": matrix[5]}
-    return _made(spec, kind, _size(path, data), _from_corner(found))
+    (height, width), (down, across) = _size(path, data), _binning(path, data)
+    model = _made(spec, kind, (height - height % down, width - width % across), _from_corner(found))
+    return replace(model, size=(int(height // down), int(width // across)))
 
 
 def _from_corner(found: dict[str, float]) -> dict[str, float]:
@@ -228,6 +256,15 @@ def _size(path: str, data: Mapping[str, Any]) -> tuple[float, float]:
         for names, shown in ((WIDTH, "image_width"), (HEIGHT, "image_height"))
     )
     return height, width
+
+
+def _binning(path: str, data: Mapping[str, Any]) -> tuple[float, float]:
+    """Pixels, down and across, that ROS says are made into one; its calibration is for those before."""
+    found = {name: _number(path, name, data.get(name.replace("_", "")) or 1) for name in ("binning_y", "binning_x")}
+    for name, number in found.items():
+        if number != int(number) or not 1 <= number <= MOST_BINNED:
+            raise FileFormatError(f"{path}: {name}: expected a whole number up to {MOST_BINNED}, got {number:g}")
+    return found["binning_y"], found["binning_x"]
 
 
 def _numbers(path: str, name: str, given: object, counts: Sequence[int]) -> list[float]:
