@@ -272,7 +272,7 @@ class SurfaceLight(Predictor):
             return self.problem.renderer.scene.assembly(space.inputs(whole))
 
     def _pictures(self, wholes: Sequence[Tensor], u: Tensor, key: tuple[int, int] | None = None) -> Tensor:
-        """Predicted pictures (n, H, W, 3) of u under conditions, with a graph; what the cameras of a key see is kept."""
+        """Return pictures (n, H, W, 3) of u under conditions, with a graph. What the cameras of a key see is kept."""
         color = self.renderer.color(self.problem.searched_space.inputs(u))
         places = [torch.cat([u, whole[len(u) :]]) for whole in wholes]
         inputs = [self._inputs(one) for one in wholes]

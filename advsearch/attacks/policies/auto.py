@@ -48,7 +48,7 @@ into the ascent. One by differences never is: half a number for each, and the su
 REACH = 0.1
 """Length of the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else."""
 
-MOMENTUM, MOMENTUM_DRAWN = 0.75, 0.9
+MOMENTUM, MOMENTUM_DRAWN = 0.75, 0.95
 """Weight of past gradients where none has noise and all point the same way, and where each sees other conditions; with
 noise PGD's own is better."""
 
@@ -315,7 +315,7 @@ class Portfolio(Raced):
     """Lets several policies search side by side and goes on with those that reached more.
 
     With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see `choices`. Within a round every
-    policy that is still in has an equal share; after it the better half goes on, by the largest objective reached so far. So
+    policy that is still in has an equal share; after it the better half goes on, by the largest objective so far. So
     of two policies each has a quarter of the renders, and the better one the other half. Each plans for what it gets
     if it stays in.
 

@@ -136,7 +136,7 @@ class Views:
         self._recorded_at = (0, 0)
 
     def __call__(self, cameras: Sequence[Mapping[str, Tensor]], lit: Lit) -> Callable[[], Seen]:
-        """Begin to look at a lit scene. What is returned waits until Dr.Jit has done all that it was asked for, and says
+        """Begin to look at a lit scene. What is returned waits until Dr.Jit has done all that was asked, and says
         what is seen; until then the processor may do other things.
 
         Args:
