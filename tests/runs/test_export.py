@@ -120,11 +120,12 @@ def test_a_table_that_cannot_be_written_names_out(run: Path, capsys: pytest.Capt
 @pytest.mark.parametrize("format", WRITERS)
 def test_what_is_no_table_says_what_it_writes_and_is_in_the_help(format: str, run: Path, capsys: Any) -> None:
     writer = WRITERS[format]
+    said = writer.__doc__ or ""
     where = f"{writer.__file__} (see advsearch/cli/exports/__init__.py): expected"
-    assert (writer.__doc__ or "").endswith(".") and "\n" not in writer.__doc__, f"{where} a sentence as its docstring"
+    assert said.endswith(".") and "\n" not in said, f"{where} a sentence as its docstring"
     assert f"--format {format}" in writer.EXAMPLE and "--out" in writer.EXAMPLE, f"{where} an EXAMPLE with --format"
     assert main(["export", "--help"]) == 0
-    assert f"{format}: {writer.__doc__.rstrip('.')}".lower() in " ".join(capsys.readouterr().out.split()).lower()
+    assert f"{format}: {said.rstrip('.')}".lower() in " ".join(capsys.readouterr().out.split()).lower()
     assert main(["export", run.name, "--format", format]) == 2
     assert f"--out: {format} writes {writer.WRITES}; give its name" in " ".join(capsys.readouterr().err.split())
     out = writer.EXAMPLE.split("--out ")[1]
