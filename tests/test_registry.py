@@ -123,23 +123,23 @@ def examples() -> list[list[str]]:
 
 
 def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_path: Path) -> None:
-    small = ["--run", str(tmp_path / "run"), "--no-baseline", "--steps", "4", "--spp", "1", "--verify-spp", "1"]
+    """Its task, too, is searched, swept and rendered; all in one process."""
+    small = ["--run", str(tmp_path / "own"), "--no-baseline", "--steps", "4", "--spp", "1", "--verify-spp", "1"]
     words = [*examples()[0], *small, "--denoise", "none", "--label", "bowl", "--quiet"]
-    listed, summary = advsearch(installed, ["list"], words)
-    names = {"controls": "fade", "policies": "shrinking", "objectives": "brightness", "tasks": "fading"}
-    assert {kind: listed[kind][-1] for kind in names} == names
-    assert (summary["controls"], summary["policy"], summary["objective"]) == (["fade"], "shrinking", "brightness")
-    assert summary["model"] == "tiny" and summary["steps"] == 4
-
-
-def test_its_task_is_searched_swept_and_rendered(installed: Path, tmp_path: Path) -> None:
     small, run = ["--denoise", "none", "--spp", "16", "--quiet"], tmp_path / "run"
     attack = [*examples()[1], "--run", str(run), "--no-baseline", "--steps", "12", "--verify-spp", "16", *small]
     given = ["--object", "mug", "--task", "fading", "--model", "zoo:gauge", *small]
     sweep = ["sweep", *given, "--grid", "fade.amount=0,0.4,1", "--trials", "0", "--run", str(tmp_path / "sweep")]
     wide = [*(word.replace("fading", "fading={tolerance: 2}") for word in sweep), "--overwrite"]
     picture = ["render", *given, "--control", "fade={amount: 0.4}", "--out", str(tmp_path / "mug.png")]
-    found, swept, widely, rendered = advsearch(installed, attack, sweep, wide, picture)
+    listed, summary, found, swept, widely, rendered = advsearch(
+        installed, ["list"], words, attack, sweep, wide, picture
+    )
+
+    names = {"controls": "fade", "policies": "shrinking", "objectives": "brightness", "tasks": "fading"}
+    assert {kind: listed[kind][-1] for kind in names} == names
+    assert (summary["controls"], summary["policy"], summary["objective"]) == (["fade"], "shrinking", "brightness")
+    assert summary["model"] == "tiny" and summary["steps"] == 4
 
     assert (found["task"], found["objective"], found["model"]) == ("fading", "score", "gauge")
     assert found["label_set"] == ["0.0"] and found["clean"]["correct"] and found["clean"]["index"] is None

@@ -229,8 +229,9 @@ def test_haze_is_one_grey_medium_in_a_ball_around_the_camera(changed: dict[str, 
 
 def test_import_says_on_standard_output_what_a_scene_has(box: Path) -> None:
     """In a process of its own, as standard output is kept clean of Mitsuba's by the descriptor."""
-    command = [sys.executable, "-m", "advsearch", "import", str(box)]
-    found = json.loads(subprocess.run([*command, "--json"], check=True, capture_output=True, text=True).stdout)
+    code = "import sys\nfrom advsearch.cli.main import main\nw = sys.argv[1:]\nsys.exit(main([*w, '--json']) | main(w))"
+    done = subprocess.run([sys.executable, "-c", code, "import", str(box)], check=True, capture_output=True, text=True)
+    found, end = json.JSONDecoder().raw_decode(done.stdout)
     assert found["command"] == "import" and found["objects"] and found["cameras"]
-    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    printed = done.stdout[end:].lstrip()
     assert printed.startswith(f"{box}: a Mitsuba scene") and f"--object {found['objects'][-1]}" in printed

@@ -88,6 +88,8 @@ class MitsubaScene:
     ) -> None:
         with one_at_a_time:
             mi = mitsuba()
+            if population.unused:  # first: kernels are compiled for the numbers of their objects, which it sets free
+                population.bury()
             self.made = (description, filter)
             self.resolution = resolution
             self.sampler = sampler
@@ -137,8 +139,6 @@ class MitsubaScene:
             self._applied: dict[str, Tensor] = {}
             self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
             self._recorded_at = (0, 0)
-            if population.unused:
-                population.bury()
             media = media_in(self._scene) if self.volumetric else ()
             population.add(self, self._scene, self._integrators, self.parameters, media=media)
             self._every: dict[str, Tensor] = {}

@@ -262,10 +262,17 @@ def cut(opacity: float) -> Renderer:
     return renderer_of(load_scene(replace(ball, opacity=share)))
 
 
+@pytest.fixture(scope="module")
+def whole() -> SurfaceRenderer:
+    """Light on the ball without the band."""
+    ball = cut(1.0)
+    return SurfaceRenderer(ball, ball.start, seed=0)
+
+
 @pytest.mark.parametrize("opacity", [0.0, 0.4])
-def test_light_passes_cut_outs(opacity: float) -> None:
+def test_light_passes_cut_outs(opacity: float, whole: SurfaceRenderer) -> None:
     """What is behind them is seen, with the light that comes in; without that a picture is much further off."""
-    of, whole = cut(opacity), SurfaceRenderer(cut(1.0), cut(1.0).start, seed=0)
+    of = cut(opacity)
     made = SurfaceRenderer(of, of.start, seed=0)
     assert why_not(of, VARYING) is None and made.arrangement.sides == 2 and whole.arrangement.sides == 1
     with torch.no_grad():
