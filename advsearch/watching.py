@@ -245,8 +245,11 @@ def count_text(done: float, total: float | None, at_most: bool) -> str:
 
 
 def times_text(elapsed: float, done: float, total: float | None, at_most: bool) -> str:
-    """Return ``10 s, 25 s left``: the time so far, and what is left if the other steps take as long as those before."""
-    if not total or not done or done >= total:
+    """Return ``10 s, 25 s left``: the time so far, and what is left if the other steps take as long as those before.
+
+    Below a tenth of an upper bound it leaves that out: most such stages end long before.
+    """
+    if not total or not done or done >= total or (at_most and 10 * done < total):
         return _seconds(elapsed)
     left = elapsed / done * (total - done)
     return f"{_seconds(elapsed)}, {'at most ' if at_most else ''}{_seconds(left)} left"

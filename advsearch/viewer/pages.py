@@ -70,7 +70,8 @@ def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
         join_html(element("h2", "Cost and conditions"), facts_table(facts)),
         again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
     )
-    what = join_html(f"{result.command}; ", subject_html(*(("", one) for one in subject_of(result, given))))
+    subject = subject_of(result, given)
+    what = join_html(result.command, "; " if subject else None, subject_html(*(("", one) for one in subject)))
     header = heading(what, given.said, remarks_of(result, given))
     return document(
         f"{run.name}, {result.command}", header, main, footer=f"run {run.name}. This page needs no other file."

@@ -208,7 +208,8 @@ def sweep_verdict(summary: SweepSummary) -> str:
 
 def _still(path: Path, summary: SweepSummary) -> Html:
     """What a page without a script shows in the explorer's place."""
-    figure = _figure(path / "images" / "sweep.png", f"Accuracy over {_axes_text(summary)}.")
+    single = summary.cells is not None and max(map(max, summary.cells.configurations)) <= 1
+    figure = _figure(path / "images" / "sweep.png", f"{'Margin' if single else 'Accuracy'} over {_axes_text(summary)}.")
     worst = _figure(path / "images" / "worst.png", _worst_text(summary))
     return join_html(
         element("div", figure, class_="pictures", data_still="true") if figure else None,

@@ -966,6 +966,10 @@ def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
         clock.now += 1.0
         progress.advance(best=0.31234)
     progress.message("a warning")
+    progress.stage("choosing", 2000, at_most=True)  # of so few, nothing is said of what is left
+    for _ in range(8):
+        clock.now += 1.0
+        progress.advance(4)
     progress.stage("a short one", 3)
     clock.now += 1.0
     progress.advance(3)
@@ -978,6 +982,8 @@ def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
         "advsearch: searching: 7 of at most 40, 7 s, at most 33 s left, best 0.312",
         "advsearch: searching: 12 of at most 40, 12 s, at most 28 s left, best 0.312",
         "advsearch: a warning",
+        "advsearch: choosing",
+        "advsearch: choosing: 28 of at most 2000, 7 s",
         "advsearch: loading the scene",
         "advsearch: loading the scene: 7 s",
     ]

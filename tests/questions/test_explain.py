@@ -213,7 +213,7 @@ def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:
 
 def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
     config = SweepConfig(
-        object="mug,bowl", environment="studio,noon", controls={"light": {}}, set_={"light.power": 1.0}
+        object="mug,bowl", environment="studio,noon", controls={"light": {}}, set_={"light.power": 1.0}, workers=2
     )
     row: dict[str, float | str] = {
         "object": "bowl", "environment": "noon", "model": "reference", "pose.yaw": 90.0, "light.power": 0.5,
@@ -221,7 +221,7 @@ def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
     made = along(config, row, FOUND.factors[0], FOUND, 3)
     assert made.object == "bowl" and made.environment == "noon" and made.controls == {} and made.keep_pictures == "all"
     assert made.grid["pose.yaw"][0] == 90.0 and len(made.grid["pose.yaw"]) == 9  # type: ignore[index, arg-type]
-    assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {}
+    assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {} and made.workers is None
     lit = along(config, row, FOUND.factors[1], FOUND, 3)
     assert lit.environment == "noon,studio" and lit.grid["pose.yaw"] == [90.0]
 

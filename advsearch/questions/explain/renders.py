@@ -88,7 +88,8 @@ def along(
     else:
         grid[factor.name] = values
     fixed = {name: value for name, value in config.set_.items() if name not in grid}
-    kept: dict[str, object] = {"keep_pictures": "all", "set": fixed}
+    alone = {"workers": None, "cluster": None}  # ten pictures take less than a worker takes to load
+    kept: dict[str, object] = {"keep_pictures": "all", "set": fixed, **alone}
     return _quiet(config, grid=grid, controls={}, samples=None, seed=seed, **kept, **outer)
 
 

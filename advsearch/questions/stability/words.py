@@ -11,11 +11,11 @@ from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 COLUMNS: Mapping[str, Column] = {
     "group": "{0.group}",
     "case": "{0.case}",
+    "status": "{0.status}",
     "finite": lambda one: "yes" if one.finite else "NO",
     "error": lambda one: "" if one.relative_error is None else f"{100.0 * one.relative_error:.2g} %",
     "ending": lambda one: textwrap.shorten(one.ending, 30, placeholder=" ..."),
     "seconds": "{0.seconds:.1f}",
-    "status": "{0.status}",
 }
 
 

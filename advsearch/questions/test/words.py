@@ -35,7 +35,7 @@ def shown(result: SuiteResult) -> ShownAnswer:
         if one.answer != HELD and one.reason != NOT_TRIED:
             caption = f"{one.statement}: {one.answer}. {one.reason}."
             pictures = [[Picture(one.picture, caption)]] if one.picture else []
-            sections.append(AnswerPart(one.name, rows=[["again", one.repeat]], pictures=pictures))
+            sections.append(AnswerPart(one.name, rows=[["repeat", one.repeat]], pictures=pictures))
     sections.append(AnswerPart("Expected from now on", result.changes))
     about = [Path(result.suite).name, result.object, result.model]
     return ShownAnswer(f"{result.title}. {suite_text(result)}", sections, facts(result), about)
@@ -45,15 +45,16 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
     """Return what is claimed."""
     what = f"{short_name(config.object)}, {', '.join(config.controls)}"
     if isinstance(claim, RightClaim):
-        spanned = "the frames that span" if "path" in config.controls else "what spans"
-        return f"{short_name(config.model)} is right in at least {percent(claim.at_least)} of {spanned} {what}"
+        spanned = "the frames" if "path" in config.controls else "the pictures"
+        share = f"at least {percent(claim.at_least)} of {spanned} that the ranges span"
+        return f"{short_name(config.model)} is right in {share}: {what}"
     if isinstance(claim, NoWorseClaim):
         points = f"{number_text(claim.points)} points"
         models = f"{short_name(config.model)} is right at most {points} less often than {short_name(claim.than)}"
         return f"{models} on the same pictures of {what}"
     epsilon = getattr(config, "epsilon", None)
     within = "" if epsilon is None else f" within {number_text(epsilon) if isinstance(epsilon, float) else epsilon}"
-    return f"no search finds a wrong {short_name(config.model)} over {what}{within}"
+    return f"no search finds a picture that {short_name(config.model)} gets wrong: {what}{within}"
 
 
 def right_reason(answer: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
