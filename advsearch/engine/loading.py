@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.errors import InputError
-from advsearch.models.switches import plainly
+from advsearch.models.guards import plainly
 from advsearch.options import told
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset

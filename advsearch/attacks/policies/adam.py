@@ -64,8 +64,8 @@ class Adam(Policy[AdamState]):
     beta2, 0.9 by default, since a search has tens of steps and not thousands; and in an l2 ball g^2 is the mean over
     the block, since there the best step for a constant gradient is along it and not along its signs.
 
-    g is clipped first (see `pgd.clipped`). An evaluation without a gradient goes on along m. One whose objective could not
-    be computed sends the search back to its best configuration, with m = v = 0 and half the rate. While there is no
+    g is clipped first (see `pgd`). An evaluation without a gradient goes on along m. One whose objective could not be
+    computed sends the search back to its best configuration, with m = v = 0 and half the rate. While there is no
     gradient but zero the step is random; after five zero gradients in a row there is nothing more to propose.
 
     Attributes:

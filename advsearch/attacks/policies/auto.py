@@ -315,9 +315,9 @@ class Portfolio(Raced):
     """Lets several policies search side by side and goes on with those that reached more.
 
     With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see `choices`. Within a round every
-    policy that is still in has an equal share; after it the better half goes on, by the largest objective reached so far. So
-    of two policies each has a quarter of the renders, and the better one the other half. Each plans for what it gets
-    if it stays in.
+    policy that is still in has an equal share; after it the better half goes on, by the largest objective reached so
+    far. So of two policies each has a quarter of the renders, and the better one the other half. Each plans for what it
+    gets if it stays in.
 
     A policy that cannot search the domain (it says so with an InputError: a grid over a texture) is left out; if none
     can, the first one's error is passed on.
