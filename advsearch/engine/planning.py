@@ -19,8 +19,7 @@ from torch import Tensor
 
 from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
 from advsearch.runs.results.derivatives import CosineRow, GradientStatus
-from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, compared
+from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, Group, compared
 from advsearch.scene.renderer import Renderer
 
 GOAL = 0.9

@@ -15,8 +15,7 @@ from torch import Tensor
 from advsearch.engine.sweeps.predicting import PAYS, SweptPredictor
 from advsearch.engine.transport import CHECK_SPP, Deviation, deviation_under_light
 from advsearch.files import scaled
-from advsearch.scene.transport.lights import BasisRenderer, Lights, lighting
-from advsearch.scene.transport.plan import NOISE
+from advsearch.scene.transport.lights import NOISE, BasisRenderer, Lights, lighting
 from advsearch.scene.transport.renderer import MOST_BYTES, SPP
 
 
