@@ -1,4 +1,4 @@
-"""Pictures of radiance as linear red, green and blue: OpenEXR (which part, layer, window, channels) and Radiance (.hdr).
+"""Pictures of radiance in linear RGB: OpenEXR (which part, layer, window, channels) and Radiance (.hdr).
 
 The format of the first is that of the OpenEXR project, "Technical Introduction to OpenEXR" and "OpenEXR File Layout".
 The second has shared-exponent RGB, run-length encoded line by line, as in the Radiance reference manual, "File Formats"
