@@ -33,7 +33,7 @@ from advsearch.config import AttackConfig  # noqa: E402
 from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.scene.gradients.group import Group  # noqa: E402
+from advsearch.scene.gradients import Group  # noqa: E402
 from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 

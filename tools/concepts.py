@@ -1,4 +1,4 @@
-"""Counts what a stranger has to learn: python tools/concepts.py [CHECKOUT] [--names]
+"""Counts what a stranger has to learn: python tools/concepts.py [CHECKOUT] [--names] [--inner]
 
 Lines of the package and its modules; lines with an untyped answer (`dict[str, Any]`, `Mapping[str, Any]`); class names
 and file names that occur several times; imports that go in a circle; modules that take a run's settings (a parameter
@@ -9,6 +9,8 @@ the worked example of docs/controls/writing.md.
 define, and names of modules that are a class's, a function's or an alias's elsewhere. One meaning are aliases of the
 same type, a command's module in each room, a module and its function of the same name, and what every module of a room
 has to define (`ENTRIES`). Methods, private names, imported names and `main` do not count.
+
+`--inner` prints the imports inside functions for which no comment, on their line or the line above, gives a reason.
 """
 
 from __future__ import annotations
@@ -59,6 +61,20 @@ def at_import(node: ast.AST) -> Iterator[ast.AST]:
             continue
         yield child
         yield from at_import(child)
+
+
+def inner_imports(text: str) -> dict[int, str]:
+    """Return the imports inside the functions of a module, by line: each with its reason, or an empty text."""
+    lines = text.splitlines()
+    found = {}
+    for function in ast.walk(ast.parse(text)):
+        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            for node in ast.walk(function):
+                if isinstance(node, (ast.Import, ast.ImportFrom)):
+                    beside = lines[node.lineno - 1].partition("#")[2]
+                    above = lines[node.lineno - 2].strip()
+                    found[node.lineno] = beside or (above if above.startswith("#") else "")
+    return found
 
 
 def circles(modules: Modules) -> list[list[str]]:
@@ -180,6 +196,7 @@ def main() -> int:
         "checkout", nargs="?", type=Path, default=Path(), help="folder of advsearch (default: this one)"
     )
     parser.add_argument("--names", action="store_true", help="list the names with several meanings")
+    parser.add_argument("--inner", action="store_true", help="list the imports inside functions without a reason")
     args = parser.parse_args()
     root = args.checkout.resolve()
     modules = modules_of(root)
@@ -200,6 +217,12 @@ def main() -> int:
         for name, where in names.items():
             print(f"{name:<24}{'; '.join(where).replace('advsearch.', '')}")
         return 0
+    inner = {name: inner_imports(text) for name, text in texts.items()}
+    bare = [(name, line) for name, found in inner.items() for line, reason in found.items() if not reason]
+    if args.inner:
+        for name, line in bare:
+            print(f"{modules[name].relative_to(root)}:{line}")
+        return 0
     print(f"lines of the package          {sum(lines):6d}   in {len(lines)} modules, median {lines[len(lines) // 2]}")
     print(f"lines with an untyped answer  {untyped:6d}")
     print(f"class names that come again   {len(classes):6d}   {', '.join(classes)}")
@@ -207,6 +230,7 @@ def main() -> int:
     print(f"names with several meanings   {len(names):6d}   (--names lists them)")
     print(f"modules that take settings    {len(settings):6d}")
     print(f"classes to add a control      {len(control):6d}   {', '.join(control)}")
+    print(f"imports inside functions      {sum(map(len, inner.values())):6d}   {len(bare)} without a reason (--inner)")
     found = circles(modules)
     print(f"circles of imports            {len(found):6d}   {'; '.join(' '.join(group) for group in found)}")
     return 0

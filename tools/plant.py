@@ -88,14 +88,14 @@ FAULTS = (
     ),
     Fault(
         "importing: a link is followed outside",
-        "advsearch/scene/importing/references.py",
+        "advsearch/scene/importing/files.py",
         "path = os.path.realpath(os.path.join(self._folder, name))",
         "path = os.path.normpath(os.path.join(self._folder, name))",
         ("tests/scene/test_importing.py",),
     ),
     Fault(
         "importing: the stride of a buffer is ignored",
-        "advsearch/scene/importing/gltf_buffers.py",
+        "advsearch/scene/importing/gltf.py",
         "data, step = self.view(view), stride or shape[1] * kind.itemsize",
         "data, step = self.view(view), shape[1] * kind.itemsize",
         ("tests/scene/test_gltf.py",),

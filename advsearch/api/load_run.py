@@ -21,8 +21,8 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
-from advsearch.scene.importing.exr import read_exr
 from advsearch.scene.importing.files import LARGEST_FILE
+from advsearch.scene.importing.hdr import read_exr
 
 
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:

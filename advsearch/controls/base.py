@@ -24,9 +24,9 @@ from advsearch.controls.values import is_number, is_whole
 from advsearch.described import Value as Value
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.gradients.group import WHOLE_RANGE as WHOLE_RANGE
-from advsearch.scene.gradients.group import Budget as Budget
-from advsearch.scene.gradients.group import Group as Group
+from advsearch.scene.gradients import WHOLE_RANGE as WHOLE_RANGE
+from advsearch.scene.gradients import Budget as Budget
+from advsearch.scene.gradients import Group as Group
 from advsearch.scene.parameters import Parameter as Parameter
 from advsearch.scene.parts import MeshPart, PluginPart
 

@@ -21,8 +21,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.runs.results.derivatives import GradientStatus
-from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import STEP_RANGE, GradientPlan
+from advsearch.scene.gradients import STEP_RANGE, GradientPlan, Group
 from advsearch.scene.renderer import Renderer
 
 Loss = Callable[[Tensor], Tensor]

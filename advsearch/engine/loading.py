@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.errors import InputError
-from advsearch.models.switches import plainly
+from advsearch.models.guards import plainly
 from advsearch.options import told
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
@@ -32,10 +32,10 @@ from advsearch.scene.description import (
     describe,
 )
 from advsearch.scene.formation import SAMPLER, ImageFormation
-from advsearch.scene.gradients.motion import Motion
 from advsearch.scene.importing.images import read_picture
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.motion import Motion
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.road import on_its_ground
 from advsearch.scene.settings import Given

@@ -25,8 +25,7 @@ from advsearch.models import Model
 from advsearch.runs.results.derivatives import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import GradientPlan
+from advsearch.scene.gradients import GradientPlan, Group
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.renderer import Linearised, LinearRenderer, linear_inputs
 from advsearch.tasks import Facts, Judgement, Mark, Task

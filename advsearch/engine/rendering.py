@@ -20,7 +20,7 @@ from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
-from advsearch.models.switches import plainly
+from advsearch.models.guards import plainly
 from advsearch.progress import Watched, watcher
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked

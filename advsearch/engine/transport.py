@@ -24,8 +24,15 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine.problem import Problem
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.lights import BasisRenderer
-from advsearch.scene.transport.plan import HAZE, NOISE, lights_to_collect, predicting, samples_to_collect, why_not
+from advsearch.scene.transport.lights import (
+    HAZE,
+    NOISE,
+    BasisRenderer,
+    lights_to_collect,
+    predicting,
+    samples_to_collect,
+    why_not,
+)
 from advsearch.scene.transport.renderer import TOO_LARGE, PredictingRenderer
 
 WORTH = 16

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from advsearch import threads
-from advsearch.models.switches import plainly
+from advsearch.models.guards import plainly
 
 _TURN = threading.RLock()
 """Held by the question at work: the threads of torch and Dr.Jit, and warnings that are caught, are the process's."""

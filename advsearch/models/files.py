@@ -1,7 +1,7 @@
 """Models in files: `torch.export` archives (.pt2) and TorchScript, told apart by content; and ONNX, by its suffix.
 
 No Python object is ever unpickled: archives that need it are refused. A model file is a program all the same; open only
-files whose makers you trust.
+files whose makers you trust. ONNX files are run by onnxruntime, which gives answers and no gradients.
 """
 
 from __future__ import annotations
@@ -11,22 +11,25 @@ import difflib
 import io
 import logging
 import os
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import torch
+from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError
 from advsearch.files import open_regular
-from advsearch.models import exported, onnx, torchscript
+from advsearch.models import exported, torchscript
 from advsearch.models.archive import LARGEST, Archive, open_archive, refused
-from advsearch.models.deadline import TookTooLong, try_torchscript
+from advsearch.models.guards import TookTooLong, try_torchscript
+from advsearch.models.labels import names_in
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, source_of
-from advsearch.models.zoo.library import without_unpickling
+from advsearch.models.zoo.library import library, without_unpickling
 
 #: Suffixes that make a name a file even if there is no such file.
 SUFFIXES = (".pt2", ".pt", ".pth", ".ts", ".torchscript", ".bin", ".pkl", ".pickle", ".ckpt", ".safetensors", ".onnx")
@@ -53,7 +56,7 @@ def load_file(path: Path) -> Source:
         if not head:
             raise FileFormatError(f"model file {path}: expected a model, got an empty file")
         if path.suffix.lower() == ".onnx":
-            return onnx.load(path)
+            return load_onnx(path)
         if head[:2] != b"PK":
             raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
@@ -192,3 +195,100 @@ def _quiet_export() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
+
+
+FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
+
+OLDEST = (1, 24)
+"""The first onnxruntime that reads no weights from outside the folder of a file; older ones follow `../` and links."""
+
+
+class OnnxNetwork(nn.Module):
+    """A session of onnxruntime as a function from a batch of images to its outputs; no gradient goes through it.
+
+    Args:
+        session: the session.
+        new_options: makes options of a run, by which it can be ended.
+    """
+
+    def __init__(self, session: Any, new_options: Callable[[], Any]) -> None:
+        super().__init__()
+        self.session, self.new_options = session, new_options
+        self.options = new_options()
+
+    def forward(self, images: Tensor) -> Tensor | tuple[Tensor, ...]:
+        """Return the only output, or all of them in their order."""
+        self.options = self.new_options()
+        given = {self.session.get_inputs()[0].name: images.detach().cpu().numpy()}
+        outputs = tuple(torch.from_numpy(output) for output in self.session.run(None, given, self.options))
+        return outputs[0] if len(outputs) == 1 else outputs
+
+    def stop(self) -> None:
+        """End the run that is going on: a file's program may never end."""
+        self.options.terminate = True
+
+
+def load_onnx(path: Path) -> Source:
+    """Return the network in an ONNX file that is known to be an ordinary one; onnxruntime holds its other files to its
+    folder.
+
+    Raises:
+        FileFormatError: it is damaged, or refers to files that are elsewhere.
+        ModelError: onnxruntime is missing or too old, or the network does not take one batch of images.
+    """
+    runtime = library("onnxruntime", str(path), "onnx")
+    _check_version(path, runtime.__version__)
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 4  # what is wrong is raised as well
+    try:
+        # What is constant is computed in each call, which has a deadline: while a session is made, nothing ends it.
+        session = runtime.InferenceSession(
+            str(path),
+            options,
+            providers=["CPUExecutionProvider"],
+            disabled_optimizers=["ConstantFolding"],
+            enable_fallback=0,  # it would print, and try the same again
+        )
+    except Exception as error:  # its errors have no type in common
+        raise FileFormatError(
+            f"model file {path}: cannot be read as ONNX with onnxruntime {runtime.__version__} ({first_line(error)})"
+        ) from error
+    inputs = session.get_inputs()
+    shape = inputs[0].shape if inputs else []
+    fixed = [side for side in shape if isinstance(side, int)]
+    if len(inputs) != 1 or len(shape) != 4 or inputs[0].type not in FLOATS or min(fixed, default=1) < 1:
+        found = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs) or "none"
+        raise ModelError(
+            f"model file {path}: expected one input, a batch of floating-point images of 4 dimensions, got {found}"
+        )
+    layout = "NHWC" if shape[3] == 3 and shape[1] != 3 else "NCHW"
+    sides = shape[1:3] if layout == "NHWC" else shape[2:4]
+    said = session.get_modelmeta().custom_metadata_map
+    if not all(isinstance(side, int) for side in sides):
+        sides = sizes_in(said.get("imgsz", ""))
+    return Source(
+        OnnxNetwork(session, runtime.RunOptions),
+        path.stem,
+        input_size=(sides[0], sides[1]) if sides else None,
+        layout=layout,
+        labels=names_in(said.get("names", "")),
+        batch_limits=(shape[0], shape[0]) if isinstance(shape[0], int) else (1, LARGEST_BATCH),
+        dtype=FLOATS[inputs[0].type],
+    )
+
+
+def sizes_in(text: str) -> tuple[int, int] | None:
+    """Return (height, width) of what YOLO's exporters write as `imgsz`, such as "[640, 640]"; None of anything else."""
+    found = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", text)
+    return (int(found[1]), int(found[2])) if found and min(int(found[1]), int(found[2])) > 0 else None
+
+
+def _check_version(path: Path, version: str) -> None:
+    """Refuse an onnxruntime before `OLDEST`."""
+    found = re.match(r"(\d+)\.(\d+)", version)
+    if found is None or (int(found[1]), int(found[2])) < OLDEST:
+        raise ModelError(
+            f"model {path}: needs onnxruntime {'.'.join(map(str, OLDEST))} or newer, got {version}, which may read "
+            "weights from anywhere that a file names: pip install -U 'advsearch[onnx]'"
+        )

@@ -14,11 +14,11 @@ from torch import nn
 from advsearch.errors import InputError, UnknownNameError, resembling
 from advsearch.models import files, imported, reference
 from advsearch.models import preprocessing as pre
+from advsearch.models.guards import called_under, plainly, turned_by_code
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
 from advsearch.models.model import Model, Preprocessing, Read
 from advsearch.models.probe import probe
 from advsearch.models.source import Purpose, Source, source_of
-from advsearch.models.switches import called_under, plainly, turned_by_code
 from advsearch.models.zoo import timm, torchvision, transformers
 from advsearch.registry import Registry
 

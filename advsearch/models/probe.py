@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from advsearch import files
 from advsearch.errors import ModelError
-from advsearch.models.deadline import TookTooLong, within
+from advsearch.models.guards import TookTooLong, within
 from advsearch.models.labels import fitting_labels
 from advsearch.models.model import Detaching, Model, ModelWarning, each_tensor, logits_of, read_by
 

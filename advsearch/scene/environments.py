@@ -12,10 +12,9 @@ import numpy.typing as npt
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.importing.exr import Plane, Planes, read_exr
 from advsearch.scene.importing.files import read_bytes, safe_name
+from advsearch.scene.importing.hdr import Plane, Planes, linear, read_exr, read_radiance
 from advsearch.scene.importing.images import area_average, banded_average
-from advsearch.scene.importing.radiance import linear, read_radiance
 
 Floats = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
@@ -68,7 +67,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 
     Args:
         path: a Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone (grey), in half or float;
-            see `advsearch.scene.importing.exr`.
+            see `advsearch.scene.importing.hdr`.
 
     Raises:
         FileFormatError: the file is missing, of another kind, damaged, or lacks channels; the message names it.

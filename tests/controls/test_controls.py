@@ -16,7 +16,7 @@ from advsearch.controls import CONTROLS, OWN, BoundControl, TextureControl, make
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import describe
-from advsearch.scene.gradients.plan import ESTIMATORS
+from advsearch.scene.gradients import ESTIMATORS
 from advsearch.scene.settings import SETTINGS
 
 every_control = pytest.mark.parametrize("kind", CONTROLS)

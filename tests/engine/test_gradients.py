@@ -35,8 +35,7 @@ from advsearch.questions.check.settings import CheckConfig
 from advsearch.questions.check.words import shown
 from advsearch.runs.results.derivatives import CosineRow
 from advsearch.scene.formation import ImageFormation
-from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import ESTIMATORS, SEARCH_STEP, first_plan
+from advsearch.scene.gradients import ESTIMATORS, SEARCH_STEP, Group, first_plan
 from advsearch.scene.renderer import Renderer
 
 SIZE = 48

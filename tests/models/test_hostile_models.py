@@ -18,7 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError
-from advsearch.models import expressions, load_model
+from advsearch.models import exported as reader
+from advsearch.models import load_model
 
 Program = dict[str, Any]
 
@@ -292,7 +293,7 @@ def test_sizes_that_depend_on_each_other_are_loaded(tmp_path: Path) -> None:
     ],
 )
 def test_expressions_of_sizes_that_are_read(text: str) -> None:
-    assert expressions.problem(text) == ""
+    assert reader.problem(text) == ""
 
 
 @pytest.mark.parametrize(
@@ -329,7 +330,7 @@ def test_expressions_of_sizes_that_are_read(text: str) -> None:
     ],
 )
 def test_expressions_that_are_none(text: str) -> None:
-    message = expressions.problem(text)
+    message = reader.problem(text)
     assert message and len(message) < 250
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.models import load_model
-from advsearch.models.switches import PLAIN, Switches, plainly
+from advsearch.models.guards import PLAIN, Switches, plainly
 
 TURNED = {
     "type": Switches(dtype=torch.float64),

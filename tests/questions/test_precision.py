@@ -70,7 +70,7 @@ from advsearch.questions.precision.settings import PrecisionConfig
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_result
 from advsearch.scene.formation import next_count
-from advsearch.scene.gradients.group import Group
+from advsearch.scene.gradients import Group
 
 SIZE = 400
 """Numbers in a synthetic picture."""

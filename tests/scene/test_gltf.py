@@ -21,8 +21,7 @@ from advsearch.scene.assets import EnvironmentAsset, Material
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.images import display_image
 from advsearch.scene.importing.imported_part import ImportedPart
-from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.parts import read_parts
+from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.texture import filtered, sampled
 
 REPEAT, MIRRORED, CLAMPED, NEAREST, LINEAR = 10497, 33648, 33071, 9728, 9729

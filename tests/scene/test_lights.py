@@ -14,7 +14,7 @@ import advsearch
 from advsearch.engine import transport as searching
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport import plan
+from advsearch.scene.transport import lights
 from advsearch.scene.transport.lights import BasisRenderer, Span, lighting
 
 SIZE = 32
@@ -149,14 +149,14 @@ def test_texture_and_light_are_predicted_together() -> None:
     ],
 )
 def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], reason: str | None) -> None:
-    assert plan.why_not(rendered_by(controls, **options)) == reason
+    assert lights.why_not(rendered_by(controls, **options)) == reason
 
 
 def test_a_light_of_a_mitsuba_scene_is_in_no_basis_picture() -> None:
     """It would be in the picture of each light, as often as the power of that one says."""
     loaded = advsearch.load_scene("large-box", scene=mitsuba().cornell_box())
     made = loaded.renderer({"light:spot": {"power": [0, 12]}}, resolution=8)
-    assert plan.why_not(made) == "spot.power changes light, and the scene has other lights of its own"
+    assert lights.why_not(made) == "spot.power changes light, and the scene has other lights of its own"
     assert not lighting(made).moved
 
 

@@ -21,7 +21,7 @@ from advsearch.questions.attack.curve import curve_from_config
 from advsearch.runs.summary import attack_of
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport import plan
+from advsearch.scene.transport import lights
 from advsearch.scene.transport import renderer as linear
 from advsearch.scene.transport.matrix import COARSE, TextureTransport
 
@@ -167,7 +167,7 @@ def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for()
 )
 def test_where_it_can_predict(controls: object, options: dict[str, object], reason: str | None) -> None:
     made = advsearch.load_scene("mug").renderer(controls, resolution=16, **options)  # type: ignore[arg-type]
-    assert plan.why_not(made) == reason
+    assert lights.why_not(made) == reason
 
 
 def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,7 +183,7 @@ SMALL = {"resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8, "control
 
 def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
     made, guesses = 0, 0
-    linearised, likely = plan.predicting, searching.Transport.likely
+    linearised, likely = lights.predicting, searching.Transport.likely
 
     def counted(*given: Any) -> Any:
         nonlocal made
@@ -205,7 +205,7 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
 
 @pytest.mark.slow
 def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    made, linearised = 0, plan.predicting
+    made, linearised = 0, lights.predicting
 
     def counted(*given: Any) -> Any:
         nonlocal made

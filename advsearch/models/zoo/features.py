@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from advsearch.errors import InputError, ModelError
 from advsearch.models.source import Purpose, Source
 from advsearch.models.zoo import zero_shot
-from advsearch.models.zoo.loaded import Loaded
-from advsearch.models.zoo.processors import Measured
+from advsearch.models.zoo.loaded import Loaded, Measured
 
 TASK = "similarity"
 """The task that compares features."""

@@ -19,10 +19,9 @@ from torch.nn import functional
 from advsearch.errors import ModelError, resembling
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
-from advsearch.models.zoo import depth_maps, features, language, mask_queries, open_vocabulary, timm, zero_shot
+from advsearch.models.zoo import features, language, pixels, timm, zero_shot
 from advsearch.models.zoo.library import library, reading
-from advsearch.models.zoo.loaded import Loaded, in_pixels
-from advsearch.models.zoo.processors import processor_of
+from advsearch.models.zoo.loaded import Loaded, in_pixels, processor_of
 
 
 @dataclass(frozen=True)
@@ -272,18 +271,18 @@ NETWORKS = (
     ),
     Family(_called("ForSemanticSegmentation"), "AutoModelForSemanticSegmentation", _with_names(_Segmenter)),
     Family(
-        mask_queries.is_ours,
+        pixels.is_ours,
         "AutoModelForUniversalSegmentation",
-        lambda loaded: mask_queries.source(loaded, names_of(loaded.network.config) or None),
+        lambda loaded: pixels.mask_source(loaded, names_of(loaded.network.config) or None),
     ),
     Family(
-        lambda architecture, network: open_vocabulary.finds(architecture),
+        lambda architecture, network: zero_shot.finds(architecture),
         "AutoModelForZeroShotObjectDetection",
-        open_vocabulary.source,
+        zero_shot.detector_source,
     ),
     Family(_called("ForObjectDetection"), "AutoModelForObjectDetection", _with_names(_Detector)),
     Family(language.speaks, "AutoModelForImageTextToText", language.source),
-    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", depth_maps.source),
+    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", pixels.depth_source),
     Family(
         lambda architecture, network: zero_shot.compares(network),
         "AutoModel",

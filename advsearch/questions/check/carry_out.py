@@ -54,8 +54,7 @@ from advsearch.questions.plan.carry_out import PlanKeywords
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.derivatives import CosineRow
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
-from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import STEP_RANGE, compared
+from advsearch.scene.gradients import STEP_RANGE, Group, compared
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

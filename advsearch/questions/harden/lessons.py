@@ -33,7 +33,7 @@ from advsearch.models import Model
 from advsearch.runs.files import replacing
 from advsearch.runs.images import write_png
 from advsearch.scene.formation import levels_of, to_8_bit
-from advsearch.scene.transport.plan import why_not
+from advsearch.scene.transport.lights import why_not
 from advsearch.scene.transport.renderer import LinearRenderer
 
 SPP, DEPTH = 2, 4

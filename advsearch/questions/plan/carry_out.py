@@ -33,7 +33,7 @@ from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.derivatives import CosineRow, PathLength
-from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES
+from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

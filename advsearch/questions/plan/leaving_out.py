@@ -24,7 +24,7 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.plan import predicting, why_not
+from advsearch.scene.transport.lights import predicting, why_not
 from advsearch.scene.transport.renderer import SPP
 
 ALL = "everything above"

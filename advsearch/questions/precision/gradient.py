@@ -16,8 +16,7 @@ from advsearch.engine.gradients import Estimate, Loss, Probe, agreement, estimat
 from advsearch.questions.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.questions.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
 from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
-from advsearch.scene.gradients.group import Group
-from advsearch.scene.gradients.plan import BY_ADJOINT, compared
+from advsearch.scene.gradients import BY_ADJOINT, Group, compared
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.renderer import LinearRenderer, linear_inputs
 

@@ -21,8 +21,8 @@ from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
 from advsearch.scene.description import describe
 from advsearch.scene.formation import ImageFormation
-from advsearch.scene.gradients.motion import Motion
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.motion import Motion
 from advsearch.scene.parts import ScenePart
 from advsearch.scene.renderer import Renderer
 

@@ -11,13 +11,11 @@ import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing import gltf_notes
-from advsearch.scene.importing.files import check_faces, damaged
-from advsearch.scene.importing.gltf import binary_chunk, read_header
-from advsearch.scene.importing.gltf_buffers import Buffers
+from advsearch.scene.importing.files import References, check_faces, damaged
+from advsearch.scene.importing.gltf import Buffers, binary_chunk, read_header
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header, MaterialEntry, Node, Primitive, TextureUse
 from advsearch.scene.importing.gltf_surfaces import GltfSurfaces
 from advsearch.scene.importing.imported_part import ImportedPart, placed
-from advsearch.scene.importing.references import References
 from advsearch.scene.importing.surfaces import ImportedSurface
 
 Array = npt.NDArray[np.float64]
@@ -32,7 +30,7 @@ DEFAULT = "mesh{es} without material: of white metal with roughness 1, the defau
 
 @np.errstate(all="ignore")
 def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
-    """Parse a glTF file; arguments, results and errors as for `advsearch.scene.importing.parts.read_parts`."""
+    """Parse a glTF file; arguments, results and errors as for `advsearch.scene.importing.objects.read_parts`."""
     header, references = read_header(path, data), References(path)
     chunk = None if path.suffix.lower() == ".gltf" else binary_chunk(data)
     buffers = Buffers(path, header, chunk, references)

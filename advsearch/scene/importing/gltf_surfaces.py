@@ -12,8 +12,8 @@ from PIL import Image
 
 from advsearch.pictures import FORMATS
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.files import shown
-from advsearch.scene.importing.gltf_buffers import Buffers
+from advsearch.scene.importing.files import References, shown
+from advsearch.scene.importing.gltf import Buffers
 from advsearch.scene.importing.gltf_entries import (
     CLAMPED,
     CUT_OUTS,
@@ -26,7 +26,6 @@ from advsearch.scene.importing.gltf_entries import (
 )
 from advsearch.scene.importing.normal_maps import normal_map
 from advsearch.scene.importing.pictures import Kind, Pictures
-from advsearch.scene.importing.references import References
 from advsearch.scene.importing.surfaces import ImportedSurface, limited_radiance, unit, with_opacity
 
 Array = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from advsearch.scene.importing.files import Inventory, shown, text_of
+from advsearch.scene.importing.files import Inventory, References, plain_name, shown, text_of
 from advsearch.scene.importing.mtl import (
     MapUse,
     MtlMaterial,
@@ -24,7 +24,6 @@ from advsearch.scene.importing.mtl import (
 )
 from advsearch.scene.importing.normal_maps import holds_normals, normal_map
 from advsearch.scene.importing.pictures import Kind, Pictures
-from advsearch.scene.importing.references import References, plain_name
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface, limited_radiance, with_opacity
 
 Floats = npt.NDArray[np.float32]

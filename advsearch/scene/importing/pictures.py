@@ -14,9 +14,8 @@ from PIL import Image
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_pixels
-from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.files import plain_name, shown
 from advsearch.scene.importing.images import TEXTURE_LIMIT, display_image
-from advsearch.scene.importing.references import plain_name
 
 Floats = npt.NDArray[np.float32]
 Kind = Literal["colours", "colours and alpha", "numbers"]

@@ -13,12 +13,11 @@ import numpy.typing as npt
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import MOST_CORNERS, Inventory, check_faces, damaged, shown
+from advsearch.scene.importing.files import MOST_CORNERS, Inventory, References, check_faces, damaged, shown
 from advsearch.scene.importing.imported_part import ImportedPart, Looked, split_at_corners
 from advsearch.scene.importing.pictures import Pictures
 from advsearch.scene.importing.ply_elements import Element, Lists, read_elements
 from advsearch.scene.importing.polygons import triangulated
-from advsearch.scene.importing.references import References
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
 
 Array = npt.NDArray[np.float64]

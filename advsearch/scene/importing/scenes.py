@@ -26,8 +26,7 @@ from advsearch.scene.importing.geometry import FLAT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light
 from advsearch.scene.importing.gltf_parts import poses
 from advsearch.scene.importing.imported_part import ImportedPart, visible
-from advsearch.scene.importing.objects import object_of
-from advsearch.scene.importing.parts import GLTF, read_parts
+from advsearch.scene.importing.objects import GLTF, object_of, read_parts
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
 
 Doubles = npt.NDArray[np.float64]

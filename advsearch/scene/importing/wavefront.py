@@ -19,6 +19,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
     Inventory,
+    References,
     check_faces,
     damaged,
     is_number,
@@ -31,7 +32,6 @@ from advsearch.scene.importing.imported_part import ImportedPart, Looked, split_
 from advsearch.scene.importing.mtl import without_comment
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
 from advsearch.scene.importing.polygons import triangulated
-from advsearch.scene.importing.references import References
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
 
 Array = npt.NDArray[np.float64]

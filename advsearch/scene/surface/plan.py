@@ -10,7 +10,7 @@ from torch import Tensor
 from advsearch.scene.description import OBJECT
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE
-from advsearch.scene.transport.plan import NOISE
+from advsearch.scene.transport.lights import NOISE
 
 PLACES = (0.02, 0.29, 0.61, 0.97)
 """Places in the range of what varies at which is looked what it changes."""

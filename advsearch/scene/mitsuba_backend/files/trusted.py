@@ -19,10 +19,9 @@ from advsearch.files import note_opened
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
 from advsearch.scene.environments import import_environment, read_light
-from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.files import References, shown
 from advsearch.scene.importing.images import TEXTURE_LIMIT, banded_average, read_picture
-from advsearch.scene.importing.parts import read_parts
-from advsearch.scene.importing.references import References
+from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.mitsuba_backend.variant import Plugin
 
 STOCK = frozenset(

@@ -19,8 +19,7 @@ import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
-from advsearch.scene.importing.references import References
+from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
 from advsearch.scene.mitsuba_backend.variant import Plugin
 
 SUFFIX = ".xml"

@@ -1,8 +1,8 @@
-"""How fast each coordinate of u moves points in the picture, and the width of a difference that follows from it.
+"""How fast each coordinate of u moves points in the picture, and derivatives by differences of a width that fits.
 
 A smooth loss is best differenced over about one pixel of motion of the fastest outline, never over a fixed length in
 the world (docs/gradients.md, "The estimators"): narrower and noise wins, wider and the loss bends. For a classifier's
-see `plan.SEARCH_STEP`.
+see `gradients.SEARCH_STEP`. The renders of a difference share their random numbers, and have no graph.
 """
 
 from __future__ import annotations
@@ -16,7 +16,33 @@ from torch import Tensor
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.gradients.plan import DEFAULT_PIXELS, DEFAULT_STEP, STEP_RANGE
+from advsearch.scene.gradients import DEFAULT_PIXELS, DEFAULT_STEP, STEP_RANGE, Group
+
+Value = Callable[[Tensor], Tensor]
+"""From a configuration (d,) to one number, at one seed."""
+
+
+def central(value: Value, group: Group, u: Tensor, found: Tensor) -> None:
+    """Two values for each coordinate of a group, `group.step` to either side."""
+    for number in range(group.begin, group.begin + group.size):
+        step = torch.zeros_like(u)
+        step[number] = group.step
+        (above, up), (below, down) = moved(u, step, group.periodic), moved(u, -step, group.periodic)
+        rise = value(above) - value(below)
+        found[number] = float(rise) / float((up - down)[number])
+
+
+def moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Tensor]:
+    """Return u + step brought back into the box, and the step that was really taken.
+
+    Periodic coordinates wrap around, so that they can go the whole step.
+    """
+    there = u + step
+    wrapped = torch.remainder(there, 1.0)
+    clipped = there.clamp(0.0, 1.0)
+    cyclic = torch.as_tensor(periodic).expand(u.shape)
+    return torch.where(cyclic, wrapped, clipped), torch.where(cyclic, step, clipped - u)
+
 
 POINTS = 400
 """Vertices of a mesh that are followed."""

@@ -1,0 +1,187 @@
+"""What code of others must not do to us: never end, or leave torch's global switches turned.
+
+Neither a signal nor an exception ends torch's own loops, so a call goes on in a thread of its own, which is left behind
+when the time is up; what would also hold Python up is tried in a process of its own first. All our own code runs with
+torch's switches as torch comes. A network is called with the type and device for new tensors that its own code has
+chosen. Gradients are ours to switch.
+"""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import torch
+from torch import nn
+
+from advsearch import files
+
+LONGEST = 120
+"""Seconds that a file's first passes may take each, and its loading, where that runs a part of it."""
+
+GRACE = 5
+"""Seconds for a call to end that was asked to."""
+
+_TRIAL = "import io, sys, torch; torch.jit.load(io.BytesIO(sys.stdin.buffer.read()), map_location='cpu')"
+
+Result = TypeVar("Result")
+
+
+class TookTooLong(Exception):
+    """The time was up; the message says what the limit is and how it is raised."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            f"no answer within {files.scaled(LONGEST)} seconds; if you trust it, {files.FACTOR}=10 in the environment "
+            "waits ten times as long"
+        )
+
+
+def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -> Result:
+    """Return what `call` returns, or raise what it raises.
+
+    Args:
+        call: what may never end.
+        stop: asks it to end when the time is up; None where nothing can.
+
+    Raises:
+        TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
+    """
+    results: list[Result] = []
+    errors: list[BaseException] = []
+    gradients = torch.is_grad_enabled()  # a thread has its own
+
+    def work() -> None:
+        try:
+            with torch.set_grad_enabled(gradients):
+                results.append(call())
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work, daemon=True)  # a daemon's: the process may end before it
+    thread.start()
+    thread.join(files.scaled(LONGEST))
+    if thread.is_alive():
+        if stop is not None:
+            stop()
+            thread.join(GRACE)
+        raise TookTooLong
+    if errors:
+        raise errors[0]
+    return results[0]
+
+
+def try_torchscript(archive: io.BytesIO) -> str:
+    """Load TorchScript in a process of its own, and return what is wrong, or nothing: torch keeps Python waiting
+    meanwhile.
+
+    An error that torch raises is not told: loading it here raises it again.
+
+    Raises:
+        TookTooLong: as for `within`.
+    """
+    command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
+    try:
+        done = subprocess.run(command, input=archive.getbuffer(), capture_output=True, timeout=files.scaled(LONGEST))
+    except subprocess.TimeoutExpired:
+        raise TookTooLong from None
+    return f"torch crashed while loading it (signal {-done.returncode})" if done.returncode < 0 else ""
+
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Switches:
+    """The state of torch's switches.
+
+    Attributes:
+        dtype, device: of new tensors.
+        gradients: whether operations are recorded, in this thread.
+        deterministic: 0, 1 where operations that are not deterministic warn, 2 where they raise.
+        anomalies: whether NaN in a derivative raises.
+    """
+
+    dtype: torch.dtype = torch.float32
+    device: torch.device = CPU
+    gradients: bool = True
+    deterministic: int = 0
+    anomalies: bool = False
+
+    @classmethod
+    def now(cls) -> Switches:
+        """Return them as they are."""
+        return cls(
+            torch.get_default_dtype(),
+            torch.get_default_device(),
+            torch.is_grad_enabled(),
+            torch.get_deterministic_debug_mode(),
+            torch.is_anomaly_enabled(),
+        )
+
+    def turn(self) -> None:
+        """Turn all of them."""
+        self.turn_for_new_tensors()
+        torch.set_grad_enabled(self.gradients)
+        torch.set_deterministic_debug_mode(self.deterministic)
+        torch.autograd.set_detect_anomaly(self.anomalies)
+
+    def turn_for_new_tensors(self) -> None:
+        """Turn those for new tensors."""
+        torch.set_default_dtype(self.dtype)
+        if torch.get_default_device() != self.device:
+            torch.set_default_device(None if self.device.type == "cpu" else self.device)
+
+
+PLAIN = Switches()
+
+_outside: list[Switches] = []
+"""As `plainly` found them, the outermost first."""
+
+
+@contextmanager
+def plainly() -> Iterator[None]:
+    """Turn torch's switches as it comes, and back at the end: also out of `torch.inference_mode`."""
+    with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+        found = Switches.now()
+        _outside.append(found)
+        if found != PLAIN:
+            PLAIN.turn()
+        try:
+            yield
+        finally:
+            _outside.pop()
+            if Switches.now() != found:
+                found.turn()
+
+
+def turned_by_code() -> Switches:
+    """Return the switches as the code of a network has turned them just now, or had before; they are `PLAIN` then."""
+    found = Switches.now()
+    if found == PLAIN:
+        return _outside[0] if _outside else PLAIN
+    PLAIN.turn()
+    return found
+
+
+def called_under(module: nn.Module, switches: Switches) -> None:
+    """Have a module called with switches of its own for new tensors, and those of the caller afterwards."""
+    if (switches.dtype, switches.device) == (PLAIN.dtype, PLAIN.device):
+        return
+    before: list[Switches] = []
+
+    def enter(*_: Any) -> None:
+        before.append(Switches.now())
+        switches.turn_for_new_tensors()
+
+    def leave(*_: Any) -> None:
+        before.pop().turn_for_new_tensors()
+
+    module.register_forward_pre_hook(enter)
+    module.register_forward_hook(leave, always_call=True)

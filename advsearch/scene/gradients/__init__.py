@@ -1,1 +1,0 @@
-"""How pictures are differentiated: the plan, differences, and the motion of coordinates."""
