@@ -157,8 +157,7 @@ def _asserted(
     from advsearch.engine.naming import exists_here, model_name
     from advsearch.engine.turn import in_turn
     from advsearch.questions.test.carry_out import test_from_config
-    from advsearch.questions.test.settings import SuiteConfig
-    from advsearch.questions.test.suite import suite_of
+    from advsearch.questions.test.settings import SuiteConfig, suite_of
 
     name = str(claim["claim"]).replace("_", "-")
     with ExitStack() as stack:

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    from advsearch.questions.photographs.page import NO_QR, qr_text
+    from advsearch.questions.photographs.serving import NO_QR, qr_text
     from advsearch.runs.directory import find_run
     from advsearch.viewer.server import Dashboard
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from advsearch.cli import output
-from advsearch.cli.screen import output_errors
+from advsearch.cli.output import output_errors
 from advsearch.errors import InputError
 
 Written = tuple[dict[str, object], str]
@@ -124,7 +124,7 @@ def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
     """Write a dataset of the pictures that were kept."""
     from advsearch.runs.directory import find_run
     from advsearch.runs.fiftyone import write_fiftyone
-    from advsearch.viewer.pictured import name_of_object, pictured
+    from advsearch.viewer.thumbnails import name_of_object, pictured
 
     folder = find_run(args.run)
     count = write_fiftyone(lambda: pictured(folder), out, folder.resolve().name, name_of_object(folder))
@@ -133,11 +133,11 @@ def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
 
 def _print(args: argparse.Namespace, out: Path) -> Written:
     """Write the sheets."""
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     longest = USUAL_SIZE if args.size is None else args.size
     with at_work(as_json=True, quiet=False):
-        from advsearch.engine.printing import printable
+        from advsearch.api.export import printable
         from advsearch.report.sheets import MOST_SHEETS, write_sheets
         from advsearch.runs.files import placed_by, replacing
 
@@ -156,10 +156,10 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
 
 def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial scene."""
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     with at_work(as_json=True, quiet=False):
-        from advsearch.api.export_scene import write_mitsuba
+        from advsearch.api.export import write_mitsuba
 
         notes = write_mitsuba(args.run, out)
     return {"notes": notes}, " ".join([f"The scene is in {out}.", *notes])
@@ -167,10 +167,10 @@ def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
 
 def _gltf(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial object."""
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     with at_work(as_json=True, quiet=False):
-        from advsearch.api.export_scene import write_gltf
+        from advsearch.api.export import write_gltf
 
         notes = write_gltf(args.run, out)
     return {"notes": notes}, " ".join([f"The object is in {out}.", *notes])

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what was understood."""
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":

@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: no class is like the word, or the model has no names for its classes.
     """
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     with at_work(as_json=True, quiet=False):
         from advsearch.models import matching_labels

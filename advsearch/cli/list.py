@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the names of one kind, or of all."""
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     kinds = list(REGISTRIES) if args.kind == "all" else [args.kind]
     with at_work(as_json=True, quiet=False):

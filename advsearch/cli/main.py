@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from advsearch import __version__
-from advsearch.cli.screen import end_output, open_descriptors, screens, shortened
+from advsearch.cli.output import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.rooms import there

@@ -114,7 +114,7 @@ class QuestionCommand:
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the answer and return the exit status."""
-        from advsearch.cli.progress import at_work
+        from advsearch.cli.output import at_work
 
         with at_work(as_json=as_json, quiet=quiet) as progress:
             from advsearch.api import carry_out

@@ -22,7 +22,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from advsearch.cli.screen import raw
+from advsearch.cli.output import raw
 
 HELP = "show what a run found, or the details of a control, a policy, a task or a recipe"
 
@@ -139,7 +139,7 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
 
 
 def _show_control(name: str, as_json: bool) -> int:
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     with at_work(as_json=True, quiet=False):
         from advsearch.cli.list import first_doc_line
@@ -164,7 +164,7 @@ def _show_control(name: str, as_json: bool) -> int:
 
 
 def _show_options(kind: str, name: str, as_json: bool) -> int:
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     with at_work(as_json=True, quiet=False):
         from advsearch.attacks import POLICIES

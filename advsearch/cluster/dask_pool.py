@@ -22,7 +22,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from advsearch.cluster.pool import Disconnected, Dropped, Ended, Event, Joined, Left
+from advsearch.cluster.executor import Disconnected, Dropped, Ended, Event, Joined, Left
 from advsearch.cluster.worker import Failure
 from advsearch.errors import ClusterError
 

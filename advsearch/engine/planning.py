@@ -24,7 +24,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
 from advsearch.engine.problem import Problem
-from advsearch.runs.results.derivatives import CosineRow, GradientStatus, PathCut, PathLength
+from advsearch.runs.results.base import CosineRow, GradientStatus, PathCut, PathLength
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, compared
 from advsearch.scene.renderer import Renderer

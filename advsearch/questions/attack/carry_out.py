@@ -194,11 +194,11 @@ def attack_from_config(
         InputError: anything that the caller can put right; nothing is written then.
     """
     if config.is_matrix:
-        from advsearch.questions.attack.matrix import matrix_from_config
+        from advsearch.questions.attack.several import matrix_from_config
 
         return matrix_from_config(config, progress=progress, resumed=resumed)
     if config.is_curve:
-        from advsearch.questions.attack.curve import curve_from_config
+        from advsearch.questions.attack.several import curve_from_config
 
         return curve_from_config(config, progress=progress, resumed=resumed)
     return attack_once(config, progress=progress, resumed=resumed)

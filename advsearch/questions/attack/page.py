@@ -32,7 +32,7 @@ from advsearch.viewer.document import (
     study_table,
     subject_html,
 )
-from advsearch.viewer.turning import object_data, object_section, read_object
+from advsearch.viewer.pages import object_data, object_section, read_object
 
 LARGE_PICTURE = 1_000_000
 """Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""

@@ -31,8 +31,7 @@ from advsearch.questions.plan.leaving_out import measured_gains, most_gradients,
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import Formation
-from advsearch.runs.results.derivatives import CosineRow, PathLength
+from advsearch.runs.results.base import CosineRow, Formation, PathLength
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.explanations.answered import ANSWER, GROUP, PART, PHOTOGRAPHS
+from advsearch.explanations.observations import ANSWER, GROUP, PART, PHOTOGRAPHS
 from advsearch.questions.recipe.figures import read_options
 from advsearch.questions.recipe.figures.base import Options
 from advsearch.settings import read_yaml
 from advsearch.settings.configuration import PLACE
-from advsearch.settings.yaml_files import merged
+from advsearch.settings.values import merged
 
 COMMANDS = ("attack", "sweep")
 """What a part may be."""

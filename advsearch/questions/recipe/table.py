@@ -9,7 +9,16 @@ from pathlib import Path
 
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.explanations.answered import ANSWER, GROUP, OTHERS, PART, PHOTOGRAPHS, Answered, answered, figure_value
+from advsearch.explanations.observations import (
+    ANSWER,
+    GROUP,
+    OTHERS,
+    PART,
+    PHOTOGRAPHS,
+    Answered,
+    answered,
+    figure_value,
+)
 from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO
 from advsearch.questions.recipe.answer import NamedCount
 from advsearch.runs.results.sweep import SurfaceMap, SweepSummary

@@ -37,8 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the files."""
-    from advsearch.questions.report.page import evidence_page
-    from advsearch.questions.report.runs import markdown
+    from advsearch.questions.report.evidence import evidence_page, markdown
     from advsearch.runs.files import write_text
     from advsearch.runs.summary import to_json
 
@@ -75,7 +74,7 @@ def collected(runs: list[str]) -> Evidence:
         FileFormatError: what is kept of a run is something else.
     """
     from advsearch.questions.report.answer import Evidence
-    from advsearch.questions.report.claims import RULES, warnings_over
+    from advsearch.questions.report.evidence import RULES, warnings_over
     from advsearch.runs.directory import find_run
 
     folders = {part.resolve(): part for name in runs for part in _with_parts(find_run(name))}
@@ -121,8 +120,7 @@ def _settings(folder: Path) -> Mapping[str, object]:
 def _run(folder: Path) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
     from advsearch.questions.report.answer import EvidenceRun
-    from advsearch.questions.report.claims import QUICK, claims_of, nothing_there
-    from advsearch.questions.report.runs import NOT_NOTED, evidence_of
+    from advsearch.questions.report.evidence import NOT_NOTED, QUICK, claims_of, evidence_of, nothing_there
     from advsearch.runs.directory import CONFIG, typed_name
     from advsearch.runs.summary import NAME as SUMMARY
     from advsearch.runs.summary import read_result
@@ -175,7 +173,7 @@ def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
 
 def _photos(folder: Path) -> list[Claim]:
     from advsearch.cli.show import photos_of
-    from advsearch.questions.report.claims import photo_claims
+    from advsearch.questions.report.evidence import photo_claims
 
     photos = photos_of(folder)
     return photo_claims(photos) if photos else []

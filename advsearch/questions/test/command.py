@@ -33,7 +33,7 @@ class _Test(QuestionCommand):
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Try the claims, print their answers, write the files, and return the exit status."""
-        from advsearch.cli.progress import at_work
+        from advsearch.cli.output import at_work
         from advsearch.questions.test.answer import SuiteResult
 
         _check_files(config)
@@ -65,11 +65,11 @@ def _check_files(config: Config) -> None:
 
 def write_files(config: Config, result: SuiteResult) -> None:
     """Write the files for machines that a configuration asks for."""
-    from advsearch.questions.test import machines
+    from advsearch.questions.test import words
     from advsearch.runs.files import write_text
 
     for name, path in _files(config).items():
-        write_text(path, getattr(machines, name)(result), durable=False)
+        write_text(path, getattr(words, name)(result), durable=False)
 
 
 COMMAND = _Test("test", about="suite", place=Positional("SUITE", "a suite, a YAML file"))

@@ -24,7 +24,7 @@ from advsearch.questions.recipe.figures.scaling import SCALING
 from advsearch.questions.recipe.figures.surface import SURFACE
 from advsearch.questions.recipe.figures.ternary import TERNARY
 from advsearch.questions.recipe.table import Table
-from advsearch.report.drawing import Figures, drawn
+from advsearch.report.figures import Figures, drawn
 
 MODEL = "model"
 """The column that says which model answered."""

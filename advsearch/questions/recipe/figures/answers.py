@@ -7,11 +7,11 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe.answer import AnswersFigure, AnswersRow, GivenAnswer
 from advsearch.questions.recipe.figures.base import FigureKind, Options, plural
 from advsearch.questions.recipe.table import Table, count_of, counted, most_frequent
-from advsearch.report.drawing import BLUE, GREY, RED
+from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
 from advsearch.report.wording import interval_text
 

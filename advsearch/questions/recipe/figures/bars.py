@@ -8,7 +8,7 @@ from typing import Any
 from advsearch.questions.recipe.answer import BarsFigure
 from advsearch.questions.recipe.figures.base import FigureKind, Options, counted_by, extremes, plural
 from advsearch.questions.recipe.table import Table
-from advsearch.report.drawing import BLUE
+from advsearch.report.figures import BLUE
 
 
 class BarsOptions(Options):

@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks import clopper_pearson
-from advsearch.explanations.answered import TRIAL
+from advsearch.explanations.observations import TRIAL
 from advsearch.questions.recipe.answer import NamedCount, RecipeFigure
 from advsearch.questions.recipe.table import Table, counted
 from advsearch.report.phrases import percent

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe.answer import CorruptionFigure, CorruptionModel, NamedCount
 from advsearch.questions.recipe.figures.base import FigureKind, Options, extremes, intervals_apart, rate_with_interval
 from advsearch.questions.recipe.figures.curve import COLOURS

@@ -11,11 +11,11 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe.answer import CuesFigure, CuesRow, NamedCount
 from advsearch.questions.recipe.figures.base import FigureKind, Options, extremes, rate_with_interval
 from advsearch.questions.recipe.table import Table, count_of, counted
-from advsearch.report.drawing import BLUE, RED
+from advsearch.report.figures import BLUE, RED
 from advsearch.report.phrases import percent
 from advsearch.runs.results.base import Interval
 

@@ -9,12 +9,12 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations.answered import Answered, figure_value
+from advsearch.explanations.observations import Answered, figure_value
 from advsearch.questions.recipe.answer import CurveBin, CurveFigure, CurveLine, NamedCount
 from advsearch.questions.recipe.figures.base import FigureKind, Options, extremes, plural
 from advsearch.questions.recipe.figures.trend import fall_of, said
 from advsearch.questions.recipe.table import Table, count_of
-from advsearch.report.drawing import BLUE, GREY, RED
+from advsearch.report.figures import BLUE, GREY, RED
 
 COLOURS = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
 MARKS = ("o", "s", "^", "D", "v", "P")

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.errors import InputError
-from advsearch.explanations.answered import WORKERS, Answered, figure_value
+from advsearch.explanations.observations import WORKERS, Answered, figure_value
 from advsearch.questions.recipe.answer import ScalingFigure, ScalingPoint
 from advsearch.questions.recipe.figures.base import FigureKind, Options
 from advsearch.questions.recipe.table import Table
-from advsearch.report.drawing import BLUE
+from advsearch.report.figures import BLUE
 
 
 def _compute(table: Table, options: Options) -> ScalingFigure:

@@ -9,7 +9,7 @@ from advsearch.errors import InputError
 from advsearch.questions.recipe.answer import SurfaceFigure, SurfaceOf
 from advsearch.questions.recipe.figures.base import FigureKind, Options
 from advsearch.questions.recipe.table import Table
-from advsearch.report.surface_words import surface_sentences
+from advsearch.report.sweeps import surface_sentences
 from advsearch.runs.directory import IMAGES, PARTS
 
 SIZE = 6.4, 2.65

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe.answer import NamedCount
 from advsearch.questions.recipe.figures.base import rate_with_interval
 from advsearch.questions.recipe.table import count_of
