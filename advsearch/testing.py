@@ -17,6 +17,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from advsearch.questions.test.settings import SuiteConfig, suite_of
+
 if TYPE_CHECKING:
     from advsearch.engine.loading import Scene
     from advsearch.engine.naming import AnyModel
@@ -123,7 +125,6 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
     __tracebackhide__ = True
     from advsearch.engine.turn import in_turn
     from advsearch.questions.test.carry_out import test_from_config
-    from advsearch.questions.test.settings import SuiteConfig
 
     with in_turn():
         result = test_from_config(SuiteConfig(**{"suite": str(suite), **settings}))
@@ -157,7 +158,6 @@ def _asserted(
     from advsearch.engine.naming import exists_here, model_name
     from advsearch.engine.turn import in_turn
     from advsearch.questions.test.carry_out import test_from_config
-    from advsearch.questions.test.settings import SuiteConfig, suite_of
 
     name = str(claim["claim"]).replace("_", "-")
     with ExitStack() as stack:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from advsearch.cli import output
-from advsearch.cli.output import output_errors
+from advsearch.cli.output import at_work, output_errors
 from advsearch.errors import InputError
 
 Written = tuple[dict[str, object], str]
@@ -133,8 +133,6 @@ def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
 
 def _print(args: argparse.Namespace, out: Path) -> Written:
     """Write the sheets."""
-    from advsearch.cli.output import at_work
-
     longest = USUAL_SIZE if args.size is None else args.size
     with at_work(as_json=True, quiet=False):
         from advsearch.api.export import printable
@@ -156,8 +154,6 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
 
 def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial scene."""
-    from advsearch.cli.output import at_work
-
     with at_work(as_json=True, quiet=False):
         from advsearch.api.export import write_mitsuba
 
@@ -167,8 +163,6 @@ def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
 
 def _gltf(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial object."""
-    from advsearch.cli.output import at_work
-
     with at_work(as_json=True, quiet=False):
         from advsearch.api.export import write_gltf
 

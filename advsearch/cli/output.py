@@ -20,9 +20,11 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
 from advsearch.cli.flags import with_flags
+from advsearch.config import SceneConfig
 from advsearch.errors import AdvsearchError, StorageError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress, Progress
+from advsearch.settings import split_names
 from advsearch.watching import bars, lines
 
 if TYPE_CHECKING:
@@ -217,8 +219,6 @@ def go_on_command(run: str | Path) -> str:
 def _code_in(file: Path) -> Sequence[str]:
     """The Python code that a run.yaml names."""
     from advsearch.cli.run import command_in, config_of_file
-    from advsearch.config import SceneConfig
-    from advsearch.settings import split_names
 
     config = config_of_file(command_in(file), file, {})
     if not isinstance(config, SceneConfig):
@@ -290,8 +290,6 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
 
 def as_notes(texts: Sequence[str]) -> str:
     """Return notes below an answer, each a paragraph, with the flags of the settings that they name."""
-    from advsearch.cli.flags import with_flags  # settings, which `--help` does without
-
     return "".join(f"\n\nNote: {with_flags(text)}" for text in texts)
 
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.cli.list import first_doc_line
+from advsearch.cli.main import COMMANDS
+from advsearch.cli.output import at_work
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
+from advsearch.options import declared_options, default_of, type_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -65,9 +70,6 @@ def run(args: argparse.Namespace) -> int:
 
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     """Print the answer of a run, or how far one has come that has none yet, and draw its pictures if wanted."""
-    import importlib
-
-    from advsearch.cli.main import COMMANDS
     from advsearch.runs.directory import find_run
     from advsearch.runs.listing import listed_run
     from advsearch.runs.summary import NAME, read_result
@@ -139,10 +141,7 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
 
 
 def _show_control(name: str, as_json: bool) -> int:
-    from advsearch.cli.output import at_work
-
     with at_work(as_json=True, quiet=False):
-        from advsearch.cli.list import first_doc_line
         from advsearch.controls import CONTROLS
         from advsearch.runs.results.base import plain
 
@@ -164,12 +163,8 @@ def _show_control(name: str, as_json: bool) -> int:
 
 
 def _show_options(kind: str, name: str, as_json: bool) -> int:
-    from advsearch.cli.output import at_work
-
     with at_work(as_json=True, quiet=False):
         from advsearch.attacks import POLICIES
-        from advsearch.cli.list import first_doc_line
-        from advsearch.options import declared_options, default_of, type_of
         from advsearch.runs.results.base import plain
         from advsearch.tasks import TASKS
 

@@ -1,4 +1,7 @@
-"""The rows of sweeps as answers and as one table of numbers: what was shown, what the model said, and whether it was right."""
+"""The rows of sweeps as answers and as one table of numbers.
+
+What was shown, what the model said, and whether it was right.
+"""
 
 from __future__ import annotations
 

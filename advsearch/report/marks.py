@@ -1,4 +1,4 @@
-"""Pictures with something drawn into them: boxes and masks of what is true and what is said; or several on one sheet."""
+"""Pictures with something drawn into them, boxes and masks of what is true and what is said; or several on a sheet."""
 
 from __future__ import annotations
 

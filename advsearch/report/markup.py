@@ -1,6 +1,6 @@
-"""HTML that is escaped by construction: text becomes markup only through `element`. And answers as a notebook shows them.
+"""HTML that is escaped by construction: text becomes markup only through `element`.
 
-A notebook shows what is said, pictures or a figure, and tables, as HTML without styles.
+And answers as a notebook shows them: what is said, pictures or a figure, and tables, without styles.
 """
 
 from __future__ import annotations

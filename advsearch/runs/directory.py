@@ -17,6 +17,7 @@ from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExi
 from advsearch.files import JsonObject, open_regular
 from advsearch.runs import database, files, images, made_with, store, summary, tracking
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
+from advsearch.settings import HEADER
 from advsearch.yaml_text import LARGEST
 
 if TYPE_CHECKING:
@@ -440,7 +441,6 @@ def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
     if database.is_results_database(path / store.NAME):
         return True
-    from advsearch.settings import HEADER
 
     try:
         with open_regular(path / CONFIG, "a run.yaml", LARGEST) as file:

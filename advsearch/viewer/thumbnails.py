@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
+from PIL import Image
 
 from advsearch.described import Value
 from advsearch.errors import InputError
@@ -57,16 +58,12 @@ BYTES = 5000
 
 def thumbnail(picture: object) -> bytes:
     """Return a display-referred picture (H, W, 3) in [0, 1] as a JPEG of at most `SIDE` pixels a side."""
-    from PIL import Image
-
     values: Bytes = to_8bit(picture)
     return _jpeg(Image.fromarray(values))
 
 
 def cover(run: Path) -> bytes:
     """Return a small picture of a run as a JPEG: its worst answer, or else its first figure; grey where it has none."""
-    from PIL import Image
-
     first = [run / IMAGES / f"{name}.png" for name in ("adversarial", "clean", "worst")]
     for file in (*first, *sorted((run / IMAGES).glob("*.png"))):
         if file.is_symlink() or not file.is_file():
@@ -121,8 +118,6 @@ class Kept:
 
     def png_of(self, step: int) -> bytes | None:
         """Return the picture of a configuration as a PNG; None where it was not kept."""
-        from PIL import Image
-
         file = path_of(self.run, step // self.models)
         if not file.is_file():
             return None

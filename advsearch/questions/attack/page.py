@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageSequence
 
 from advsearch.files import JsonObject
 from advsearch.questions.attack.method import PLAN_HEADS, method_facts, plan_rows, plan_text
@@ -419,8 +420,6 @@ def _read_pictures(path: Path) -> dict[str, str]:
 
 def _read_frames(file: Path) -> list[str]:
     """Return the frames of an animation as data URLs; none where it is missing or damaged."""
-    from PIL import Image, ImageSequence
-
     frames = []
     try:
         with Image.open(file) as animation:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hmac
 import importlib
+import io
 import json
 import re
 import time
@@ -99,8 +100,6 @@ def qr_svg(address: str) -> str | None:
 
 def qr_text(address: str) -> str | None:
     """Return an address as a QR code for a terminal; None where segno is not installed."""
-    import io
-
     made, text = _made(address), io.StringIO()
     if made is None:
         return None

@@ -6,12 +6,16 @@ import argparse
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch import __version__
 from advsearch.cli import output
+from advsearch.cli.show import photos_of
 from advsearch.errors import AdvsearchError, InputError
+from advsearch.options import FROM_RUN
+from advsearch.settings import read_yaml
 
 if TYPE_CHECKING:
     from advsearch.questions.report.answer import Evidence, EvidenceRun
@@ -110,7 +114,6 @@ def _of_quick_recipe(folder: Path) -> bool:
 def _settings(folder: Path) -> Mapping[str, object]:
     """What its run.yaml says; nothing where there is none that can be read."""
     from advsearch.runs.directory import CONFIG
-    from advsearch.settings import read_yaml
 
     with suppress(AdvsearchError):
         return read_yaml(folder / CONFIG)
@@ -120,7 +123,7 @@ def _settings(folder: Path) -> Mapping[str, object]:
 def _run(folder: Path) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
     from advsearch.questions.report.answer import EvidenceRun
-    from advsearch.questions.report.evidence import NOT_NOTED, QUICK, claims_of, evidence_of, nothing_there
+    from advsearch.questions.report.evidence import NOT_NOTED, QUICK, claims_of, evidence_of
     from advsearch.runs.directory import CONFIG, typed_name
     from advsearch.runs.summary import NAME as SUMMARY
     from advsearch.runs.summary import read_result
@@ -133,7 +136,7 @@ def _run(folder: Path) -> EvidenceRun:
             run=name,
             command=str(settings.get("command") or "unknown"),
             ending="none yet",
-            claims=[nothing_there("the run has no result; it is at work, or was stopped before its end")],
+            claims=[nothing_claimed("the run has no result; it is at work, or was stopped before its end")],
             about={key: text for key, text in facts.items() if text},
             searched=[],
             measured={},
@@ -150,9 +153,6 @@ def _run(folder: Path) -> EvidenceRun:
 
 def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
     """The options of the task that a run was judged by; nothing of one that is not to be had here."""
-    from dataclasses import fields
-
-    from advsearch.options import FROM_RUN
     from advsearch.tasks import make_task
     from advsearch.tasks.together import Together
 
@@ -172,7 +172,6 @@ def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
 
 
 def _photos(folder: Path) -> list[Claim]:
-    from advsearch.cli.show import photos_of
     from advsearch.questions.report.evidence import photo_claims
 
     photos = photos_of(folder)

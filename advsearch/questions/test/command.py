@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
+from advsearch.cli.output import at_work
 from advsearch.cli.question import Positional, QuestionCommand
+from advsearch.errors import InputError
 
 if TYPE_CHECKING:
     import argparse
@@ -33,7 +35,6 @@ class _Test(QuestionCommand):
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Try the claims, print their answers, write the files, and return the exit status."""
-        from advsearch.cli.output import at_work
         from advsearch.questions.test.answer import SuiteResult
 
         _check_files(config)
@@ -56,8 +57,6 @@ def _check_files(config: Config) -> None:
     Raises:
         InputError: the folder of one is not there.
     """
-    from advsearch.errors import InputError
-
     for name, path in _files(config).items():
         if path.is_dir() or not path.absolute().parent.is_dir():
             raise InputError(f"{name}: expected a file in a folder that is there, got {path}; make the folder first")

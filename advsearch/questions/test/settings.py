@@ -1,4 +1,7 @@
-"""What `test` needs to know: its settings, what a picture of a claim needs, and the suite that a YAML file describes."""
+"""What `test` needs to know: its settings, and the suite that a YAML file describes.
+
+And what a picture of a claim needs.
+"""
 
 from __future__ import annotations
 
