@@ -123,6 +123,7 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
         InputError: anything that the caller can put right.
     """
     __tracebackhide__ = True
+    # late: torch takes long to import
     from advsearch.engine.turn import in_turn
     from advsearch.questions.test.carry_out import test_from_config
 
@@ -145,6 +146,7 @@ def _asserted(
 ) -> SuiteResult:
     """Try a suite of one claim, and raise what its answer says."""
     __tracebackhide__ = True
+    # late: torch takes long to import
     from advsearch.engine.loading import (
         CONTROL,
         MODEL,

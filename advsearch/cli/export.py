@@ -79,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     """Write the rows."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import PARTS, find_run
     from advsearch.runs.export import FORMATS, write_rows
     from advsearch.runs.store import NAME, Store
@@ -107,6 +108,7 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
 
 def _threedb(args: argparse.Namespace, out: Path) -> Written:
     """Write a folder as 3DB does."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import find_run
     from advsearch.runs.store import NAME, Store
     from advsearch.runs.threedb import write_threedb
@@ -122,6 +124,7 @@ def _threedb(args: argparse.Namespace, out: Path) -> Written:
 
 def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
     """Write a dataset of the pictures that were kept."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import find_run
     from advsearch.runs.fiftyone import write_fiftyone
     from advsearch.viewer.thumbnails import name_of_object, pictured
@@ -135,6 +138,7 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
     """Write the sheets."""
     longest = USUAL_SIZE if args.size is None else args.size
     with at_work(as_json=True, quiet=False):
+        # late, so that --help answers at once
         from advsearch.api.export import printable
         from advsearch.report.sheets import MOST_SHEETS, write_sheets
         from advsearch.runs.files import placed_by, replacing
@@ -155,6 +159,7 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
 def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial scene."""
     with at_work(as_json=True, quiet=False):
+        # late, so that --help answers at once
         from advsearch.api.export import write_mitsuba
 
         notes = write_mitsuba(args.run, out)
@@ -164,6 +169,7 @@ def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
 def _gltf(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial object."""
     with at_work(as_json=True, quiet=False):
+        # late, so that --help answers at once
         from advsearch.api.export import write_gltf
 
         notes = write_gltf(args.run, out)

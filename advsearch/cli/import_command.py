@@ -37,6 +37,7 @@ def run(args: argparse.Namespace) -> int:
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with at_work(as_json=True, quiet=False):
+        # late: another thing has this name here
         from advsearch.scene.importing.scenes import MITSUBA_FILE, contents
 
         if Path(args.file).suffix.lower() == MITSUBA_FILE:
@@ -111,6 +112,7 @@ def _slow(whole: ObjectAsset) -> list[str]:
 
 def _mitsuba(args: argparse.Namespace, out: Path | None) -> Callable[[], int]:
     """Read and picture, as its first camera sees it, a Mitsuba scene; return what prints what was understood."""
+    # late: another thing has this name here
     from advsearch.scene.mitsuba_backend.files.scene import contents
 
     found = contents(Path(args.file))

@@ -27,6 +27,7 @@ def run(args: argparse.Namespace) -> int:
         InputError: no class is like the word, or the model has no names for its classes.
     """
     with at_work(as_json=True, quiet=False):
+        # late, so that --help answers at once
         from advsearch.models import matching_labels
         from advsearch.models.labels import names_nothing
 
@@ -53,6 +54,7 @@ def class_names(model: str, labels: str | None) -> tuple[str, ...]:
     Raises:
         InputError: the model has none.
     """
+    # late, so that --help answers at once
     from advsearch.models import load_model, read_labels
 
     if labels is not None:

@@ -167,6 +167,7 @@ def add_code_flag(parser: argparse.ArgumentParser) -> None:
 
 def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
+    # late, so that --help answers at once
     from advsearch.runs.results.base import plain
 
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
@@ -186,6 +187,7 @@ def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> in
         answer: makes a text for a person of it.
         as_json: print the result itself instead.
     """
+    # late: it imports this module
     from advsearch.cli.main import INTERRUPTED, OK
 
     if as_json:
@@ -208,6 +210,7 @@ def go_on_command(run: str | Path) -> str:
     Args:
         run: its folder.
     """
+    # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG, typed_name
 
     words = ["advsearch", "resume", typed_name(run)]
@@ -218,6 +221,7 @@ def go_on_command(run: str | Path) -> str:
 
 def _code_in(file: Path) -> Sequence[str]:
     """The Python code that a run.yaml names."""
+    # late: it imports this module
     from advsearch.cli.run import command_in, config_of_file
 
     config = config_of_file(command_in(file), file, {})
@@ -244,6 +248,7 @@ def output_kept_clean() -> Iterator[None]:
 
 def shown_text(result: Result) -> str:
     """Return what is shown of an answer as text: what it says, its parts, by what it came about, and notes."""
+    # late, so that --help answers at once
     from advsearch.report.shown import facts_of, remarks_of, shown
     from advsearch.runs.directory import REPORT
 

@@ -81,6 +81,7 @@ class QuestionCommand:
         Raises:
             InputError: what it is about is missing.
         """
+        # late, so that --help answers at once
         from advsearch.registry import only_named_code
 
         named = getattr(args, self.about, None)
@@ -96,6 +97,7 @@ class QuestionCommand:
 
     def file(self, args: argparse.Namespace) -> Path | None:
         """Return the settings of the first run that the question is about, if it is about one."""
+        # late, so that --help answers at once
         from advsearch.runs.directory import CONFIG, find_run
 
         if self.about not in args:
@@ -112,6 +114,7 @@ class QuestionCommand:
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the answer and return the exit status."""
         with at_work(as_json=as_json, quiet=quiet) as progress:
+            # late, so that --help answers at once
             from advsearch.api import carry_out
 
             result = carry_out(config, progress=progress, resumed=resumed)

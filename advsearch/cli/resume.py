@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do what is left of the run and print its answer; of a run that is done, its answer."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG, find_run, only_here
     from advsearch.runs.listing import finished
 
@@ -53,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
 def _adds(path: Path, changes: Mapping[str, object]) -> bool:
     """Whether a run that is done still gives something: the map of a sweep's surface, or a recipe's figures anew, with
     the photographs that were taken since."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG
 
     command = command_in(path / CONFIG)

@@ -85,6 +85,7 @@ def run_file(
     Raises:
         UnknownNameError: there is no such command.
     """
+    # late, so that --help answers at once
     from advsearch.registry import only_named_code
 
     config = config_of_file(command, file, changes)

@@ -54,6 +54,7 @@ STYLE: dict[Any, Any] = {
 
 def new_axes() -> Any:
     """Return matplotlib axes of a new figure of the calling program, which shows it as it shows others."""
+    # late: matplotlib takes long to import
     import matplotlib.pyplot as plt
 
     return plt.subplots(layout="constrained")[1]
@@ -73,6 +74,7 @@ def drawn(
         kinds: suffixes of the files.
         style: settings of matplotlib that differ from `STYLE`.
     """
+    # late: matplotlib takes long to import
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -300,6 +302,7 @@ def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
     end = max(ceil(10.0 * largest - 1e-9) / 10.0, 0.1)
 
     def draw(figure: Any) -> None:
+        # late: matplotlib takes long to import
         import matplotlib as mpl
 
         scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(-end, end), mpl.colormaps[COLOURS])

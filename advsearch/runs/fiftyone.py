@@ -232,6 +232,7 @@ def _digest(key: str) -> str:
 
 def _mask_png(layers: Path) -> bytes:
     """Return the mask in an EXR with layers as a PNG of one channel: 1 where the object is."""
+    # late: OpenEXR takes long to import
     import OpenEXR
 
     try:

@@ -132,6 +132,7 @@ def write_layers(path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]
 
 
 def _write_exr(path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]) -> Path:
+    # late: OpenEXR takes long to import
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **notes}

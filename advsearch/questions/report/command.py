@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the files."""
+    # late, so that --help answers at once
     from advsearch.questions.report.evidence import evidence_page, markdown
     from advsearch.runs.files import write_text
     from advsearch.runs.summary import to_json
@@ -77,6 +78,7 @@ def collected(runs: list[str]) -> Evidence:
         UnknownNameError: there is no such run.
         FileFormatError: what is kept of a run is something else.
     """
+    # late, so that --help answers at once
     from advsearch.questions.report.answer import Evidence
     from advsearch.questions.report.evidence import RULES, warnings_over
     from advsearch.runs.directory import find_run
@@ -96,6 +98,7 @@ def _files(model: str) -> list[str]:
 
 def _with_parts(folder: Path) -> Iterator[Path]:
     """A run; in place of a recipe, the runs that it consists of."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import PARTS, is_run
 
     parts = [one for one in sorted((folder / PARTS).glob("*")) if is_run(one)]
@@ -113,6 +116,7 @@ def _of_quick_recipe(folder: Path) -> bool:
 
 def _settings(folder: Path) -> Mapping[str, object]:
     """What its run.yaml says; nothing where there is none that can be read."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG
 
     with suppress(AdvsearchError):
@@ -122,8 +126,10 @@ def _settings(folder: Path) -> Mapping[str, object]:
 
 def _run(folder: Path) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
+    # late, so that --help answers at once
     from advsearch.questions.report.answer import EvidenceRun
     from advsearch.questions.report.evidence import NOT_NOTED, QUICK, claims_of, evidence_of
+    from advsearch.report.claims import nothing_claimed
     from advsearch.runs.directory import CONFIG, typed_name
     from advsearch.runs.summary import NAME as SUMMARY
     from advsearch.runs.summary import read_result
@@ -153,6 +159,7 @@ def _run(folder: Path) -> EvidenceRun:
 
 def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
     """The options of the task that a run was judged by; nothing of one that is not to be had here."""
+    # late, so that --help answers at once
     from advsearch.tasks import make_task
     from advsearch.tasks.together import Together
 
@@ -172,6 +179,7 @@ def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
 
 
 def _photos(folder: Path) -> list[Claim]:
+    # late, so that --help answers at once
     from advsearch.questions.report.evidence import photo_claims
 
     photos = photos_of(folder)
@@ -180,6 +188,7 @@ def _photos(folder: Path) -> list[Claim]:
 
 def _made_with(folder: Path) -> dict[str, str]:
     """What the run noted at each sitting; of several that differ, all."""
+    # late, so that --help answers at once
     from advsearch.runs.made_with import NOTE
     from advsearch.runs.store import NAME as STORE
     from advsearch.runs.store import Store

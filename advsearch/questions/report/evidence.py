@@ -55,14 +55,6 @@ def photo_claims(photos: PhotoAgreement) -> list[Claim]:
     return [claim("measured", f"{said}{share_text(extent)}. The interval takes photographs as independent.", extent)]
 
 
-def nothing_there(why: str) -> Claim:
-    """Return the claim of a run without a result."""
-    return nothing_claimed(why)
-
-
-# ---- parts ----------------------------------------------------------------------------------------------------------
-
-
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
     """Return what has to be known of runs together.
 

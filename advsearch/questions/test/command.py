@@ -35,10 +35,12 @@ class _Test(QuestionCommand):
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Try the claims, print their answers, write the files, and return the exit status."""
+        # late, so that --help answers at once
         from advsearch.questions.test.answer import SuiteResult
 
         _check_files(config)
         with at_work(as_json=as_json, quiet=quiet) as progress:
+            # late, so that --help answers at once
             from advsearch.api import carry_out
 
             result = carry_out(config, progress=progress, resumed=resumed)
@@ -64,6 +66,7 @@ def _check_files(config: Config) -> None:
 
 def write_files(config: Config, result: SuiteResult) -> None:
     """Write the files for machines that a configuration asks for."""
+    # late, so that --help answers at once
     from advsearch.questions.test import words
     from advsearch.runs.files import write_text
 
