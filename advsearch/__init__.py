@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from advsearch import losses as losses
     from advsearch import testing as testing
-    from advsearch.api.load_run import load_run as load_run
-    from advsearch.api.model import load_model as load_model
+    from advsearch.api.load import load_model as load_model
+    from advsearch.api.load import load_run as load_run
     from advsearch.api.render import Rendering as Rendering
     from advsearch.api.render import render as render
     from advsearch.engine.attack_result import AttackResult as AttackResult
@@ -53,8 +53,8 @@ _HOMES = {
     "explain": "advsearch.questions.explain.carry_out",
     "gap": "advsearch.questions.gap.carry_out",
     "harden": "advsearch.questions.harden.carry_out",
-    "load_model": "advsearch.api.model",
-    "load_run": "advsearch.api.load_run",
+    "load_model": "advsearch.api.load",
+    "load_run": "advsearch.api.load",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
     "plan": "advsearch.questions.plan.carry_out",

@@ -17,6 +17,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from advsearch.questions.test.settings import SuiteConfig, suite_of
+
 if TYPE_CHECKING:
     from advsearch.engine.loading import Scene
     from advsearch.engine.naming import AnyModel
@@ -121,9 +123,9 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
         InputError: anything that the caller can put right.
     """
     __tracebackhide__ = True
+    # late: torch takes long to import
     from advsearch.engine.turn import in_turn
     from advsearch.questions.test.carry_out import test_from_config
-    from advsearch.questions.test.settings import SuiteConfig
 
     with in_turn():
         result = test_from_config(SuiteConfig(**{"suite": str(suite), **settings}))
@@ -144,6 +146,7 @@ def _asserted(
 ) -> SuiteResult:
     """Try a suite of one claim, and raise what its answer says."""
     __tracebackhide__ = True
+    # late: torch takes long to import
     from advsearch.engine.loading import (
         CONTROL,
         MODEL,
@@ -157,8 +160,6 @@ def _asserted(
     from advsearch.engine.naming import exists_here, model_name
     from advsearch.engine.turn import in_turn
     from advsearch.questions.test.carry_out import test_from_config
-    from advsearch.questions.test.settings import SuiteConfig
-    from advsearch.questions.test.suite import suite_of
 
     name = str(claim["claim"]).replace("_", "-")
     with ExitStack() as stack:

@@ -44,7 +44,7 @@ from sweep import ConstantRenderer, resident  # noqa: E402
 
 from advsearch.attacks import Evaluation  # noqa: E402
 from advsearch.cluster.coordinator import DEPTH  # noqa: E402
-from advsearch.cluster.pool import Event  # noqa: E402
+from advsearch.cluster.executor import Event  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.engine.sharing import Sent  # noqa: E402
 from advsearch.engine.sweeps import swept_scene  # noqa: E402
@@ -217,7 +217,7 @@ def simulated(figure: Path | None) -> list[bool]:
 
 def draw(found: Sequence[tuple[int, float]], path: Path) -> None:
     """Draw pictures a second against workers."""
-    from advsearch.report.drawing import new_axes
+    from advsearch.report.figures import new_axes
 
     axes = new_axes()
     workers = [one for one, _ in found]

@@ -19,7 +19,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.cli.progress import watch_progress  # noqa: E402
+from advsearch.cli.output import watch_progress  # noqa: E402
 from advsearch.questions.harden.answer import HardenResult, Share  # noqa: E402
 from advsearch.questions.harden.carry_out import harden_from_config  # noqa: E402
 from advsearch.questions.harden.settings import HardenConfig  # noqa: E402

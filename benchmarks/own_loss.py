@@ -29,8 +29,7 @@ from torch import Tensor  # noqa: E402
 
 import advsearch  # noqa: E402
 from advsearch import losses  # noqa: E402
-from advsearch.engine.objective import off_print
-from advsearch.engine.objective import variation
+from advsearch.engine.objective import off_print, variation
 from advsearch.scene.gradients import plan
 
 ASKED = 1.05

@@ -12,12 +12,11 @@ from advsearch.config import AttackConfig
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region.answer import RegionResult
-from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
-from advsearch.runs.summary import attack_of
+from advsearch.runs.summary import attack_of, write_answer
 from advsearch.viewer.pages import write_page
 
 

@@ -8,10 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from advsearch.cluster.coordinator import Coordinator
-from advsearch.cluster.executor import Work
-from advsearch.cluster.inputs import Files
-from advsearch.cluster.pool import Disconnected, Ended, Event, Joined, Left
-from advsearch.cluster.worker import Carried, Failure, Ready, prepare
+from advsearch.cluster.executor import Disconnected, Ended, Event, Joined, Left, Work
+from advsearch.cluster.worker import Carried, Failure, Files, Ready, prepare
 from advsearch.errors import ClusterError
 
 HERE = {"processor": "here"}
@@ -19,7 +17,7 @@ HERE = {"processor": "here"}
 
 @dataclass
 class Simulated:
-    """What `advsearch.cluster.pool.Pool` asks for.
+    """What `advsearch.cluster.executor.Pool` asks for.
 
     Attributes:
         call: what a worker does with a range.

@@ -45,8 +45,7 @@ from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.replay.settings import WAYS, ReplayConfig
 from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.questions.stability.suite import chosen
-from advsearch.questions.test.settings import SuiteConfig
-from advsearch.questions.test.suite import read_suite
+from advsearch.questions.test.settings import SuiteConfig, read_suite
 from advsearch.runs import export
 from advsearch.scene import environments, library
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 from advsearch import rooms
 from advsearch import threads as threads  # before torch: it sets how OpenMP waits
+from advsearch.runs.directory import begun
+from advsearch.runs.results.base import Result
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,9 +34,6 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
     Raises:
         InputError: anything that whoever asked can put right; nothing is written then.
     """
-    from advsearch.runs.directory import begun
-    from advsearch.runs.results.base import Result
-
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
         name = f"{config.command}_from_config"

@@ -1,9 +1,8 @@
 """Studies: questions that take several attacks, each in a folder of its own in the run, on workers if asked to.
 
-A worker carries an attack out in a folder on its own disk, which comes back as files.
-
-An attack that this process has begun itself stays its own. What is shared are whole attacks, in a curve all those of an
-object, so that one whose worker died begins again.
+A part is carried out in its folder, gone on with, or read where it is done. A worker carries an attack out in a folder
+on its own disk, which comes back as files. An attack that this process has begun itself stays its own. What is shared
+are whole attacks, in a curve all those of an object, so that one whose worker died begins again.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from advsearch import rooms
+from advsearch.api import carry_out
 from advsearch.cluster.executor import Call, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import CONFIGS, AttackConfig
@@ -28,20 +28,36 @@ from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
-from advsearch.report.notebook import figure_of_answer
+from advsearch.report.markup import figure_of_answer
 from advsearch.report.shown import shown
-from advsearch.runs import lock
+from advsearch.runs import files
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
 from advsearch.runs.files import PART, storage_errors, write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import INTERRUPTED
-from advsearch.runs.results.study import StudyResult
-from advsearch.runs.summary import attack_of
+from advsearch.runs.results.base import INTERRUPTED, Result, StudyResult
+from advsearch.runs.summary import attack_of, read_result
 from advsearch.scene.library import list_objects, load_object
-from advsearch.settings import FILES
+from advsearch.settings import FILES, Config, read_yaml
 from advsearch.tasks import make_task
 from advsearch.viewer.pages import write_page
+
+
+def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
+    """Return the result of a part; what is done of it is not done again.
+
+    Args:
+        path: of its folder.
+        config: what it does, where it has not begun.
+        progress: told how far it is.
+    """
+    if not is_run(path) or not (path / CONFIG).is_file():
+        return carry_out(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
+    if finished(path):
+        return read_result(path)
+    kind = CONFIGS[str(read_yaml(path / CONFIG)["command"])]
+    return carry_out(kind.from_yaml(path / CONFIG), progress=progress, resumed=path)
+
 
 Study = TypeVar("Study", bound=StudyResult)
 Rows = TypeVar("Rows")
@@ -151,7 +167,7 @@ def attacks_of(settings: JsonObject) -> Call:
                 path = Path(folder) / part.name
                 own = part.config.model_copy(update={"run": str(path), "overwrite": True})
                 ending = attack_once()(own, clean=clean).summary.ending
-                files = (one for one in path.rglob("*") if one.is_file() and one.name != lock.NAME)
+                files = (one for one in path.rglob("*") if one.is_file() and one.name != files.NAME)
                 read = {one.relative_to(path).as_posix(): one.read_bytes() for one in files}
                 found.append((part.name, str(path), read))
                 if ending in SETTLED:

@@ -37,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    from advsearch.questions.photographs.page import NO_QR, qr_text
+    # late, so that --help answers at once
+    from advsearch.questions.photographs.serving import NO_QR, qr_text
     from advsearch.runs.directory import find_run
     from advsearch.viewer.server import Dashboard
 
@@ -73,6 +74,7 @@ class _LoadedLater:
 
     @cached_property
     def _loaded(self) -> Photographs:
+        # late, so that --help answers at once
         from advsearch.questions.photographs.carry_out import Photographs
 
         return Photographs()

@@ -189,6 +189,7 @@ def _reinstall(name: str) -> str:
 
 def check_llvm() -> Component:
     """The libLLVM that will be used, what else there is, and why that is not used."""
+    # late, so that --help answers at once
     from advsearch.scene.mitsuba_backend.llvm import VARIABLE, ensure_llvm, find, install_command
 
     given = os.environ.get(VARIABLE, "")
@@ -210,6 +211,7 @@ def bundled_scenes() -> Component:
     """The objects and environments that travel inside the package."""
     name, fix = "bundled scenes", "reinstall advsearch; in a checkout: git restore scenes/data"
     try:
+        # late, so that --help answers at once
         from advsearch.scene.library import list_environments, list_objects
 
         objects, environments = list_objects(), list_environments()
@@ -291,6 +293,7 @@ def _text(output: str | bytes | None) -> str:
 
 def _print_table(parts: list[Component], good: bool) -> None:
     """Print the parts as a table, and below it what has to be done."""
+    # late, so that --help answers at once
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

@@ -12,7 +12,7 @@ from pkgutil import iter_modules
 
 from advsearch.cli import exports, output
 from advsearch.cli.exports.print import USUAL_SIZE
-from advsearch.cli.screen import output_errors
+from advsearch.cli.output import output_errors
 from advsearch.errors import InputError
 
 WRITERS = {
@@ -76,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     """Write the rows."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import PARTS, find_run
     from advsearch.runs.export import FORMATS, write_rows
     from advsearch.runs.store import NAME, Store

@@ -80,7 +80,10 @@ def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: 
 
 def _inside(scene: str) -> str:
     """Return the names of what can be the object in a scene file, as a message lists them."""
+    # late: another thing has this name here
     from advsearch.scene.importing.files import shown
+
+    # late, so that --help answers at once
     from advsearch.scene.importing.scenes import MITSUBA_FILE, node_names
     from advsearch.scene.mitsuba_backend.files.scene import contents
 

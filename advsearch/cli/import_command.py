@@ -8,7 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import advsearch
 from advsearch.cli import output
+from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 
@@ -31,13 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what was understood."""
-    from advsearch.cli.progress import at_work
-
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with at_work(as_json=True, quiet=False):
-        import advsearch
+        # late: another thing has this name here
         from advsearch.scene.importing.scenes import MITSUBA_FILE, contents
 
         if Path(args.file).suffix.lower() == MITSUBA_FILE:
@@ -112,7 +112,7 @@ def _slow(whole: ObjectAsset) -> list[str]:
 
 def _mitsuba(args: argparse.Namespace, out: Path | None) -> Callable[[], int]:
     """Read and picture, as its first camera sees it, a Mitsuba scene; return what prints what was understood."""
-    import advsearch
+    # late: another thing has this name here
     from advsearch.scene.mitsuba_backend.files.scene import contents
 
     found = contents(Path(args.file))

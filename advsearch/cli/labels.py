@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 
 from advsearch.cli import output
+from advsearch.cli.flags import add_settings
+from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 
 HELP = "find the names of a model's classes, as --label takes them"
@@ -13,8 +15,6 @@ EXAMPLES = ("labels", "labels mug --labels labels.json", "labels mug --model mod
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    from advsearch.cli.flags import add_settings
-
     parser.add_argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it")
     add_settings(parser, only=("model", "labels"))
     output.add_flags(parser)
@@ -26,9 +26,8 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: no class is like the word, or the model has no names for its classes.
     """
-    from advsearch.cli.progress import at_work
-
     with at_work(as_json=True, quiet=False):
+        # late, so that --help answers at once
         from advsearch.models import matching_labels
         from advsearch.models.labels import names_nothing
 
@@ -55,6 +54,7 @@ def class_names(model: str, labels: str | None) -> tuple[str, ...]:
     Raises:
         InputError: the model has none.
     """
+    # late, so that --help answers at once
     from advsearch.models import load_model, read_labels
 
     if labels is not None:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from advsearch.cli import output
+from advsearch.cli.output import at_work
 from advsearch.rooms import there
 
 HELP = "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes"
@@ -36,8 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the names of one kind, or of all."""
-    from advsearch.cli.progress import at_work
-
     kinds = list(REGISTRIES) if args.kind == "all" else [args.kind]
     with at_work(as_json=True, quiet=False):
         found = {kind: list_names(kind) for kind in kinds}

@@ -21,10 +21,13 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from advsearch import __version__
-from advsearch.cli.screen import end_output, open_descriptors, screens, shortened
+from advsearch.cli.flags import with_flags
+from advsearch.cli.output import end_output, open_descriptors, screens, shortened
+from advsearch.config import CONFIGS
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.rooms import there
+from advsearch.settings import settings
 
 GROUPS = {
     "ask: what does a model get wrong?": {
@@ -139,8 +142,6 @@ def _run_and_tell(given: list[str]) -> int:
         sys.stdout.flush()
         return status
     except AdvsearchError as error:
-        from advsearch.cli.flags import with_flags
-
         asks_for_flag = isinstance(error, UnknownNameError) or "`code=" in str(error)  # no file may name its own code
         in_a_file = given[0] in ("run", "resume") and not asks_for_flag
         text = str(error) if in_a_file else with_flags(str(error))
@@ -234,9 +235,6 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
 
 def _owners(flag: str) -> list[str]:
     """Commands that have a flag."""
-    from advsearch.config import CONFIGS
-    from advsearch.settings import settings
-
     return [name for name, config in CONFIGS.items() if flag in (one.flag for one in settings(config))]
 
 

@@ -1,4 +1,9 @@
-"""What every command prints with: JSON alone on standard output, messages on standard error."""
+"""What every command prints with: JSON alone on standard output, messages and progress on standard error.
+
+What is printed holds names that others chose: of files, labels, objects, runs. Here is the one place where the control
+characters in them, which could steer a terminal or forge a line, become readable escapes; and where a full disk behind
+standard output becomes a message. Progress is bars on a terminal, and a plain line now and then elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +13,138 @@ import json
 import os
 import shlex
 import sys
+import unicodedata
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
-from advsearch.errors import AdvsearchError
+from advsearch.cli.flags import with_flags
+from advsearch.config import SceneConfig
+from advsearch.errors import AdvsearchError, StorageError
+from advsearch.interrupts import INTERRUPTS
+from advsearch.progress import NullProgress, Progress
+from advsearch.settings import split_names
+from advsearch.watching import bars, lines
 
 if TYPE_CHECKING:
     from advsearch.runs.results.base import Result
+
+
+LONGEST_WORD = 300
+"""Most characters of a name in a message; of a longer one the ends are shown."""
+
+
+def escaped(text: str, encoding: str = "utf-8") -> str:
+    """Return `text` with everything but line ends and tabs that a terminal would not show written as an escape."""
+    if not text.isascii() or not text.isprintable():
+        text = "".join(sign if sign in "\n\t" or _is_shown(sign) else _escape(sign) for sign in text)
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
+def shortened(text: str) -> str:
+    """Return a message with the middle of its overlong words left out."""
+    return " ".join(
+        word if len(word) <= LONGEST_WORD else f"{word[:100]}...{word[-40:]} ({len(word):,} characters)"
+        for word in text.split(" ")
+    )
+
+
+def _is_shown(sign: str) -> bool:
+    return sign.isprintable() or (sign >= "\xa0" and unicodedata.category(sign) == "Zs")
+
+
+def _escape(sign: str) -> str:
+    code = ord(sign)
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+class Screen:
+    """A text stream that prints text `escaped`. All but writing is the stream's own.
+
+    Args:
+        stream: where it goes.
+        needed: whether a failure to write is an error; what goes to standard error is dropped then.
+    """
+
+    def __init__(self, stream: TextIO, *, needed: bool) -> None:
+        self.stream = stream
+        self._needed = needed
+
+    def write(self, text: str) -> int:
+        """Write a text; errors as for `output_errors`."""
+        with self._errors():
+            self.stream.write(escaped(text, self.stream.encoding or "utf-8"))
+        return len(text)
+
+    def flush(self) -> None:
+        """Write out what is held back; errors as for `write`."""
+        with self._errors():
+            self.stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def _errors(self) -> AbstractContextManager[None]:
+        return output_errors() if self._needed else suppress(OSError)
+
+
+@contextmanager
+def output_errors() -> Iterator[None]:
+    """Turn what goes wrong with standard output inside the block into a message.
+
+    Raises:
+        StorageError: it could not be written, for another reason than that nobody reads any more.
+        BrokenPipeError: nobody reads any more.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise StorageError(f"cannot write to standard output: {error.strerror or error}") from None
+
+
+@contextmanager
+def screens() -> Iterator[None]:
+    """Let everything that is printed inside the block go through a `Screen`."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = _screen(before[0], needed=True), _screen(before[1], needed=False)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+def raw(stream: IO[str]) -> IO[str]:
+    """Return the stream behind a `Screen`, for what draws on a terminal and escapes names itself."""
+    return stream.stream if isinstance(stream, Screen) else stream
+
+
+def open_descriptors() -> None:
+    """Point standard streams that were closed at nothing, or the next file that is opened would be one of them."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+
+
+def end_output() -> None:
+    """Write out what is left; where that fails, drop it, so that the interpreter's own end does not complain."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError, StorageError):
+        with suppress(OSError, ValueError, AttributeError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _screen(stream: Any, *, needed: bool) -> TextIO:
+    if isinstance(stream, Screen):
+        return cast(TextIO, stream)
+    # Python has none where the descriptor was closed.
+    there: TextIO = stream if stream is not None else open(os.devnull, "w", encoding="utf-8")
+    return cast(TextIO, Screen(there, needed=needed))
 
 
 def add_flags(parser: argparse.ArgumentParser, *, quiet: bool = False) -> None:
@@ -39,6 +167,7 @@ def add_code_flag(parser: argparse.ArgumentParser) -> None:
 
 def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
+    # late, so that --help answers at once
     from advsearch.runs.results.base import plain
 
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
@@ -58,6 +187,7 @@ def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> in
         answer: makes a text for a person of it.
         as_json: print the result itself instead.
     """
+    # late: it imports this module
     from advsearch.cli.main import INTERRUPTED, OK
 
     if as_json:
@@ -80,6 +210,7 @@ def go_on_command(run: str | Path) -> str:
     Args:
         run: its folder.
     """
+    # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG, typed_name
 
     words = ["advsearch", "resume", typed_name(run)]
@@ -90,9 +221,8 @@ def go_on_command(run: str | Path) -> str:
 
 def _code_in(file: Path) -> Sequence[str]:
     """The Python code that a run.yaml names."""
+    # late: it imports this module
     from advsearch.cli.run import command_in, config_of_file
-    from advsearch.config import SceneConfig
-    from advsearch.settings import split_names
 
     config = config_of_file(command_in(file), file, {})
     if not isinstance(config, SceneConfig):
@@ -118,6 +248,7 @@ def output_kept_clean() -> Iterator[None]:
 
 def shown_text(result: Result) -> str:
     """Return what is shown of an answer as text: what it says, its parts, by what it came about, and notes."""
+    # late, so that --help answers at once
     from advsearch.report.shown import facts_of, remarks_of, shown
     from advsearch.runs.directory import REPORT
 
@@ -164,6 +295,72 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
 
 def as_notes(texts: Sequence[str]) -> str:
     """Return notes below an answer, each a paragraph, with the flags of the settings that they name."""
-    from advsearch.cli.flags import with_flags  # settings, which `--help` does without
-
     return "".join(f"\n\nNote: {with_flags(text)}" for text in texts)
+
+
+LOADING_STAGES = 2
+"""The first stages of a command: modules are imported, then a scene and a model are loaded, which imports more."""
+
+
+@contextmanager
+def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
+    """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
+    with output_kept_clean() if as_json else nullcontext(), watch_progress(quiet=quiet) as watcher:
+        progress = LoadingProgress(watcher)
+        progress.stage("starting: loading PyTorch and Mitsuba")
+        yield progress
+        progress.end()
+
+
+@contextmanager
+def watch_progress(*, quiet: bool = False) -> Iterator[Progress]:
+    """Yield the progress that suits standard error: none when `quiet`, bars on a terminal, lines elsewhere."""
+    if quiet:
+        yield NullProgress()
+    elif sys.stderr.isatty():
+        with bars(raw(sys.stderr), with_flags) as drawn:
+            yield drawn
+    else:
+        with lines(sys.stderr, with_flags) as told:
+            yield told
+
+
+class LoadingProgress:
+    """A watcher that raises an interrupt which came while something was loaded, when that stage ends.
+
+    Modules that are being imported and native code make other errors of an interrupt, or none. After `LOADING_STAGES`
+    all that catches one is ours and answers it.
+
+    Args:
+        progress: is told everything.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._begun = 0
+
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        """See `Progress.stage`.
+
+        Raises:
+            KeyboardInterrupt: one came while something was loaded.
+        """
+        if self._begun <= LOADING_STAGES:
+            INTERRUPTS.check()
+        self._begun += 1
+        self._progress.stage(name, total, hint=hint, at_most=at_most)
+
+    def advance(self, n: int = 1, **info: float | str) -> None:
+        self._progress.advance(n, **info)
+
+    def message(self, text: str) -> None:
+        self._progress.message(text)
+
+    def end(self) -> None:
+        """End the work.
+
+        Raises:
+            KeyboardInterrupt: nothing but imports was there, and one came meanwhile.
+        """
+        if self._begun < LOADING_STAGES:
+            INTERRUPTS.check()

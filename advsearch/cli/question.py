@@ -9,7 +9,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.cli.flags import add_settings, config_from
+from advsearch.cli.output import at_work
+from advsearch.config import CONFIGS
 from advsearch.errors import InputError
+from advsearch.settings import split_names
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,9 +62,6 @@ class QuestionCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add a flag for each of the settings, and those that commands share."""
-        from advsearch.cli.flags import add_settings
-        from advsearch.config import CONFIGS
-
         add_settings(parser, CONFIGS[self.name])
         output.add_flags(parser, quiet=True)
         if self.place:
@@ -80,6 +81,7 @@ class QuestionCommand:
         Raises:
             InputError: what it is about is missing.
         """
+        # late, so that --help answers at once
         from advsearch.registry import only_named_code
 
         named = getattr(args, self.about, None)
@@ -95,8 +97,8 @@ class QuestionCommand:
 
     def file(self, args: argparse.Namespace) -> Path | None:
         """Return the settings of the first run that the question is about, if it is about one."""
+        # late, so that --help answers at once
         from advsearch.runs.directory import CONFIG, find_run
-        from advsearch.settings import split_names
 
         if self.about not in args:
             return None
@@ -107,16 +109,12 @@ class QuestionCommand:
 
     def config(self, args: argparse.Namespace) -> Config:
         """Return the configuration that the arguments describe."""
-        from advsearch.cli.flags import config_from
-        from advsearch.config import CONFIGS
-
         return config_from(args, CONFIGS[self.name])
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the answer and return the exit status."""
-        from advsearch.cli.progress import at_work
-
         with at_work(as_json=as_json, quiet=quiet) as progress:
+            # late, so that --help answers at once
             from advsearch.api import carry_out
 
             result = carry_out(config, progress=progress, resumed=resumed)

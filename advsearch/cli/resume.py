@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 from advsearch.cli import output
+from advsearch.cli.run import changes_in, command_in, run_file
+from advsearch.cli.show import show_run
 from advsearch.errors import InputError
 
 HELP = "continue a run that was stopped, from where it stopped"
@@ -30,9 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do what is left of the run and print its answer; of a run that is done, its answer."""
-    import sys
-
-    from advsearch.cli.run import changes_in, command_in, run_file
+    # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG, find_run, only_here
     from advsearch.runs.listing import finished
 
@@ -40,8 +41,6 @@ def run(args: argparse.Namespace) -> int:
     if not (path / CONFIG).is_file():
         raise InputError(f"{path}: expected a run with its {CONFIG}, got none; it was stopped before it began")
     if finished(path) and not _adds(path, changes):
-        from advsearch.cli.show import show_run
-
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
     if only := only_here(path):
@@ -55,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 def _adds(path: Path, changes: Mapping[str, object]) -> bool:
     """Whether a run that is done still gives something: the map of a sweep's surface, or a recipe's figures anew, with
     the photographs that were taken since."""
-    from advsearch.cli.run import command_in
+    # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG
 
     command = command_in(path / CONFIG)

@@ -22,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print one line for each run."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import HOME
     from advsearch.runs.listing import listed_runs
 

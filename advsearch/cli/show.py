@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.cli.list import first_doc_line
+from advsearch.cli.main import COMMANDS
+from advsearch.cli.output import at_work
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
+from advsearch.options import declared_options, default_of, type_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +27,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from advsearch.cli.screen import raw
+from advsearch.cli.output import raw
 
 HELP = "show what a run found, or the details of a control, a policy, a task or a recipe"
 
@@ -49,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
         case ["policy" | "task" as kind, name]:
             return _show_options(kind, name, args.json)
         case ["recipe", name]:
+            # late, so that --help answers at once
             from advsearch.questions.recipe.description import read_recipe, recipe_yaml
 
             text = recipe_yaml(name)
@@ -65,9 +71,7 @@ def run(args: argparse.Namespace) -> int:
 
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     """Print the answer of a run, or how far one has come that has none yet, and draw its pictures if wanted."""
-    import importlib
-
-    from advsearch.cli.main import COMMANDS
+    # late, so that --help answers at once
     from advsearch.runs.directory import find_run
     from advsearch.runs.listing import listed_run
     from advsearch.runs.summary import NAME, read_result
@@ -89,17 +93,20 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
 
 def photos_of(run: Path) -> PhotoAgreement | None:
     """Return how photographs agree with the run's renderings; None where there are none."""
+    # late, so that --help answers at once
     from advsearch.questions.photographs.files import FOLDER
     from advsearch.runs.directory import IMAGES
 
     if not (run / IMAGES / FOLDER).is_dir():
         return None
+    # late, so that --help answers at once
     from advsearch.questions.photographs.carry_out import photo_agreement
 
     return photo_agreement(run)
 
 
 def _photos_text(table: PhotoAgreement) -> str:
+    # late, so that --help answers at once
     from advsearch.report.wording import count, interval_text
 
     if table.interval is None:
@@ -139,10 +146,8 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
 
 
 def _show_control(name: str, as_json: bool) -> int:
-    from advsearch.cli.progress import at_work
-
     with at_work(as_json=True, quiet=False):
-        from advsearch.cli.list import first_doc_line
+        # late, so that --help answers at once
         from advsearch.controls import CONTROLS
         from advsearch.runs.results.base import plain
 
@@ -164,12 +169,9 @@ def _show_control(name: str, as_json: bool) -> int:
 
 
 def _show_options(kind: str, name: str, as_json: bool) -> int:
-    from advsearch.cli.progress import at_work
-
     with at_work(as_json=True, quiet=False):
+        # late, so that --help answers at once
         from advsearch.attacks import POLICIES
-        from advsearch.cli.list import first_doc_line
-        from advsearch.options import declared_options, default_of, type_of
         from advsearch.runs.results.base import plain
         from advsearch.tasks import TASKS
 
@@ -275,6 +277,7 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
         return None, f"Terminals with kitty's protocol or Sixel draw them here: {EXTRA}"
     if renderable.Image not in (renderable.SixelImage, renderable.TGPImage):
         return None, "This terminal draws no pictures: it has neither kitty's protocol nor Sixel."
+    # late, so that --help answers at once
     from rich.console import Console
 
     console = Console(file=raw(sys.stdout))

@@ -20,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the page and say where it is."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import find_run
     from advsearch.viewer.pages import renewed, write_bundle
 

@@ -15,11 +15,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.cluster.executor import Done, Work, Workforce
-from advsearch.cluster.inputs import Files
-from advsearch.cluster.machine import MachineInfo, machine_name
-from advsearch.cluster.pool import Disconnected, Dropped, Ended, Event, Joined, Left, Pool
-from advsearch.cluster.worker import Carried, Failure, Ready, carry_out_batch, prepare
+from advsearch.cluster.executor import Disconnected, Done, Dropped, Ended, Event, Joined, Left, Pool, Work, Workforce
+from advsearch.cluster.worker import Carried, Failure, Files, MachineInfo, Ready, carry_out_batch, machine_name, prepare
 from advsearch.errors import ClusterError
 
 DEPTH = 2

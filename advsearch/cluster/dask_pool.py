@@ -22,7 +22,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from advsearch.cluster.pool import Disconnected, Dropped, Ended, Event, Joined, Left
+from advsearch.cluster.executor import Disconnected, Dropped, Ended, Event, Joined, Left
 from advsearch.cluster.worker import Failure
 from advsearch.errors import ClusterError
 
@@ -76,6 +76,7 @@ def local(workers: int) -> Site:
     """Return the place of so many processes on this machine, which nobody else can reach."""
 
     def start(**more: Any) -> Any:
+        # comes with the extra `dask`
         import distributed
 
         make: Any = distributed.LocalCluster
@@ -177,6 +178,7 @@ class DaskPool:
         self._begin(work).result(seconds)
 
     async def _open(self, seconds: float) -> None:
+        # comes with the extra `dask`
         import dask
         import distributed
 
@@ -235,6 +237,7 @@ class DaskPool:
         return str(self._client.dashboard_link or "") if drawn else ""
 
     async def _call(self, ticket: int, worker: str, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        # comes with the extra `dask`
         from distributed import KilledWorker
 
         client = self._client

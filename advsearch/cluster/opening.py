@@ -17,8 +17,7 @@ from advsearch import threads
 from advsearch.cluster.coordinator import Coordinator
 from advsearch.cluster.dask_pool import DaskPool, Site, local
 from advsearch.cluster.executor import Executor, Work
-from advsearch.cluster.inputs import Files, read_files
-from advsearch.cluster.machine import this_machine, version
+from advsearch.cluster.worker import Files, read_files, this_machine, version
 from advsearch.errors import FileFormatError, InputError
 from advsearch.settings import read_yaml
 

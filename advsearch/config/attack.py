@@ -8,9 +8,8 @@ from typing import Any, ClassVar, Literal
 from pydantic import JsonValue, model_validator
 
 from advsearch.config.derivative import DerivativeConfig
-from advsearch.config.named import name_in, read_named
 from advsearch.config.rendering import RenderConfig
-from advsearch.config.scene import ControlsByName, SceneConfig
+from advsearch.config.scene import ControlsByName, SceneConfig, name_in, read_named
 from advsearch.files import JsonObject
 from advsearch.settings import Clash, setting, setting_as_in, split_names
 

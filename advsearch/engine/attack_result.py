@@ -17,10 +17,9 @@ from advsearch.engine.objective import task_for
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
-from advsearch.report.drawing import new_axes
-from advsearch.report.notebook import answer_html, side_by_side
+from advsearch.report.figures import new_axes, search_axes
+from advsearch.report.markup import answer_html, side_by_side
 from advsearch.report.shown import shown
-from advsearch.report.studies import search_axes
 from advsearch.runs import store
 from advsearch.runs.export import to_pandas
 from advsearch.runs.results.attack import (

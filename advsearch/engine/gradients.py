@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.runs.results.derivatives import GradientStatus
+from advsearch.runs.results.base import GradientStatus
 from advsearch.scene.gradients import STEP_RANGE, GradientPlan, Group
 from advsearch.scene.renderer import Renderer
 

@@ -25,7 +25,6 @@ from advsearch.engine.rows import control_group, lost_remarks, mean_number, veri
 from advsearch.engine.searches import UNPRINTED
 from advsearch.engine.transport import remark
 from advsearch.report.wording import number_text
-from advsearch.runs.answer import write_answer
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import (
     AnswerDistribution,
@@ -54,6 +53,7 @@ from advsearch.runs.results.attack import (
     VerifiedRate,
 )
 from advsearch.runs.results.base import Formation, MovedValue, VariedValue
+from advsearch.runs.summary import write_answer
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
 from advsearch.viewer.pages import write_page

@@ -24,15 +24,8 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
 from advsearch.engine.problem import Problem
-from advsearch.runs.results.derivatives import CosineRow
-from advsearch.runs.results.derivatives import GradientStatus
-from advsearch.runs.results.derivatives import PathCut
-from advsearch.runs.results.derivatives import PathLength
-from advsearch.scene.gradients import BY_ADJOINT
-from advsearch.scene.gradients import BY_DIFFERENCES
-from advsearch.scene.gradients import GradientPlan
-from advsearch.scene.gradients import Group
-from advsearch.scene.gradients import compared
+from advsearch.runs.results.base import CosineRow, GradientStatus, PathCut, PathLength
+from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, Group, compared
 from advsearch.scene.renderer import Renderer
 
 GOAL = 0.9

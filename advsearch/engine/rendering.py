@@ -22,8 +22,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model, load_model
 from advsearch.models.guards import plainly
 from advsearch.progress import Watched, watcher
-from advsearch.report.contact_sheet import contact_sheet
-from advsearch.report.marks import marked
+from advsearch.report.marks import contact_sheet, marked
 from advsearch.report.phrases import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png

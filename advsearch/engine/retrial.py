@@ -19,8 +19,8 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.sharing import Shared
 from advsearch.errors import InputError
 from advsearch.progress import Progress
-from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.summary import read_answer
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Judgement
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from advsearch.report.drawing import BLUE, GREY, RED, drawn
+from advsearch.report.figures import BLUE, GREY, RED, drawn
 from advsearch.report.markup import Html, element
 
 if TYPE_CHECKING:

@@ -17,6 +17,7 @@ from advsearch.report.phrases import (
     wanted,
     with_article,
 )
+from advsearch.settings import split_names
 
 if TYPE_CHECKING:
     from advsearch.runs.results.attack import AttackSummary, SharedWork, VerifiedRate
@@ -148,8 +149,6 @@ def short_name(value: Any) -> str:
 
 def short_names(text: str) -> str:
     """Return the last parts of paths, of one or of several separated by commas: ``a.hdr, studio``."""
-    from advsearch.settings import split_names  # which is too heavy for a help
-
     return ", ".join(map(short_name, split_names(text)))
 
 

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
-from advsearch.runs import database, images, lock, made_with, store, summary, tracking
+from advsearch.runs import database, files, images, made_with, store, summary, tracking
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
+from advsearch.settings import HEADER
 from advsearch.yaml_text import LARGEST
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ class RunDirectory:
         store: its open results.
     """
 
-    def __init__(self, path: Path, held: lock.RunLock) -> None:
+    def __init__(self, path: Path, held: files.RunLock) -> None:
         self.path = path
         self._lock = held
         self._began = True
@@ -119,7 +120,7 @@ class RunDirectory:
     @classmethod
     def _in_place(cls, path: Path, overwrite: bool) -> RunDirectory:
         """Lock the directory, empty it if it may be, and start the run; leave none of it when that fails."""
-        held = lock.RunLock(path)
+        held = files.RunLock(path)
         try:
             check_free(path, overwrite=overwrite)
             with storage_errors(path):
@@ -179,7 +180,7 @@ class RunDirectory:
         """
         path = find_run(run)
         _check_links(path)
-        held = lock.RunLock(path)
+        held = files.RunLock(path)
         try:
             opened = cls(path, held)
         except BaseException:
@@ -395,7 +396,7 @@ def _check_links(path: Path) -> None:
     Raises:
         FileFormatError: there is a link.
     """
-    links = [name for name in (*CONTENTS, lock.NAME) if name != CONFIG and (path / name).is_symlink()]
+    links = [name for name in (*CONTENTS, files.NAME) if name != CONFIG and (path / name).is_symlink()]
     if links:
         raise FileFormatError(f"{path / links[0]}: expected a file or a folder of this run, got a link; remove it")
 
@@ -440,7 +441,6 @@ def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
     if database.is_results_database(path / store.NAME):
         return True
-    from advsearch.settings import HEADER
 
     try:
         with open_regular(path / CONFIG, "a run.yaml", LARGEST) as file:
@@ -514,7 +514,7 @@ def _is_leftover(path: Path) -> bool:
     """Whether it is what a kill leaves before there is a run: the lock, a part of a file, results without a byte."""
     if path.name == store.NAME:
         return path.is_file() and path.stat().st_size == 0
-    return path.name in (lock.NAME, f"{store.NAME}-journal") or path.name.startswith(PART)
+    return path.name in (files.NAME, f"{store.NAME}-journal") or path.name.startswith(PART)
 
 
 def _remove_if_bare(path: Path) -> None:

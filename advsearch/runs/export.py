@@ -171,6 +171,7 @@ def _json(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) ->
 
 def _parquet(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
     try:
+        # comes with the extra `parquet`
         import pyarrow
         import pyarrow.parquet
     except ImportError:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.errors import FileFormatError, InputError
@@ -231,8 +232,8 @@ def _digest(key: str) -> str:
 
 def _mask_png(layers: Path) -> bytes:
     """Return the mask in an EXR with layers as a PNG of one channel: 1 where the object is."""
+    # late: OpenEXR takes long to import
     import OpenEXR
-    from PIL import Image
 
     try:
         with OpenEXR.File(str(layers), separate_channels=True) as file:

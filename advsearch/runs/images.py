@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from advsearch.errors import FileFormatError
 from advsearch.runs.files import replacing, write_bytes
@@ -64,8 +65,6 @@ def difference(before: Any, after: Any, gain: float = DIFFERENCE_GAIN) -> Floats
 
 def png_bytes(image: Any) -> bytes:
     """Return the display-referred picture as an 8-bit PNG; equal pictures give equal bytes."""
-    from PIL import Image
-
     buffer = io.BytesIO()
     Image.fromarray(_picture(to_8bit(image))).save(buffer, "PNG")
     return buffer.getvalue()
@@ -73,8 +72,6 @@ def png_bytes(image: Any) -> bytes:
 
 def smaller_png(data: bytes, side: int) -> bytes:
     """Return the picture of a PNG as a PNG whose longest side is at most `side` pixels."""
-    from PIL import Image
-
     buffer = io.BytesIO()
     with Image.open(io.BytesIO(data)) as image:
         image.thumbnail((side, side))
@@ -97,8 +94,6 @@ def read_png(path: Path) -> Floats:
     Raises:
         FileFormatError: it is missing or not a picture.
     """
-    from PIL import Image
-
     try:
         with Image.open(path) as image:
             values: Floats = np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
@@ -137,6 +132,7 @@ def write_layers(path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]
 
 
 def _write_exr(path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]) -> Path:
+    # late: OpenEXR takes long to import
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **notes}
@@ -179,8 +175,6 @@ def write_animation(path: Path, frames: Sequence[Any]) -> Path:
 
 def _gif(pictures: Sequence[Bytes]) -> bytes:
     """Return a GIF with one palette for all frames, by Pillow itself: 20 times as fast as through imageio."""
-    from PIL import Image
-
     pixels = np.concatenate(pictures)
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
     palette = Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)

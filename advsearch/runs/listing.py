@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
-from advsearch.runs import database, lock, store, summary
+from advsearch.runs import database, files, store, summary
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.runs.results.base import Result
 from advsearch.settings import read_yaml
@@ -107,6 +107,6 @@ def _when(path: Path) -> float | None:
 
 
 def _state(path: Path, result: Result | None) -> str:
-    if lock.is_held(path):
+    if files.is_held(path):
         return "running"
     return "stopped" if result is None or result.goes_on else str(getattr(result, "ending", "done"))

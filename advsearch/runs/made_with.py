@@ -12,6 +12,7 @@ from itertools import islice
 from pathlib import Path
 
 from advsearch.files import opened_for
+from advsearch.settings.configuration import FILES
 
 NOTE = "made with"
 """The note: a list, with an entry for each sitting."""
@@ -60,8 +61,6 @@ def changed_file(before: Sequence[Mapping[str, object]], settings: Mapping[str, 
 def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of each file that settings name, in hexadecimal, and of each that was read for it: materials,
     pictures and buffers that a mesh or a scene names. A folder has one for all. What is bundled or gone has none."""
-    from advsearch.settings.configuration import FILES
-
     found: dict[str, str] = {}
     for name, value in settings.items():
         for path in _paths(value):

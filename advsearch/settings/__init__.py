@@ -8,6 +8,7 @@ from __future__ import annotations
 from advsearch.settings.configuration import FILES, Config
 from advsearch.settings.declaration import Clash, Setting, setting, setting_as_in, settings
 from advsearch.settings.values import (
+    HEADER,
     all_finite,
     as_python,
     as_text,
@@ -15,10 +16,10 @@ from advsearch.settings.values import (
     is_shallow,
     number_or_text,
     parse_assignment,
+    read_yaml,
     shown,
     split_names,
 )
-from advsearch.settings.yaml_files import HEADER, read_yaml
 
 __all__ = [
     "FILES",

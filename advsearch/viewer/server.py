@@ -1,4 +1,6 @@
-"""`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
+"""Requests that the dashboard's server does not answer as asked.
+
+`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
 
 What it answers: GET and HEAD of the list, of a run's page, of its rows and pictures, POST of a photograph, and nothing
 else. No part of an address becomes a path: runs are looked up by name among those that it was given, pictures by
@@ -30,15 +32,22 @@ from advsearch import rooms
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import open_regular
 from advsearch.report.markup import element
-from advsearch.runs import listing, lock
+from advsearch.runs import files, listing
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
 from advsearch.viewer.certificate import https_context, is_address, reachable
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.following import START, following_page, is_under_way, progress_json
-from advsearch.viewer.list_page import list_page
-from advsearch.viewer.refused import Refused
+from advsearch.viewer.dashboard import START, following_page, is_under_way, list_page, progress_json
 from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
 from advsearch.viewer.thumbnails import cover, kept_pictures, path_of
+
+
+class Refused(Exception):
+    """A request that is not answered as asked."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
 
 LOOPBACK = "127.0.0.1"
 
@@ -318,7 +327,7 @@ class _Handler(BaseHTTPRequestHandler):
             with open_regular(run / COLUMNS, "columns of a sweep", LARGEST) as file:
                 return "application/octet-stream", file.read()
         part = PART if after else FIRST_PART
-        running = lock.is_held(run)  # before the rows are read: what comes later is asked for again
+        running = files.is_held(run)  # before the rows are read: what comes later is asked for again
         columns = read_columns(run, after, part)
         more = len(columns.step) == part
         return "application/octet-stream", replace(columns, more=more, running=running).packed()

@@ -19,11 +19,19 @@ from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, study_chart
-from advsearch.report.distance import distance_axes, distance_of, distance_sentence
-from advsearch.report.drives import HEADS, drive_rows, drive_title
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.phrases import answer_text, beside_text, is_command, percent
-from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
+from advsearch.report.sweeps import (
+    DRIVE_HEADS,
+    difference_text,
+    distance_axes,
+    distance_of,
+    distance_sentence,
+    drive_rows,
+    drive_title,
+    surface_sentences,
+    wrong_text,
+)
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
@@ -227,7 +235,10 @@ def _drives(path: Path, summary: SweepSummary) -> Html:
     return join_html(
         element("h2", "Whole drives"),
         element("div", figure, class_="pictures") if figure else None,
-        *(join_html(element("p", drive_title(one)), study_table(HEADS, drive_rows(one))) for one in summary.drives),
+        *(
+            join_html(element("p", drive_title(one)), study_table(DRIVE_HEADS, drive_rows(one)))
+            for one in summary.drives
+        ),
     )
 
 

@@ -14,7 +14,7 @@ from samples import make_answered
 from scipy.spatial import KDTree
 
 import advsearch
-from advsearch.api.export_scene import answer_of
+from advsearch.api.export import answer_of
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.controls import make_control, make_space

@@ -14,11 +14,11 @@ from advsearch.api.studies import chains_of
 from advsearch.cluster.executor import Done, Work, Workforce
 from advsearch.config import AttackConfig
 from advsearch.errors import ClusterError
-from advsearch.questions.attack.curve import curve_from_config
+from advsearch.questions.attack.several import curve_from_config
 from advsearch.questions.gap.carry_out import gap_from_config
 from advsearch.questions.gap.settings import GapConfig
-from advsearch.runs.answer import read_answer
 from advsearch.runs.store import NAME, Store
+from advsearch.runs.summary import read_answer
 
 SMALL = GapConfig(
     object="mug",

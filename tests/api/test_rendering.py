@@ -15,7 +15,7 @@ import torch
 import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import InputError
-from advsearch.report.contact_sheet import GAP, LINE, NARROWEST, columns_for, contact_sheet
+from advsearch.report.marks import GAP, LINE, NARROWEST, columns_for, contact_sheet
 from advsearch.runs.images import read_png
 from advsearch.scene.color import linear_to_srgb
 

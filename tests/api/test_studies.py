@@ -23,7 +23,7 @@ from advsearch.config import AttackConfig
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack.curve import curve_from_config
+from advsearch.questions.attack.several import curve_from_config
 from advsearch.questions.gap.carry_out import gap_from_config
 from advsearch.questions.gap.settings import GapConfig
 from advsearch.questions.region import carry_out as mapping
@@ -98,7 +98,7 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
 ) -> None:
     run = str(tmp_path / "it")
     monkeypatch.setattr(
-        "advsearch.questions.attack.curve.curve_from_config", lambda config, **more: samples.curve(run=config.run)
+        "advsearch.questions.attack.several.curve_from_config", lambda config, **more: samples.curve(run=config.run)
     )
     assert carry_out(AttackConfig(**several, run=run)) == samples.curve(run=run)
 

@@ -30,9 +30,8 @@ from advsearch import __version__
 from advsearch.cli import list as listing
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
-from advsearch.cli.output import aligned, finish
+from advsearch.cli.output import aligned, finish, watch_progress
 from advsearch.cli.output import shown_text as answer
-from advsearch.cli.progress import watch_progress
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value

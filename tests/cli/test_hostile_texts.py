@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.cli.screen import escaped, shortened
+from advsearch.cli.output import escaped, shortened
 from advsearch.errors import FileFormatError
 from advsearch.models import read_labels
 from advsearch.settings import parse_assignment, read_yaml
@@ -201,7 +201,7 @@ def test_names_are_shown_short_and_without_escapes(
 
 def test_json_for_a_terminal_is_json_still(capsys: pytest.CaptureFixture[str]) -> None:
     from advsearch.cli import output
-    from advsearch.cli.screen import screens
+    from advsearch.cli.output import screens
 
     with screens():
         output.print_json({"name": ESCAPES, "\u00e9": "\U000e0001"})

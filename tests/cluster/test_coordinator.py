@@ -13,9 +13,7 @@ from simulated_cluster import Failure, Simulated, coordinator
 from advsearch import threads
 from advsearch.cluster.coordinator import DEPTH, PATIENCE, Coordinator
 from advsearch.cluster.executor import Done, Work
-from advsearch.cluster.inputs import Files
-from advsearch.cluster.machine import version
-from advsearch.cluster.worker import MOST_LOADED, Carried, Ready, carry_out_batch, prepare
+from advsearch.cluster.worker import MOST_LOADED, Carried, Files, Ready, carry_out_batch, prepare, version
 from advsearch.errors import ClusterError
 
 COUNT, SIZE = 400, 16

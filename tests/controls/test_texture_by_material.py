@@ -17,10 +17,10 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 import advsearch
+from advsearch.api.export import printable
 from advsearch.cli.main import main
 from advsearch.controls import make_control, make_space
 from advsearch.engine.objective import off_print, variation
-from advsearch.engine.printing import printable
 from advsearch.engine.transport import remark
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset

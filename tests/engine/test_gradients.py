@@ -33,7 +33,7 @@ from advsearch.questions.check.answer import WHOLE, DerivativeRow, DirectionRow
 from advsearch.questions.check.carry_out import attempts, check_from_config
 from advsearch.questions.check.settings import CheckConfig
 from advsearch.questions.check.words import shown
-from advsearch.runs.results.derivatives import CosineRow
+from advsearch.runs.results.base import CosineRow
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import ESTIMATORS, SEARCH_STEP, Group, first_plan
 from advsearch.scene.renderer import Renderer

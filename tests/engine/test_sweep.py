@@ -48,11 +48,11 @@ from advsearch.errors import AdvsearchError, InputError, RunExistsError, Unknown
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import job_of, sweep_from_config
 from advsearch.report.wording import formation_text
-from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import plain
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
+from advsearch.runs.summary import write_answer
 from advsearch.scene.formation import ImageFormation
 from advsearch.settings import settings
 from advsearch.viewer.columns import read_columns

@@ -96,7 +96,7 @@ def load_run(path: Path) -> None:
 
 def load_answer(path: Path) -> None:
     """Read the answer of a run."""
-    from advsearch.runs.answer import read_answer
+    from advsearch.runs.summary import read_answer
 
     read_answer(path.parents[1])
 

@@ -23,7 +23,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.compare import carry_out
 from advsearch.questions.compare.answer import ComparedPair, CompareResult
 from advsearch.questions.compare.settings import CompareConfig
-from advsearch.questions.report.claims import claims_of
+from advsearch.questions.report.evidence import claims_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row

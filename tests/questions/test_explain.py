@@ -17,8 +17,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
-from advsearch.explanations.answered import Answered
-from advsearch.explanations.observations import Factor, Observations
+from advsearch.explanations.observations import Answered, Factor, Observations
 from advsearch.explanations.rules import CountedRule, RuleCondition
 from advsearch.questions.explain import renders as explaining
 from advsearch.questions.explain.answer import ExplainResult

@@ -26,7 +26,7 @@ from advsearch.questions.plan.settings import PlanConfig
 from advsearch.questions.plan.words import READING
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
-from advsearch.runs.results.derivatives import CosineRow, PathLength
+from advsearch.runs.results.base import CosineRow, PathLength
 from advsearch.runs.summary import read_result
 
 SMALL: dict[str, Any] = {

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import advsearch
-from advsearch.api import carry_out, subruns
+from advsearch.api import carry_out, studies
 from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult
 from advsearch.questions.recipe.description import Recipe, check_figures, planned, read_recipe, recipe_names, titles
@@ -280,7 +280,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
         done.append(config.object)
         return real(config, **named)
 
-    monkeypatch.setattr(subruns, "carry_out", stopping)
+    monkeypatch.setattr(studies, "carry_out", stopping)
     with pytest.raises(KeyboardInterrupt):
         advsearch.recipe(path, run=run)
     path.unlink()  # it goes on as it began

@@ -21,10 +21,9 @@ from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.replay import carry_out as replaying
 from advsearch.questions.replay.settings import ReplayConfig
-from advsearch.runs.answer import read_answer, write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
-from advsearch.runs.summary import read_result
+from advsearch.runs.summary import read_answer, read_result, write_answer
 from advsearch.scene.formation import ImageFormation
 
 EASY = "small_models:easy"

@@ -17,9 +17,15 @@ from advsearch.questions.photographs.answer import PhotoAgreement
 from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.report.answer import Evidence
-from advsearch.questions.report.claims import RULES, claims_of, photo_claims, warnings_over
-from advsearch.questions.report.page import evidence_page
-from advsearch.questions.report.runs import evidence_of, markdown
+from advsearch.questions.report.evidence import (
+    RULES,
+    claims_of,
+    evidence_of,
+    evidence_page,
+    markdown,
+    photo_claims,
+    warnings_over,
+)
 from advsearch.report.claims import ENDED, NO_PROOF, NOTHING, Claim
 from advsearch.runs.results.base import Result
 from advsearch.runs.summary import to_json

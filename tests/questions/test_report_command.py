@@ -14,7 +14,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.questions.recipe.settings import RecipeConfig
-from advsearch.questions.report.claims import QUICK
+from advsearch.questions.report.evidence import QUICK
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.images import write_png
 from advsearch.runs.made_with import NOTE, file_digests

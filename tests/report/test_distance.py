@@ -13,7 +13,7 @@ from stored_sweeps import make_sweep
 
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.report.distance import distance_of, distance_sentence, seen_from
+from advsearch.report.sweeps import distance_of, distance_sentence, seen_from
 from advsearch.runs.results.sweep import AxisRow
 from advsearch.viewer.sweep_page import SweepSource, sweep_page_html
 

@@ -14,8 +14,8 @@ import pytest
 from PIL import ImageCms
 
 import advsearch
+from advsearch.api.export import printable
 from advsearch.cli.main import main
-from advsearch.engine.printing import printable
 from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import MARGIN, PAPERS, Piece, pages_of, write_sheets
 from advsearch.runs.images import read_png, to_8bit

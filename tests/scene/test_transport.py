@@ -17,7 +17,7 @@ from torch import Tensor
 import advsearch
 from advsearch.config import AttackConfig
 from advsearch.engine import transport as searching
-from advsearch.questions.attack.curve import curve_from_config
+from advsearch.questions.attack.several import curve_from_config
 from advsearch.runs.summary import attack_of
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer

@@ -34,15 +34,13 @@ from advsearch.errors import FileFormatError
 from advsearch.questions.attack.page import LARGE_PICTURE, SMALLER_SIDE
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
-from advsearch.report.markup import Html, element, join_html
-from advsearch.report.notebook import figure_of_answer
+from advsearch.report.markup import Html, element, figure_of_answer, join_html
 from advsearch.report.phrases import objective_label, percent
 from advsearch.report.shown import shown
-from advsearch.report.style import CSS
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.images import read_png
-from advsearch.viewer.document import asset
-from advsearch.viewer.turning import LARGEST, object_section, read_object
+from advsearch.viewer.document import CSS, asset
+from advsearch.viewer.pages import LARGEST, object_section, read_object
 
 VOID = {"meta", "img", "br", "hr", "link"}
 

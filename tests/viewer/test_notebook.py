@@ -20,8 +20,8 @@ from samples import CURVE, GAP, sweep
 
 from advsearch.questions.attack.answer import CurveResult
 from advsearch.questions.gap.answer import GapResult
-from advsearch.report.notebook import side_by_side
-from advsearch.report.studies import search_axes, sweep_axes
+from advsearch.report.figures import search_axes, sweep_axes
+from advsearch.report.markup import side_by_side
 
 NOTEBOOK, LOSSES = ROOT / "docs" / "notebook.ipynb", ROOT / "docs" / "own-loss.ipynb"
 

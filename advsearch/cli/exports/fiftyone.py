@@ -16,7 +16,7 @@ def write(args: argparse.Namespace, out: Path) -> Written:
     """Write a dataset of the pictures that were kept."""
     from advsearch.runs.directory import find_run
     from advsearch.runs.fiftyone import write_fiftyone
-    from advsearch.viewer.pictured import name_of_object, pictured
+    from advsearch.viewer.thumbnails import name_of_object, pictured
 
     folder = find_run(args.run)
     count = write_fiftyone(lambda: pictured(folder), out, folder.resolve().name, name_of_object(folder))

@@ -15,10 +15,10 @@ EXAMPLE = "export mug-texture-001 --format gltf --out mug.glb"
 
 def write(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial object."""
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     with at_work(as_json=True, quiet=False):
-        from advsearch.api.export_scene import write_gltf
+        from advsearch.api.export import write_gltf
 
         notes = write_gltf(args.run, out)
     return {"notes": notes}, " ".join([f"The object is in {out}.", *notes])

@@ -15,10 +15,10 @@ EXAMPLE = "export mug-texture-001 --format mitsuba --out folder"
 
 def write(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial scene."""
-    from advsearch.cli.progress import at_work
+    from advsearch.cli.output import at_work
 
     with at_work(as_json=True, quiet=False):
-        from advsearch.api.export_scene import write_mitsuba
+        from advsearch.api.export import write_mitsuba
 
         notes = write_mitsuba(args.run, out)
     return {"notes": notes}, " ".join([f"The scene is in {out}.", *notes])

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from advsearch.engine.sweeps.summary import FINISHED, Count, rate
 from advsearch.errors import FileFormatError
@@ -135,8 +136,6 @@ def read_picture(path: Path) -> object:
     Raises:
         FileFormatError: it is none, or has more than `MOST_PIXELS`.
     """
-    from PIL import Image
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)

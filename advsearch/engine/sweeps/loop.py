@@ -33,7 +33,7 @@ from advsearch.engine.sweeps.surface import map_surface
 from advsearch.engine.sweeps.swept_scene import Scenes, check_worst
 from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
-from advsearch.report.studies import sweep_figure
+from advsearch.report.figures import sweep_figure
 from advsearch.report.wording import count
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes

@@ -18,10 +18,9 @@ from advsearch.attacks.trials import paired_difference
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.job import KIND
 from advsearch.engine.sweeps.points import Drawn, Picks
-from advsearch.report.drawing import new_axes
-from advsearch.report.notebook import answer_html
+from advsearch.report.figures import new_axes, sweep_axes, sweep_figure
+from advsearch.report.markup import answer_html
 from advsearch.report.shown import shown
-from advsearch.report.studies import sweep_axes, sweep_figure
 from advsearch.runs import store
 from advsearch.runs.export import to_pandas
 from advsearch.runs.results.sweep import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary

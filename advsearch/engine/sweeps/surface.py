@@ -33,7 +33,7 @@ from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.summary import rate
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.progress import Progress
-from advsearch.report.surface import SurfacePanel, SurfaceView, surface_figure
+from advsearch.report.figures import SurfacePanel, SurfaceView, surface_figure
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.sweep import SurfaceMap, SurfacePart, SurfaceTable

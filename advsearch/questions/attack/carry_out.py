@@ -64,6 +64,7 @@ from advsearch.models import Model
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
+from advsearch.questions.attack.several import matrix_from_config
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.tasks import AnyTask, Task, make_task
@@ -194,11 +195,9 @@ def attack_from_config(
         InputError: anything that the caller can put right; nothing is written then.
     """
     if config.is_matrix:
-        from advsearch.questions.attack.matrix import matrix_from_config
-
         return matrix_from_config(config, progress=progress, resumed=resumed)
     if config.is_curve:
-        from advsearch.questions.attack.curve import curve_from_config
+        from advsearch.questions.attack.several import curve_from_config
 
         return curve_from_config(config, progress=progress, resumed=resumed)
     return attack_once(config, progress=progress, resumed=resumed)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageSequence
 
 from advsearch.files import JsonObject
 from advsearch.questions.attack.method import PLAN_HEADS, method_facts, plan_rows, plan_text
@@ -32,7 +33,7 @@ from advsearch.viewer.document import (
     study_table,
     subject_html,
 )
-from advsearch.viewer.turning import object_data, object_section, read_object
+from advsearch.viewer.pages import object_data, object_section, read_object
 
 LARGE_PICTURE = 1_000_000
 """Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
@@ -420,8 +421,6 @@ def _read_pictures(path: Path) -> dict[str, str]:
 
 def _read_frames(file: Path) -> list[str]:
     """Return the frames of an animation as data URLs; none where it is missing or damaged."""
-    from PIL import Image, ImageSequence
-
     frames = []
     try:
         with Image.open(file) as animation:

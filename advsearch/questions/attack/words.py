@@ -27,7 +27,7 @@ from advsearch.report.claims import (
     searches_text,
     share_text,
 )
-from advsearch.report.drawing import BLUE
+from advsearch.report.figures import BLUE
 from advsearch.report.phrases import answer_cells, margin_text, percent
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 from advsearch.report.wording import count, interval_text, number_text, short_name

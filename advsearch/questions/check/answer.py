@@ -6,9 +6,8 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report.notebook import InNotebook
-from advsearch.runs.results.base import Fields, JsonFloat, RunResult
-from advsearch.runs.results.derivatives import GradientStatus
+from advsearch.report.markup import InNotebook
+from advsearch.runs.results.base import Fields, GradientStatus, JsonFloat, RunResult
 
 WHOLE = "*"
 """What stands for the parameter in rows about a whole control."""

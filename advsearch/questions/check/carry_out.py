@@ -52,7 +52,7 @@ from advsearch.questions.check.answer import (
 from advsearch.questions.check.settings import CheckConfig
 from advsearch.questions.plan.carry_out import PlanKeywords
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.derivatives import CosineRow
+from advsearch.runs.results.base import CosineRow
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients import STEP_RANGE, Group, compared
 

@@ -21,6 +21,7 @@ EXAMPLES = (
 
 def lacks_gradient(result: CheckResult) -> bool:
     """Whether a parameter has no good gradient by any estimator."""
+    # late, so that --help answers at once
     from advsearch.questions.check.words import short_names
 
     return bool(short_names(result.rows))

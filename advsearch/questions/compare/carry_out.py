@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.api.keywords import Named, Names, SampledKeywords, asks, configured
-from advsearch.api.subruns import carry_out_part
+from advsearch.api.studies import carry_out_part
 from advsearch.attacks import clopper_pearson
 from advsearch.engine.loading import Controls
 from advsearch.engine.sweeps.job import check_all
@@ -19,9 +19,8 @@ from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult, PairPicture
-from advsearch.questions.compare.pairs import compared, far_apart
 from advsearch.questions.compare.settings import CompareConfig
-from advsearch.questions.compare.sides import Side, differing, read_sides, varying
+from advsearch.questions.compare.sides import Side, compared, differing, far_apart, read_sides, varying
 from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.files import write_bytes

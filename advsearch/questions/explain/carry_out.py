@@ -12,8 +12,7 @@ from advsearch.api.keywords import RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
-from advsearch.explanations.answered import Answered
-from advsearch.explanations.observations import Factor, Observations, observed
+from advsearch.explanations.observations import Answered, Factor, Observations, observed
 from advsearch.explanations.rules import (
     CHANCE,
     FEWEST_ROWS,

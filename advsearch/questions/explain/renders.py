@@ -15,14 +15,13 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.subruns import carry_out_part
+from advsearch.api.studies import carry_out_part
 from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.engine.sweeps.job import check_all
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.explanations.answered import Answered, figure_value, rows_of
-from advsearch.explanations.observations import Factor, Mask, Observations
+from advsearch.explanations.observations import Answered, Factor, Mask, Observations, figure_value, rows_of
 from advsearch.explanations.rules import CountedRule, RuleCondition, RuleConditions, covered
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of

@@ -6,11 +6,10 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from advsearch.report.notebook import InNotebook
+from advsearch.report.markup import InNotebook
 from advsearch.runs.export import table_to_pandas
 from advsearch.runs.results.attack import AverageCase, VerifiedRate
-from advsearch.runs.results.base import Fields, JsonFloat
-from advsearch.runs.results.study import StudyResult
+from advsearch.runs.results.base import Fields, JsonFloat, StudyResult
 
 
 class GapRow(Fields):

@@ -8,7 +8,7 @@ from typing import Any
 from advsearch.questions.gap.answer import GapResult, GapRow
 from advsearch.report import wording
 from advsearch.report.claims import Claim, average_claim, case_claim, searches_text
-from advsearch.report.drawing import BLUE, GREY, RED
+from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import margin_text, percent
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 

@@ -8,7 +8,7 @@ from typing import Any
 from advsearch.questions.harden.answer import HardenResult, Share
 from advsearch.report import wording
 from advsearch.report.claims import NO_PROOF, Claim, Extent, claim, share_text
-from advsearch.report.drawing import BLUE, RED, Figures, drawn
+from advsearch.report.figures import BLUE, RED, Figures, drawn
 from advsearch.report.phrases import percent
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 

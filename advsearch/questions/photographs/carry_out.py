@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
 from advsearch import seeds
 from advsearch.attacks import clopper_pearson
@@ -117,8 +118,6 @@ class Photographs:
 
     def _add(self, run: Path, rendering: str, data: bytes, source: str) -> PhotoAgreement:
         """Judge and keep a photograph that was aligned with a rendering; `source` is the name of its file."""
-        from PIL import Image
-
         file = rendering_file(run, rendering)
         with Image.open(file) as image:
             sound = sound_photo(data, image.size)
@@ -188,8 +187,6 @@ class _PhotoJudge:
 
         The picture is resized in 8 bits with Lanczos' filter, which averages where it shrinks.
         """
-        from PIL import Image
-
         height, width = self.size
         with Image.open(io.BytesIO(data)) as image:
             small = image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)

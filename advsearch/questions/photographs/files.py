@@ -11,6 +11,8 @@ import io
 import re
 from pathlib import Path
 
+from PIL import Image, ImageOps
+
 from advsearch.errors import InputError
 from advsearch.runs.directory import IMAGES
 from advsearch.viewer.thumbnails import kept_pictures, path_of
@@ -88,8 +90,6 @@ def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
     Raises:
         InputError: it is too large, or no such picture.
     """
-    from PIL import Image, ImageOps
-
     if len(data) > LARGEST:
         raise InputError(f"photo: expected at most {LARGEST >> 20} MB, got more; send a smaller one")
     bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)

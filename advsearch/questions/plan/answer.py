@@ -6,9 +6,8 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report.notebook import InNotebook
-from advsearch.runs.results.base import Fields, Formation, JsonFloat, RunResult
-from advsearch.runs.results.derivatives import CosineRow, GroupDerivative, PathLength
+from advsearch.report.markup import InNotebook
+from advsearch.runs.results.base import CosineRow, Fields, Formation, GroupDerivative, JsonFloat, PathLength, RunResult
 
 
 class DenoiserAdvice(Fields):

@@ -31,9 +31,9 @@ from advsearch.questions.plan.leaving_out import measured_gains, most_gradients,
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import Formation
-from advsearch.runs.results.derivatives import CosineRow, PathLength
+from advsearch.runs.results.base import CosineRow, Formation, PathLength
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
+from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -286,8 +286,6 @@ def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAd
 
 def _limits() -> list[EstimatorLimit]:
     """What the material form does not cover, as it states itself."""
-    from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS
-
     return [EstimatorLimit.of(limit) for limit in LIMITS]
 
 

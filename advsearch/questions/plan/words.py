@@ -6,8 +6,7 @@ from collections.abc import Mapping
 
 from advsearch.questions.plan.answer import PlanResult
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
-from advsearch.runs.results.base import OUT_OF_TIME
-from advsearch.runs.results.derivatives import GroupDerivative
+from advsearch.runs.results.base import OUT_OF_TIME, GroupDerivative
 
 READING = (
     "How a search gets the derivative of each parameter, measured on this scene, and why. adjoint: a second render "

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
+from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

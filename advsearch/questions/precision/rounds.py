@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 
 from advsearch import seeds, threads
 from advsearch.cluster.executor import Executor
-from advsearch.cluster.machine import processor
+from advsearch.cluster.worker import processor
 from advsearch.errors import ClusterError
 from advsearch.questions.precision.answer import Machine
 from advsearch.questions.precision.points import Array, MeasuredSetting

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from advsearch.report.notebook import InNotebook
+from advsearch.report.markup import InNotebook
 from advsearch.runs.results.base import Fields, Interval, RunResult
 from advsearch.runs.results.sweep import CountedAnswers, SurfaceTable
 

@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, Literal
 import torch
 
 from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
-from advsearch.api.subruns import carry_out_part
+from advsearch.api.studies import carry_out_part
 from advsearch.config import AttackConfig, SweepConfig
-from advsearch.config.named import name_in
-from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
+from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.engine.attack_parts import check_from_config
 from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
-from advsearch.explanations.answered import TRIAL, WORKERS, Answered, rows_of
+from advsearch.explanations.observations import TRIAL, WORKERS, Answered, rows_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.recipe.answer import RecipeFigure, RecipePart, RecipeResult

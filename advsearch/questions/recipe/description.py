@@ -19,14 +19,14 @@ from advsearch import seeds
 from advsearch.config import CONFIGS
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.explanations.answered import ANSWER, GROUP, PART, PHOTOGRAPHS
+from advsearch.explanations.observations import ANSWER, GROUP, PART, PHOTOGRAPHS
 from advsearch.questions.recipe.figures import read_options
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Options
 from advsearch.runs.directory import default_name
 from advsearch.settings import read_yaml, split_names
 from advsearch.settings.configuration import PLACE, SettingsError
-from advsearch.settings.yaml_files import merged
+from advsearch.settings.values import merged
 
 COMMANDS = ("attack", "sweep")
 """What a part may be."""

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.explanations.answered import (
+from advsearch.explanations.observations import (
     ANSWER,
     GROUP,
     OTHERS,

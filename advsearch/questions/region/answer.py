@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.report.notebook import InNotebook
+from advsearch.report.markup import InNotebook
 from advsearch.runs.results.attack import LinearTransport
 from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, JsonFloat, SceneResult, having
 

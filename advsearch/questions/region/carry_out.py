@@ -33,10 +33,10 @@ from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, M
 from advsearch.questions.region.growing import ATTEMPTS, MOST_PROBED, USUAL, GrownBox, grow
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.questions.region.words import map_figure
-from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
+from advsearch.runs.summary import read_answer
 from advsearch.scene.surface import plan
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.settings import split_names

@@ -7,10 +7,9 @@ from typing import Any
 
 from advsearch.questions.region.answer import BoxSide, MarginMap, RegionResult
 from advsearch.report.claims import Claim, Extent, claim, share_text
-from advsearch.report.drawing import Figures
+from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
 from advsearch.report.phrases import percent
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
-from advsearch.report.studies import MARGIN, axis_title, figure_of, heat
 
 
 def shown(result: RegionResult) -> ShownAnswer:

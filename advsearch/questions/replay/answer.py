@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report.notebook import InNotebook
+from advsearch.report.markup import InNotebook
 from advsearch.runs.results.attack import ControlGroup, VerifiedRate
 from advsearch.runs.results.base import Fields, SceneResult
 

@@ -6,12 +6,16 @@ import argparse
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch import __version__
 from advsearch.cli import output
+from advsearch.cli.show import photos_of
 from advsearch.errors import AdvsearchError, InputError
+from advsearch.options import FROM_RUN
+from advsearch.settings import read_yaml
 
 if TYPE_CHECKING:
     from advsearch.questions.report.answer import Evidence, EvidenceRun
@@ -37,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the files."""
-    from advsearch.questions.report.page import evidence_page
-    from advsearch.questions.report.runs import markdown
+    # late, so that --help answers at once
+    from advsearch.questions.report.evidence import evidence_page, markdown
     from advsearch.runs.files import write_text
     from advsearch.runs.summary import to_json
 
@@ -74,8 +78,9 @@ def collected(runs: list[str]) -> Evidence:
         UnknownNameError: there is no such run.
         FileFormatError: what is kept of a run is something else.
     """
+    # late, so that --help answers at once
     from advsearch.questions.report.answer import Evidence
-    from advsearch.questions.report.claims import RULES, warnings_over
+    from advsearch.questions.report.evidence import RULES, warnings_over
     from advsearch.runs.directory import find_run
 
     folders = {part.resolve(): part for name in runs for part in _with_parts(find_run(name))}
@@ -93,6 +98,7 @@ def _files(model: str) -> list[str]:
 
 def _with_parts(folder: Path) -> Iterator[Path]:
     """A run; in place of a recipe, the runs that it consists of."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import PARTS, is_run
 
     parts = [one for one in sorted((folder / PARTS).glob("*")) if is_run(one)]
@@ -110,8 +116,8 @@ def _of_quick_recipe(folder: Path) -> bool:
 
 def _settings(folder: Path) -> Mapping[str, object]:
     """What its run.yaml says; nothing where there is none that can be read."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG
-    from advsearch.settings import read_yaml
 
     with suppress(AdvsearchError):
         return read_yaml(folder / CONFIG)
@@ -120,9 +126,10 @@ def _settings(folder: Path) -> Mapping[str, object]:
 
 def _run(folder: Path) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
+    # late, so that --help answers at once
     from advsearch.questions.report.answer import EvidenceRun
-    from advsearch.questions.report.claims import QUICK, claims_of, nothing_there
-    from advsearch.questions.report.runs import NOT_NOTED, evidence_of
+    from advsearch.questions.report.evidence import NOT_NOTED, QUICK, claims_of, evidence_of
+    from advsearch.report.claims import nothing_claimed
     from advsearch.runs.directory import CONFIG, typed_name
     from advsearch.runs.summary import NAME as SUMMARY
     from advsearch.runs.summary import read_result
@@ -135,7 +142,7 @@ def _run(folder: Path) -> EvidenceRun:
             run=name,
             command=str(settings.get("command") or "unknown"),
             ending="none yet",
-            claims=[nothing_there("the run has no result; it is at work, or was stopped before its end")],
+            claims=[nothing_claimed("the run has no result; it is at work, or was stopped before its end")],
             about={key: text for key, text in facts.items() if text},
             searched=[],
             measured={},
@@ -152,9 +159,7 @@ def _run(folder: Path) -> EvidenceRun:
 
 def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
     """The options of the task that a run was judged by; nothing of one that is not to be had here."""
-    from dataclasses import fields
-
-    from advsearch.options import FROM_RUN
+    # late, so that --help answers at once
     from advsearch.tasks import make_task
     from advsearch.tasks.together import Together
 
@@ -174,8 +179,8 @@ def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
 
 
 def _photos(folder: Path) -> list[Claim]:
-    from advsearch.cli.show import photos_of
-    from advsearch.questions.report.claims import photo_claims
+    # late, so that --help answers at once
+    from advsearch.questions.report.evidence import photo_claims
 
     photos = photos_of(folder)
     return photo_claims(photos) if photos else []
@@ -183,6 +188,7 @@ def _photos(folder: Path) -> list[Claim]:
 
 def _made_with(folder: Path) -> dict[str, str]:
     """What the run noted at each sitting; of several that differ, all."""
+    # late, so that --help answers at once
     from advsearch.runs.made_with import NOTE
     from advsearch.runs.store import NAME as STORE
     from advsearch.runs.store import Store

@@ -38,7 +38,7 @@ class _Stability(QuestionCommand):
         if not args.list:
             return super().run(args)
         from advsearch.cli.flags import config_from
-        from advsearch.cli.progress import at_work
+        from advsearch.cli.output import at_work
         from advsearch.questions.stability.settings import StabilityConfig
 
         config = config_from(args, StabilityConfig)

@@ -46,10 +46,9 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
-from advsearch.runs.summary import attack_of
+from advsearch.runs.summary import attack_of, read_answer
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.parameters import Parameter
 from advsearch.scene.surfaces import aovs_of

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from advsearch.cli.flags import config_from
 from advsearch.cli.question import QuestionCommand
+from advsearch.config import AttackConfig, SweepConfig
 
 if TYPE_CHECKING:
     from advsearch.settings import Config
@@ -28,8 +30,6 @@ class _Sweep(QuestionCommand):
         file = self.file(args)
         if file is None:
             return super().config(args)
-        from advsearch.cli.flags import config_from
-        from advsearch.config import AttackConfig, SweepConfig
 
         varies = "grid" in args or "controls" in args
         return config_from(args, SweepConfig, **SweepConfig.of_answer(AttackConfig.from_yaml(file), varies=varies))

@@ -7,12 +7,17 @@ from typing import Any
 
 from advsearch.report import wording
 from advsearch.report.claims import Claim, Extent, claim, extent_of, share_text
-from advsearch.report.distance import distance_of, distance_sentence
-from advsearch.report.drives import HEADS, drive_rows, drive_title
+from advsearch.report.figures import figure_size, sweep_axes
 from advsearch.report.phrases import answer_text, beside_text, margin_text, percent
 from advsearch.report.shown import AnswerPart, ShownAnswer
-from advsearch.report.studies import figure_size, sweep_axes
-from advsearch.report.surface_words import surface_sentences
+from advsearch.report.sweeps import (
+    DRIVE_HEADS,
+    distance_of,
+    distance_sentence,
+    drive_rows,
+    drive_title,
+    surface_sentences,
+)
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.sweep import AxisRow, PairedRates, SweepSummary, WorstConfiguration
 from advsearch.settings import split_names
@@ -31,7 +36,7 @@ def shown(summary: SweepSummary) -> ShownAnswer:
     """Return accuracy in total and by axis, the worst configuration and the cost."""
     far = distance_of(summary)
     sections = [*_beside(summary), AnswerPart(text=[distance_sentence(far)]) if far else AnswerPart()]
-    sections += [AnswerPart(drive_title(one), heads=HEADS, rows=drive_rows(one)) for one in summary.drives or ()]
+    sections += [AnswerPart(drive_title(one), heads=DRIVE_HEADS, rows=drive_rows(one)) for one in summary.drives or ()]
     sections += _tables(summary)
     if summary.surface is not None:
         said = "\n".join(surface_sentences(summary.surface))

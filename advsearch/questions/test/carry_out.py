@@ -27,8 +27,15 @@ from advsearch.questions.test.counterexamples import (
     remove,
     write_expected,
 )
-from advsearch.questions.test.settings import SuiteConfig
-from advsearch.questions.test.suite import COUNTEREXAMPLES, NotBrokenClaim, NoWorseClaim, Suite, read_suite, suite_of
+from advsearch.questions.test.settings import (
+    COUNTEREXAMPLES,
+    NotBrokenClaim,
+    NoWorseClaim,
+    Suite,
+    SuiteConfig,
+    read_suite,
+    suite_of,
+)
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE

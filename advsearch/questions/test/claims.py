@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.api.subruns import carry_out_part
+from advsearch.api.studies import carry_out_part
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence
@@ -28,8 +28,7 @@ from advsearch.progress import Progress
 from advsearch.questions.test import words
 from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
-from advsearch.questions.test.settings import DrawnConfig
-from advsearch.questions.test.suite import AnyClaim, NoWorseClaim, RightClaim
+from advsearch.questions.test.settings import AnyClaim, DrawnConfig, NoWorseClaim, RightClaim
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.results.attack import AttackSummary

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
+from advsearch.cli.output import at_work
 from advsearch.cli.question import Positional, QuestionCommand
+from advsearch.errors import InputError
 
 if TYPE_CHECKING:
     import argparse
@@ -33,11 +35,12 @@ class _Test(QuestionCommand):
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Try the claims, print their answers, write the files, and return the exit status."""
-        from advsearch.cli.progress import at_work
+        # late, so that --help answers at once
         from advsearch.questions.test.answer import SuiteResult
 
         _check_files(config)
         with at_work(as_json=as_json, quiet=quiet) as progress:
+            # late, so that --help answers at once
             from advsearch.api import carry_out
 
             result = carry_out(config, progress=progress, resumed=resumed)
@@ -56,8 +59,6 @@ def _check_files(config: Config) -> None:
     Raises:
         InputError: the folder of one is not there.
     """
-    from advsearch.errors import InputError
-
     for name, path in _files(config).items():
         if path.is_dir() or not path.absolute().parent.is_dir():
             raise InputError(f"{name}: expected a file in a folder that is there, got {path}; make the folder first")
@@ -65,11 +66,12 @@ def _check_files(config: Config) -> None:
 
 def write_files(config: Config, result: SuiteResult) -> None:
     """Write the files for machines that a configuration asks for."""
-    from advsearch.questions.test import machines
+    # late, so that --help answers at once
+    from advsearch.questions.test import words
     from advsearch.runs.files import write_text
 
     for name, path in _files(config).items():
-        write_text(path, getattr(machines, name)(result), durable=False)
+        write_text(path, getattr(words, name)(result), durable=False)
 
 
 COMMAND = _Test("test", about="suite", place=Positional("SUITE", "a suite, a YAML file"))

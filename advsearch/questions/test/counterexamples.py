@@ -27,7 +27,7 @@ from advsearch.engine.retrial import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
 from advsearch.questions.test.answer import ANSWERS, HELD
-from advsearch.questions.test.suite import OWN, Suite
+from advsearch.questions.test.settings import OWN, Suite
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, default_name, find_run
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.images import read_png

@@ -1,15 +1,22 @@
-"""What `test` needs to know beside its suite, and what one picture of a claim needs."""
+"""What `test` needs to know: its settings, and the suite that a YAML file describes.
+
+And what a picture of a claim needs.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
+from advsearch.errors import FileFormatError, InputError, resembling
+from advsearch.settings import Clash, Config, as_text, check_once, read_yaml, setting, setting_as_in, shown, split_names
+from advsearch.settings.configuration import PLACE
 
 
 class SuiteConfig(Config):
@@ -113,3 +120,206 @@ class DrawnConfig(SceneConfig):
 
 
 CONFIG = SuiteConfig
+
+
+OWN = (*PLACE, "seed", "threads", "deterministic", "workers", "cluster", "seconds")
+"""Settings that the suite or its command says for all claims."""
+
+PICTURES, MOST = 400, 1_000_000
+"""Pictures that a claim may take, and the most that it may ask for."""
+
+COUNTEREXAMPLES = "counterexamples"
+"""What stands for all of them, and no claim is called."""
+
+Settings = dict[str, object]
+
+EXPECTED = {
+    "claim": "right, not_broken or no_worse",
+    "claims": "names with a claim each, such as `right-around: {claim: right, at_least: 0.9}`",
+    "at_least": "a share over 0 and under 1, such as 0.95",
+    "points": "percentage points over 0 and under 100, such as 2",
+    "pictures": f"a whole number from 1 to {MOST}",
+    "than": "another model, by its name or its file",
+    "confidence": "a number from 0.5 to 0.9999, such as 0.95",
+    "seconds": "a number of seconds over 0",
+    "seed": "a whole number from 0 to 2**63 - 1",
+    "settings": "settings with their values, such as `object: mug`",
+    "title": "a text of 1 to 200 letters",
+}
+"""What each name of a suite takes."""
+
+A_CLAIM = "a claim such as {claim: right, at_least: 0.9}"
+"""What a name among the claims takes."""
+
+
+NUMBERS = ("at_least", "points", "pictures", "confidence", "seconds", "seed")
+"""Names that take numbers."""
+
+
+class _Described(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+    @field_validator(*NUMBERS, mode="before", check_fields=False)
+    @classmethod
+    def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
+        """Refuse true for a number: YAML's `pictures: yes` is a slip, not 1."""
+        if isinstance(value, bool):
+            raise ValueError(f"expected {EXPECTED[info.field_name]}, got {value}")
+        return value
+
+
+class _Claim(_Described):
+    kind: ClassVar[type[SceneConfig]]
+    settings: Settings = Field(default_factory=dict)
+
+
+class RightClaim(_Claim):
+    """The model is right in at least a share of the pictures that the controls span.
+
+    Attributes:
+        at_least: that share.
+        pictures: that are drawn, at most.
+    """
+
+    kind: ClassVar[type[SceneConfig]] = DrawnConfig
+    claim: Literal["right"]
+    at_least: Annotated[float, Field(gt=0.0, lt=1.0)]
+    pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
+
+    @field_validator("at_least", mode="before")
+    @classmethod
+    def _per_cent(cls, value: Any) -> Any:
+        """Accept ``95 %``."""
+        found = re.fullmatch(r"\s*(\d+(?:\.\d+)?) ?%\s*", value) if isinstance(value, str) else None
+        return value if found is None else float(found[1]) / 100.0
+
+
+class NotBrokenClaim(_Claim):
+    """No search finds a configuration within a budget that the model gets wrong; its settings are those of `attack`."""
+
+    kind: ClassVar[type[SceneConfig]] = AttackConfig
+    claim: Literal["not_broken"]
+
+
+class NoWorseClaim(_Claim):
+    """The model is right at most so many points less often than another one, on the same pictures.
+
+    Attributes:
+        than: the other model.
+        points: percentage points.
+        pictures: that are drawn, at most.
+    """
+
+    kind: ClassVar[type[SceneConfig]] = DrawnConfig
+    claim: Literal["no_worse"]
+    than: Annotated[str, Field(min_length=1)]
+    points: Annotated[float, Field(gt=0.0, lt=100.0)]
+    pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
+
+
+AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim
+"""The kinds of claims; each is tried by a method of `Trial`. A claim about the frames of a drive would stand here."""
+
+
+class Suite(_Described):
+    """What the file of a suite says.
+
+    Attributes:
+        title: what it is about.
+        settings: of all claims, as for `attack`; what a claim says itself takes their place.
+        seed: root of all random numbers.
+        confidence: of each claim that is decided by drawn pictures.
+        seconds: after which nothing more is begun; None for no limit.
+        claims: by name.
+    """
+
+    title: Annotated[str, Field(min_length=1, max_length=200)] = "Claims about a model"
+    settings: Settings = Field(default_factory=dict)
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    confidence: Annotated[float, Field(ge=0.5, le=0.9999)] = 0.95
+    seconds: Annotated[float, Field(gt=0.0, le=1e9)] | None = None
+    claims: Annotated[
+        dict[str, Annotated[AnyClaim, Field(discriminator="claim")]], Field(min_length=1, max_length=1000)
+    ]
+
+    @field_validator("claims")
+    @classmethod
+    def _names(cls, value: dict[str, AnyClaim]) -> dict[str, AnyClaim]:
+        for name in value:
+            if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,59}", name) or name == COUNTEREXAMPLES:
+                raise ValueError(f"expected names of small letters, digits and hyphens, got {shown(name)}")
+        return value
+
+    def config_of(self, name: str, **changes: object) -> SceneConfig:
+        """Return what a claim's pictures are made with.
+
+        Args:
+            name: of the claim.
+            **changes: settings that the command says for all claims; None says nothing.
+
+        Raises:
+            InputError: a setting is unknown, impossible, or the suite's own.
+        """
+        claim = self.claims[name]
+        for where, given in (("settings", self.settings), (f"claims.{name}.settings", claim.settings)):
+            if own := [one for one in given if one in OWN]:
+                raise InputError(f"{where}: {own[0]} is said for the whole suite; leave it out there")
+        said = {one: value for one, value in changes.items() if value is not None}
+        try:
+            return claim.kind(**{**self.settings, **claim.settings, "seed": self.seed, **said})
+        except InputError as error:
+            raise InputError(f"claims.{name}: {error}") from None
+
+
+def read_suite(path: str | Path) -> Suite:
+    """Return the suite in a YAML file.
+
+    Raises:
+        FileFormatError: the file is missing or no YAML, or as for `suite_of`.
+    """
+    return suite_of(read_yaml(path), str(path))
+
+
+def suite_of(data: Mapping[str, object], where: str) -> Suite:
+    """Return the suite that a mapping describes.
+
+    Args:
+        data: as it stands in a YAML file.
+        where: that file, for messages.
+
+    Raises:
+        FileFormatError: something is missing, unknown, or of another kind; one sentence says what.
+    """
+    given = {name: value for name, value in data.items() if name not in ("schema", "command")}
+    try:
+        return Suite(**given)
+    except ValidationError as error:
+        found = error.errors(include_url=False)
+        first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])  # a slip in a name
+        raise FileFormatError(f"{where}: {_told(first)}") from None
+
+
+def _told(error: Any) -> str:
+    """What is wrong, in words: where, what was expected and what was got."""
+    place = [str(one) for one in error["loc"] if one not in ("right", "not_broken", "no_worse")]
+    if place[-1] == "[key]":  # a name that is a number
+        got = shown(error["input"])
+        return f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"
+    name, got = place[-1], shown(error["input"])
+    if error["type"].startswith("union_tag"):
+        place, name = [*place, "claim"], "claim"
+        got = "nothing" if error["type"] == "union_tag_not_found" else shown(error["ctx"]["tag"])
+    where = ".".join(place)
+    if error["type"] == "extra_forbidden":
+        if name in EXPECTED:
+            return f"{where}: {'a claim of this kind' if len(place) > 2 else 'a suite'} has no {name}; leave it out"
+        near = resembling(name, sorted(EXPECTED))[:1]
+        guess = f"did you mean {near[0]}?" if near else "docs/testing.md has the names"
+        return f"{where}: there is no such name in a suite, or in a claim of this kind; {guess}"
+    if error["type"] == "missing":
+        got = "nothing"
+    if error["type"] == "too_short":
+        got = "none"
+    if error["type"] == "value_error":
+        return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
+    return f"{where}: expected {EXPECTED.get(name, A_CLAIM)}, got {got}"

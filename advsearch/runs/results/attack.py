@@ -14,10 +14,10 @@ from advsearch.runs.results.base import (
     Interval,
     JsonFloat,
     Payload,
+    PlannedGradient,
     SceneResult,
     VariedValue,
 )
-from advsearch.runs.results.derivatives import PlannedGradient
 
 
 class DescribedValue(Fields):

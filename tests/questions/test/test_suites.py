@@ -30,8 +30,8 @@ from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
 from advsearch.questions.attack.carry_out import attack_once
-from advsearch.questions.report.claims import claims_of
-from advsearch.questions.test import claims, machines
+from advsearch.questions.report.evidence import claims_of
+from advsearch.questions.test import claims, words
 from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
 from advsearch.questions.test.carry_out import test_from_config as carry_out
 from advsearch.questions.test.counterexamples import _Block as Block
@@ -233,7 +233,7 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     assert every.changes == ["found: held -> failed", "too-few: held -> undecided"] and every.status == 0
     known = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "known")))
     assert known.status == 0 and [one.expected for one in known.claims] == ["failed", "undecided"]
-    skipped = ElementTree.fromstring(machines.junit(known).partition("\n")[2])
+    skipped = ElementTree.fromstring(words.junit(known).partition("\n")[2])
     assert (skipped.get("failures"), skipped.get("errors"), skipped.get("skipped")) == ("0", "0", "2")
 
 
@@ -329,8 +329,8 @@ def check_sarif(value: Any, name: str = "log") -> None:
 def test_sarif_obeys_the_standard_whatever_a_suite_is_called(tested: tuple[SuiteResult, Path]) -> None:
     result, _ = tested
     for suite in (result.suite, "my suites/größe #1.yaml"):
-        check_sarif(json.loads(machines.sarif(result.model_copy(update={"suite": suite}))))
-    log = json.loads(machines.sarif(result))
+        check_sarif(json.loads(words.sarif(result.model_copy(update={"suite": suite}))))
+    log = json.loads(words.sarif(result))
     for broken in (
         {**log, "version": "2.0.0"},
         {**log, "runs": [{**log["runs"][0], "tool": {}}]},
@@ -379,10 +379,10 @@ def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
     result, _ = tested
     odd = ClaimAnswer(name="odd", kind="right", statement="<b>|`\x00", answer="failed", reason="a | b\n<script>")
     odd_result = result.model_copy(update={"claims": [odd], "title": "T\x07 & <x>"})
-    root = ElementTree.fromstring(machines.junit(odd_result).partition("\n")[2])
+    root = ElementTree.fromstring(words.junit(odd_result).partition("\n")[2])
     assert root.find("testsuite") is not None and root[0].get("name") == "T? & <x>"
-    assert "| odd | failed |  | a \\| b \\<script\\> |" in machines.markdown(odd_result)
-    assert json.loads(machines.sarif(odd_result))["runs"][0]["results"][0]["ruleId"] == "right"
+    assert "| odd | failed |  | a \\| b \\<script\\> |" in words.markdown(odd_result)
+    assert json.loads(words.sarif(odd_result))["runs"][0]["results"][0]["ruleId"] == "right"
 
 
 # ---- bad suites -----------------------------------------------------------------------------------------------------

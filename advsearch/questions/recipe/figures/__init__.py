@@ -17,7 +17,7 @@ from advsearch.questions.recipe.figures.along import CURVE, SCALING
 from advsearch.questions.recipe.figures.given import ANSWERS, CUES
 from advsearch.questions.recipe.figures.ternary import TERNARY
 from advsearch.questions.recipe.table import FigureKind, Options, Table
-from advsearch.report.drawing import Figures, drawn
+from advsearch.report.figures import Figures, drawn
 
 MODEL = "model"
 """The column that says which model answered."""

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe.answer import (
     BarsFigure,
     CorruptionFigure,
@@ -33,8 +33,8 @@ from advsearch.questions.recipe.table import (
     rate_with_interval,
 )
 from advsearch.questions.recipe.words import bare
-from advsearch.report.drawing import BLUE
-from advsearch.report.surface_words import surface_sentences
+from advsearch.report.figures import BLUE
+from advsearch.report.sweeps import surface_sentences
 from advsearch.runs.directory import IMAGES, PARTS
 
 

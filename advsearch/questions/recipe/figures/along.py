@@ -12,10 +12,10 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations.answered import WORKERS, Answered, figure_value
+from advsearch.explanations.observations import WORKERS, Answered, figure_value
 from advsearch.questions.recipe.answer import CurveBin, CurveFigure, CurveLine, NamedCount, ScalingFigure, ScalingPoint
 from advsearch.questions.recipe.table import FigureKind, Options, Table, count_of, extremes, plural, rate_with_interval
-from advsearch.report.drawing import BLUE, GREY, RED
+from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.runs.results.base import Interval
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.explanations.answered import Answered
+from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe.answer import AnswersFigure, AnswersRow, CuesFigure, CuesRow, GivenAnswer, NamedCount
 from advsearch.questions.recipe.table import (
     FigureKind,
@@ -24,7 +24,7 @@ from advsearch.questions.recipe.table import (
     plural,
     rate_with_interval,
 )
-from advsearch.report.drawing import BLUE, GREY, RED
+from advsearch.report.figures import BLUE, RED
 from advsearch.report.phrases import percent
 from advsearch.report.wording import interval_text
 from advsearch.runs.results.base import Interval

@@ -1,8 +1,9 @@
-"""How far away a detector sees an object: the distance at which half of a sweep's pictures show it to the model.
+"""What a sweep found beside its shares, in rows and sentences: over drives, on the surface, and from how far away.
 
-The share of pictures in which it is seen is taken to fall with the distance. The estimate is where the falling line
-through the counts crosses one half (isotonic regression by pooling adjacent violators, Ayer et al. 1955, linear in
-the logarithm of the distance). The interval is exact: with m distances each share is judged by the binomial test of one
+How far away a detector sees an object is the distance at which half of a sweep's pictures show it to the model. The
+share of pictures in which it is seen is taken to fall with the distance. The estimate is where the falling line through
+the counts crosses one half (isotonic regression by pooling adjacent violators, Ayer et al. 1955, linear in the
+logarithm of the distance). The interval is exact: with m distances each share is judged by the binomial test of one
 half at 0.025 / m on each side, so that all hold together with 95 %; it begins at the farthest distance at which the
 share is above one half for sure, and ends at the nearest one beyond it at which the share is below one half for sure.
 """
@@ -12,11 +13,85 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch.errors import InputError
-from advsearch.report.drawing import BLUE, GREY
+from advsearch.report.figures import BLUE, GREY
+from advsearch.report.wording import count, short_name
 from advsearch.runs.results.sweep import AxisRow, SweepSummary
+
+if TYPE_CHECKING:
+    from advsearch.runs.results.sweep import (
+        CountedAnswers,
+        DriveRates,
+        OverDrives,
+        SurfaceMap,
+        SurfacePart,
+        SurfaceTable,
+    )
+
+
+DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")
+"""What stands above the rows."""
+
+
+def drive_title(one: DriveRates) -> str:
+    """Return what drives they are, and of which model."""
+    what = f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} s, {one.model}"
+    return what if one.answer is None else f"{what}, with {one.answer}"
+
+
+def drive_rows(one: DriveRates) -> list[tuple[str, str, str, str]]:
+    """Return a row for each number, as `DRIVE_HEADS` says."""
+    rows = [
+        ("frames in which it is right", *_texts(one.right, 100.0, " %")),
+        ("longest gap", *_texts(one.longest_gap, 1.0, " s")),
+        ("changes a second", *_texts(one.flicker, 1.0, "")),
+    ]
+    if one.first_seen is not None:
+        never = f", never in {one.never_seen}" if one.never_seen else ""
+        mean, interval, worst = _texts(one.first_seen, 1.0, f" {one.unit}")
+        rows.insert(1, ("first right at a distance of", mean + never, interval, worst))
+    return rows
+
+
+def _texts(number: OverDrives, factor: float, unit: str) -> tuple[str, str, str]:
+    low, high = (None, None) if number.interval is None else number.interval
+    interval = "-" if low is None or high is None else f"{low * factor:.3g} to {high * factor:.3g}{unit}"
+    return f"{number.mean * factor:.3g}{unit}", interval, f"{number.worst * factor:.3g}{unit}"
+
+
+def surface_sentences(surface: SurfaceMap) -> list[str]:
+    """Return what the map of each object and model says, a sentence or two each."""
+    return [_sentence(table, surface.least) for table in surface.tables if table.part == "cell"]
+
+
+def _sentence(table: SurfaceTable, least: int) -> str:
+    who, cells = f"{short_name(table.object)}, {short_name(table.model)}", count(table.compared, table.part)
+    if not table.compared:
+        return f"{who}: no {table.part} was seen in {least} pictures and hidden in as many, so nothing is compared."
+    if not table.worse + table.better:
+        return f"{who}: none of {cells} that were compared is told from chance."
+    said = (
+        f"{who}: of {cells} that were compared, {table.worse} go with wrong answers and {table.better} with right ones."
+    )
+    if not table.strongest:
+        return said
+    first = table.strongest[0]
+    where = f"The clearest, at u {first.u:.2f} and v {first.v:.2f}"
+    return f"{said} {where}: wrong in {wrong_text(first.seen)} that see it, {wrong_text(first.hidden)} that do not."
+
+
+def wrong_text(counted: CountedAnswers) -> str:
+    """Return ``35 of 40``: wrong answers among all."""
+    return f"{counted.configurations - counted.correct} of {counted.configurations}"
+
+
+def difference_text(part: SurfacePart) -> str:
+    """Return ``+83 % (+66 % to +91 %)``."""
+    low, high = part.interval
+    return f"{part.difference:+.0%} ({low:+.0%} to {high:+.0%})".replace("%", " %")
+
 
 DISTANCE = "camera.distance"
 """The axis."""

@@ -1,28 +1,39 @@
-"""`load_run`: the answer of a run from its folder, as the call that asked had it."""
+"""`load_run`, the answer of a run from its folder; and `load_model`, to which a task may be named."""
 
 from __future__ import annotations
 
+import inspect
+import os
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from advsearch import models
 from advsearch.engine.attack_parts import parts_in
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import InputError
 from advsearch.files import read_bytes
-from advsearch.runs.answer import read_answer
+from advsearch.models import Model
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.images import read_png
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
-from advsearch.runs.summary import read_result
+from advsearch.runs.summary import read_answer, read_result
 from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr
+from advsearch.tasks import AnyTask, make_task
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from advsearch.models.model import Read
 
 
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
@@ -71,3 +82,29 @@ def _layer(path: Path) -> Tensor:
     """What a control handed over, (h, w, 3) float32."""
     planes, _ = read_exr(path, read_bytes(path, "a picture of a run", LARGEST_FILE))
     return torch.from_numpy(np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1))
+
+
+class ModelKeywords(TypedDict, total=False):
+    """What may be said of a model, see `advsearch.models.load_model`."""
+
+    labels: str | os.PathLike[str] | Sequence[str] | None
+    prompt: str | Sequence[str] | None
+    name: str | None
+    input_size: int | Sequence[int] | str | None
+    mean: float | Sequence[float] | str | None
+    std: float | Sequence[float] | str | None
+    value_range: Sequence[float] | str | None
+    layout: str | None
+    channels: str | None
+    max_batch: int | None
+    read: Read | None
+
+
+def load_model(
+    spec: str | Path | nn.Module | Model, *, task: AnyTask | None = None, **options: Unpack[ModelKeywords]
+) -> Model:
+    return models.load_model(spec, task=None if task is None else make_task(task), **options)
+
+
+load_model.__doc__ = models.load_model.__doc__
+load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]

@@ -1,8 +1,13 @@
-"""A run that goes on, or was stopped, in the dashboard: how far it is, its search as a curve and step by step."""
+"""Pages that only the dashboard has: the list of its runs, and a run that goes on or was stopped.
+
+Of such a run: how far it is, its search as a curve and step by step.
+"""
 
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
 from urllib.parse import quote
@@ -10,13 +15,50 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from advsearch.report.markup import Html, element
-from advsearch.runs import listing, lock, store
+from advsearch.report import wording
+from advsearch.report.markup import Html, element, join_html
+from advsearch.runs import files, listing, store
 from advsearch.runs.directory import PARTS, REPORT
+from advsearch.runs.listing import Listed
 from advsearch.runs.results.base import plain
 from advsearch.runs.store import Row
-from advsearch.viewer.document import data_script, data_url, document
+from advsearch.viewer.document import data_script, data_url, document, scrolled
 from advsearch.viewer.thumbnails import thumbnail
+
+
+def list_page(runs: Mapping[str, Path]) -> str:
+    """Return the page that lists runs, by the name under which each is shown; the newest first."""
+    found = [(name, listing.listed_run(path, counts=False)) for name, path in runs.items()]
+    found.sort(key=lambda one: one[1].when or 0.0, reverse=True)
+    sweeps = sum(one.command == "sweep" for _, one in found)
+    heads = [*(["side by side"] if sweeps > 1 else []), "picture", "run", "what came out", "begun"]
+    head = element("tr", *(element("th", text, scope="col") for text in heads))
+    lines = (_line(name, one, comparable=sweeps > 1) for name, one in found)
+    made = element("table", element("thead", head), element("tbody", *lines), class_="runs")
+    button = element("p", element("button", "Show the chosen sweeps side by side", type="submit"))
+    form = element("form", scrolled(made), button if sweeps > 1 else None, action="compare/")
+    none = element("p", "No runs here yet: advsearch sweep, or advsearch attack, makes one.")
+    title = element("header", element("h1", "Runs"))
+    return document("Runs", title, element("main", form if found else none), connects=True)
+
+
+def _line(name: str, one: Listed, *, comparable: bool) -> Html:
+    place, sweep = f"runs/{quote(name, safe='')}/", one.command == "sweep"
+    box = element("input", type="checkbox", name="run", value=name, aria_label=f"compare {name}") if sweep else None
+    picture = element("img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72")
+    about = ", ".join(filter(None, (one.command, wording.short_names(one.object), " and ".join(one.controls))))
+    photos = element("a", "photographs", href=f"{place}align/", aria_label=f"photographs of {name}")
+    beside = join_html(" ", photos) if one.command in ("attack", "sweep") else None
+    begun = "" if one.when is None else time.strftime("%Y-%m-%d %H:%M", time.localtime(one.when))
+    return element(
+        "tr",
+        element("td", box) if comparable else None,
+        element("td", element("a", picture, href=place, tabindex="-1", aria_hidden="true")),
+        element("th", element("a", name, href=place), element("div", about, beside, class_="soft"), scope="row"),
+        element("td", join_html(one.state, f": {one.answer}" if one.answer else None)),
+        element("td", begun, class_="number"),
+    )
+
 
 MOST_ROWS = 2000
 """Evaluations that are sent at once; the page asks for the rest."""
@@ -27,7 +69,7 @@ START = 0
 
 def is_under_way(run: Path) -> bool:
     """Whether a run has no page that says what came out: none at all, or one of an attack that is being resumed."""
-    return not (run / REPORT).is_file() or (lock.is_held(run) and listing.can_resume(run))
+    return not (run / REPORT).is_file() or (files.is_held(run) and listing.can_resume(run))
 
 
 def following_page(name: str, run: Path) -> str:
@@ -63,7 +105,7 @@ def progress_json(run: Path, after: int) -> bytes:
     """
     last = after
     running, ended = (
-        lock.is_held(run),
+        files.is_held(run),
         not is_under_way(run),
     )  # before what it has is read: what comes later is asked for
     rows: list[Row] = []

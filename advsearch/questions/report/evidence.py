@@ -1,4 +1,7 @@
-"""A run as evidence beside its claims: what it was about, what varied, how it was measured, what is left out."""
+"""A run as evidence: its claims, what it was about, what varied, how it was measured, what is left out.
+
+For a page and as Markdown.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,69 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from advsearch import rooms
+from advsearch.questions.photographs.answer import PhotoAgreement
 from advsearch.questions.report.answer import Evidence, EvidenceRun
 from advsearch.report import wording
-from advsearch.report.claims import Claim
+from advsearch.report.claims import Claim, Extent, claim, nothing_claimed, share_text
+from advsearch.report.markup import Html, element, join_html
+from advsearch.report.wording import interval_text
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result, VariedValue
 from advsearch.runs.results.sweep import SweepSummary
+from advsearch.viewer.document import again, document, facts_table, heading, study_table
+
+RULES = (
+    "Each claim is about the run's own model, object, environment, label and settings, and about nothing else.",
+    "`found`: fresh renders confirm a configuration that a search found; how many others there are is not known.",
+    "`not found`: a search of so many renders found none; another policy or more renders may find one.",
+    "`measured`: a share of what was counted; its interval has 95 % confidence (Clopper-Pearson) and holds for the "
+    "distribution that was drawn from.",
+    "`nothing claimed`: the run does not carry a claim, for the reason that it gives.",
+    "Renderings are not photographs: a claim is about reality only as far as photographs were compared.",
+)
+"""How claims are to be read."""
+
+QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; no result."
+
+
+def claims_of(result: Result) -> list[Claim]:
+    """Return what a run stands for; one that stands for nothing says so in a claim of that kind."""
+    if result.goes_on:
+        told = f"; so far: {result.brief}" if result.brief else ""
+        return [nothing_claimed(f"the run was stopped before its end{told}")]
+    if own := rooms.in_room(result.command, "words", "claims"):
+        return list(own(result)) or [nothing_claimed("nothing in this run came to its end")]
+    return [nothing_claimed(f"the command {result.command} measures something else than how often a model is right")]
+
+
+def photo_claims(photos: PhotoAgreement) -> list[Claim]:
+    """Return what photographs of a run's renderings say."""
+    if not photos.photos or photos.interval is None:
+        return []
+    agreeing = photos.right_right + photos.wrong_wrong
+    extent = Extent(what="photographs that agree", count=agreeing, total=photos.photos, interval=photos.interval)
+    said = "Photographs and renderings agree (both right, or both wrong) in "
+    return [claim("measured", f"{said}{share_text(extent)}. The interval takes photographs as independent.", extent)]
+
+
+def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
+    """Return what has to be known of runs together.
+
+    Args:
+        models: of each run.
+        digests: of each run's model files, one text a run; empty where none is known.
+    """
+    said = []
+    if len(set(models)) > 1:
+        names = ", ".join(sorted(set(models)))
+        said.append(f"The runs are of different models: {names}. A claim about one is none about another.")
+    for model in sorted(set(models)):
+        known = {text for one, text in zip(models, digests, strict=True) if one == model and text}
+        if len(known) > 1:
+            said.append(f"{model}: its file was not the same in all runs, so that they are of {len(known)} models.")
+    return said
+
 
 NOT_NOTED = "not noted: the run is older than that"
 
@@ -187,8 +247,8 @@ def markdown(evidence: Evidence) -> str:
             *(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in one.claims),
             "",
         ]
-        for heading, facts in sections(one).items():
-            lines += [f"{heading}:", "", *(f"- {_plain(text)}" for text in facts), ""]
+        for title, facts in sections(one).items():
+            lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
         lines += (
             ["To repeat it:", "", "```sh", one.command_line.replace("```", "` ` `"), "```", ""]
             if one.command_line
@@ -209,7 +269,7 @@ def sections(one: EvidenceRun) -> dict[str, list[str]]:
         "Budget": [f"{name}: {text}" for name, text in one.cost.items()],
         "Made with": [f"{name}: {text}" for name, text in one.made_with.items()],
     }
-    return {heading: lines for heading, lines in found.items() if lines}
+    return {title: lines for title, lines in found.items() if lines}
 
 
 def _plain(text: str) -> str:
@@ -218,3 +278,42 @@ def _plain(text: str) -> str:
     for sign in "\\<>*_[]`|":
         one_line = one_line.replace(sign, f"\\{sign}")
     return one_line
+
+
+CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
+
+
+def evidence_page(evidence: Evidence) -> str:
+    """Return the page."""
+    claims = [claim for one in evidence.runs for claim in one.claims]
+    carried = sum(claim.kind != "nothing claimed" for claim in claims)
+    runs = f"{len(evidence.runs)} run{'' if len(evidence.runs) == 1 else 's'}"
+    said = f"What {runs} show{'s' if len(evidence.runs) == 1 else ''}, and no more than that."
+    main = element(
+        "main",
+        *(_run(one) for one in evidence.runs),
+        element("h2", "How to read this"),
+        element("ul", *(element("li", text.replace("`", "")) for text in evidence.rules)),
+    )
+    header = heading(f"evidence; {carried} of {len(claims)} statements carry a claim", said, evidence.warnings)
+    return document("evidence", header, main, footer="evidence. This page needs no other file.")
+
+
+def _run(one: EvidenceRun) -> Html:
+    rows = [
+        [
+            claim.kind,
+            claim.statement,
+            f"{claim.extent.count} of {claim.extent.total}" if claim.extent else "",
+            interval_text(claim.extent.interval) if claim.extent else "",
+        ]
+        for claim in one.claims
+    ]
+    facts = {name: "; ".join(lines) for name, lines in sections(one).items()}
+    beside = element("details", element("summary", "On what, how, and what is left out"), facts_table(facts), open="")
+    return join_html(
+        element("h2", f"{one.run} ({one.command})"),
+        study_table(CLAIM_HEADS, rows),
+        beside,
+        again(one.command_line) if one.command_line else None,
+    )

@@ -1,0 +1,299 @@
+"""The answer of a run for other programs and for print.
+
+Other programs get the adversarial scene. Printed are patches, and textures unwrapped into pieces, in true millimetres.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+import advsearch
+from advsearch import seeds
+from advsearch.config import AttackConfig
+from advsearch.controls.base import Control
+from advsearch.controls.patch import enlarged
+from advsearch.controls.space import file_name
+from advsearch.controls.texture import TextureControl
+from advsearch.engine.attack_parts import judged_alone, problem_from_config
+from advsearch.engine.loading import as_controls, load_scene
+from advsearch.engine.problem import Problem
+from advsearch.engine.retrial import kept_answer
+from advsearch.errors import FileFormatError, InputError
+from advsearch.report.sheets import Mask, Piece
+from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
+from advsearch.runs.files import placed_by, storage_errors, write_bytes, write_text
+from advsearch.runs.images import read_png, to_8bit
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.summary import attack_of, read_result
+from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.description import NO_MAP, OBJECT
+from advsearch.scene.exporting.gltf import PLAIN, glb, posed
+from advsearch.scene.mitsuba_backend.files.writing import NAME, SCATTERINGS, write_scene
+from advsearch.scene.parts import HazePart
+from advsearch.scene.raster import doubled_areas
+from advsearch.scene.surface_map import Ints, rasterised
+
+GLB, XML = ".glb", ".xml"
+
+
+@dataclass(frozen=True, eq=False)
+class AnsweredRun:
+    """A run with its answer.
+
+    Attributes:
+        folder: of the run.
+        problem: as the run had it.
+        u: (d,) the configuration of the whole space; what varies by chance is as in the clean scene.
+    """
+
+    folder: Path
+    problem: Problem
+    u: Tensor
+
+    @property
+    def on_picture(self) -> list[str]:
+        """The controls that change the finished picture there."""
+        grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
+        slices = self.problem.space.slices(self.u)
+        return [control.name for control, part in slices if not torch.equal(control.picture(part, grey), grey)]
+
+    @property
+    def inputs(self) -> dict[str, Tensor]:
+        """Those of the scene inside Mitsuba, and what is applied to its picture."""
+        renderer = self.problem.renderer
+        with torch.no_grad():
+            return renderer.scene.assembly(renderer.space.inputs(self.u))
+
+
+def answer_of(run: str | Path) -> AnsweredRun:
+    """Load a run's scene and its answer.
+
+    Args:
+        run: name or folder of a run of `attack` that has ended.
+
+    Raises:
+        InputError: the run has no answer, or its scene is another one now.
+        FileFormatError: the run did not end, or is of another command.
+    """
+    folder = find_run(run)
+    summary = attack_of(folder)
+    if summary.adversarial is None:
+        raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to export")
+    problem, _ = problem_from_config(judged_alone(AttackConfig.from_yaml(folder / CONFIG)))
+    trial = summary.adversarial.trial  # where conditions vary, those of the picture that the run keeps
+    draw = None if trial is None else seeds.stream(problem.seed, "verification", trial)
+    return AnsweredRun(folder, problem, problem.whole(kept_answer(folder, problem), draw))
+
+
+def write_mitsuba(run: str | Path, out: Path) -> list[str]:
+    """Write the scene of a run's answer as XML with its meshes and pictures beside it.
+
+    Args:
+        run: name or folder of a run of `attack` that has ended.
+        out: a file that ends in .xml, or a folder for `scene.xml`; what is beside it has names that begin with its own.
+
+    Returns:
+        Sentences about how its picture becomes that of the run, and what is no part of it.
+
+    Raises:
+        InputError: the run has no answer, files of these names are there, or stock Mitsuba has no such scene.
+        FileFormatError: the run did not end, or is of another command.
+    """
+    path = out if out.suffix.lower() == XML else out / NAME
+    taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
+    there = [one for one in taken if one.exists()]
+    if there or path.parent.is_file():
+        raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
+    answer = answer_of(run)
+    renderer = answer.problem.renderer
+    inputs = answer.inputs
+    on_picture = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
+    backdrop = on_picture.get("backdrop.color")
+    hazes = [part.name for part in renderer.scene.made[0].parts if isinstance(part, HazePart)]
+    hazy = any(float(inputs[f"{name}.density"]) > 0.0 for name in hazes)
+    if hazy and backdrop is not None:
+        raise InputError(f"{answer.folder}: haze before a plain background is no part of a Mitsuba scene")
+    gain = renderer.formation.gain
+    if "camera.exposure" in on_picture:
+        gain *= float(torch.exp2(on_picture["camera.exposure"]))
+    height, width = renderer.formation.resolution
+    notes = [
+        f"The sensor has {width} x {height} pixels, and light paths have at most {renderer.scene.max_depth} segments.",
+        f"The run's picture is the sRGB curve of {gain:.9g} times this radiance, cut off at 1.",
+    ]
+    if backdrop is not None:
+        red, green, blue = (f"{one:.9g}" for one in (backdrop / renderer.formation.gain).tolist())
+        notes.append(f"Where its alpha is under 1, add 1 - alpha times the plain background ({red}, {green}, {blue}).")
+    if hazy:
+        notes.append(f"Haze scatters light, which Mitsuba counts as a segment: {SCATTERINGS} more are for that.")
+    if renderer.formation.denoiser != "none":
+        notes.append("Not in it: the denoiser. Take many samples a pixel.")
+    if answer.on_picture:
+        notes.append(f"Not in it: what the control {', '.join(answer.on_picture)} did to the finished picture.")
+    if answer.problem.conditions is not None:
+        notes.append("What varied by chance in the run is as in the clean scene.")
+    with placed_by("out"), storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as made:
+            write_scene(renderer.scene, inputs, Path(made) / path.name, " ".join(notes), hide=backdrop is not None)
+            for one in sorted(Path(made).iterdir()):
+                os.replace(one, path.parent / one.name)
+        text = f"The answer of {answer.folder.name} as a scene for Mitsuba 3 (advsearch {advsearch.__version__}).\n"
+        write_text(path.with_name(f"{path.stem}-README.txt"), "\n".join([text, *notes, ""]), durable=False)
+    return notes
+
+
+def write_gltf(run: str | Path, out: Path) -> list[str]:
+    """Write the object of a run's answer as binary glTF: displaced and in its pose, with its texture.
+
+    Args:
+        run: name or folder of a run of `attack` that has ended.
+        out: a file that ends in .glb.
+
+    Returns:
+        Sentences about what is not as in the run.
+
+    Raises:
+        InputError: the run has no answer, or the file is called otherwise.
+        FileFormatError: the run did not end, or is of another command.
+    """
+    if out.suffix.lower() != GLB:
+        raise InputError(f"out: expected the name of a .glb file, got {out}")
+    answer = answer_of(run)
+    description = answer.problem.space.scene
+    assert description is not None
+    part = description.meshes[OBJECT]
+    found = posed(part, answer.inputs)
+    with placed_by("out"):
+        write_bytes(out, glb([found]))
+    notes = ["Lengths are in object sizes, y is up, and the texture is rounded to 8 bits."]
+    if part.surface is not None:
+        notes.append("Its surface is one of Mitsuba's own, of which glTF has the base colour only.")
+    elif found.material.specular > PLAIN:
+        notes.append(
+            f"A specular of {found.material.specular:g} is over glTF's largest, {PLAIN:g}, which it has there."
+        )
+    return notes
+
+
+BLEED = 3.0
+"""Millimetres of colour beyond the line to cut."""
+FINEST = 0.2
+"""Millimetres of a pixel that is fine enough: texels are divided until they are no larger, and are interpolated between
+as the renderer does it."""
+MOST_PARTS = 9
+"""Parts of a texel along each side, odd: the middle one has the texel's own colour."""
+
+
+def printable(run: str | Path, size: float) -> list[Piece]:
+    """Return what of a run's answer can be printed.
+
+    A patch is one piece. A texture has one for each connected part of the unwrapped surface, stretched along both sides
+    to the mean size that its texels have on the object; what is left of distortion within a piece is in its name.
+
+    Args:
+        run: of `attack`, that has ended.
+        size: of the real object, its longest side in millimetres, over 0.
+
+    Raises:
+        InputError: nothing of it can be printed, or the size is out of range.
+        UnknownNameError: there is no such run.
+        FileFormatError: the run is of another kind or has not ended, or lacks its files.
+    """
+    if not 1.0 <= size <= 10_000.0:
+        raise InputError(f"size: expected the object's longest side in millimetres, 1 to 10000, got {size}")
+    folder = find_run(run)
+    summary = read_result(folder)
+    if not isinstance(summary, AttackSummary):
+        raise FileFormatError(f"{folder}: expected a run of attack, got one of {summary.command}")
+    config = AttackConfig.from_yaml(folder / CONFIG)
+    scene = load_scene(config.object, NO_MAP, up=config.up)
+    pieces: list[Piece] = []
+    for control in as_controls(config.controls):
+        picture = folder / ARTIFACTS / f"{file_name(control.name)}.png"
+        if control.kind == "patch":
+            pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
+            given = config.controls.get(control.name, {}).get("size")
+            side = size * _side(control, summary, given)
+            pieces.append(_piece(f"{control.name}, {side:.1f} mm a side", pixels, (side / len(pixels),) * 2, None))
+        elif isinstance(control, TextureControl) and picture.is_file():
+            mesh, named = control.mesh_in(scene.description).mesh, control.materials_in(scene.description)
+            faces = None if named is None else np.concatenate([mesh.materials[one] for one in named])
+            extent = float(np.ptp(scene.description.object.mesh.vertices, axis=0).max())
+            pieces.extend(_charts(control.name, read_png(picture), mesh, faces, size / extent))
+    if not pieces:
+        raise InputError(f"{folder}: it has neither a texture nor a patch, so that there is nothing to print")
+    return pieces
+
+
+def _side(control: Control, summary: AttackSummary, given: object) -> float:
+    """The side of a patch in object sizes: what was found, what was given, or its default."""
+    found = (summary.configuration or {}).get(f"{control.name}.size")
+    if found is not None and isinstance(found.value, (int, float)):
+        return float(found.value)
+    default = next(parameter.default for parameter in control.parameters if parameter.name == "size")
+    return float(given if isinstance(given, (int, float)) else default)
+
+
+def _charts(name: str, texture: Floats, mesh: Mesh, faces: Ints | None, scale: float) -> Iterator[Piece]:
+    """Yield the connected parts of a texture as they are seen from outside, the largest first; with `faces` those of
+    these faces.
+
+    Neighbouring texels of one part lie a distance apart on the surface; the mean over the part, along columns and rows,
+    is the size that they get. `scale` is in millimetres a mesh unit.
+    """
+    areas = doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
+    charts = rasterised(mesh, (texture.shape[0], texture.shape[1]))
+    places = charts.positions().astype(np.float64)
+    labels, count = ndimage.label(charts.covered & (True if faces is None else np.isin(charts.face, faces)))
+    boxes = ndimage.find_objects(labels)
+    order = sorted(range(count), key=lambda index: -int((labels[boxes[index]] == index + 1).sum()))
+    for number, index in enumerate(order, 1):
+        rows, columns = boxes[index]
+        inside = labels[rows, columns] == index + 1
+        here = places[rows, columns] * scale
+        steps = [_steps(here, inside, axis) for axis in (1, 0)]
+        if not all(len(step) for step in steps):
+            continue  # a line of texels has no area to print
+        pixel = float(np.mean(steps[0])), float(np.mean(steps[1]))
+        if min(pixel) <= 0.0:
+            continue
+        stretch = max(float(np.std(step) / np.mean(step)) for step in steps)
+        nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        picture = texture[rows, columns][tuple(nearest)]
+        if areas[np.unique(charts.face[rows, columns][inside])].sum() < 0.0:
+            picture, inside = picture[:, ::-1], inside[:, ::-1]
+        title = name if count == 1 else f"{name}, piece {number}"
+        title += f" (sizes within it differ by {100 * stretch:.0f} %)" if stretch >= 0.005 else ""
+        yield _piece(title, picture, pixel, inside)
+
+
+def _steps(places: np.ndarray, inside: Mask, axis: int) -> np.ndarray:
+    """Distances on the surface between texels that are neighbours along an axis, both inside; in millimetres."""
+    lengths = np.linalg.norm(np.diff(places, axis=axis), axis=-1)
+    both = np.minimum(inside.take(range(1, inside.shape[axis]), axis), inside.take(range(inside.shape[axis] - 1), axis))
+    return np.asarray(lengths[both.astype(bool)])
+
+
+def _piece(name: str, picture: Floats, pixel: tuple[float, float], inside: Mask | None) -> Piece:
+    """Divide the pixels, and put the bleed around them."""
+    parts = min(MOST_PARTS, 2 * math.ceil((max(pixel) / FINEST - 1.0) / 2.0) + 1) if max(pixel) > FINEST else 1
+    fine = enlarged(torch.from_numpy(np.ascontiguousarray(picture)), parts) if parts > 1 else torch.from_numpy(picture)
+    size = pixel[0] / parts, pixel[1] / parts
+    columns, rows = (math.ceil(BLEED / side) for side in size)
+    levels = np.pad(to_8bit(fine.numpy()), ((rows, rows), (columns, columns), (0, 0)), mode="edge")
+    mask = None
+    if inside is not None and not inside.all():
+        mask = np.pad(inside.repeat(parts, 0).repeat(parts, 1), ((rows, rows), (columns, columns)))
+    return Piece(name, levels, size, (columns, rows), mask)
