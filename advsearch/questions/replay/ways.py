@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.corruption.digital import coded
-from advsearch.controls.sensor import through_sensor
+from advsearch.controls.sensor import SensorControl, through_sensor
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, unchanged
 from advsearch.scene.exporting.cycles import BlenderError, Cycles
@@ -144,6 +144,5 @@ def _file(quality: int) -> Callable[[Tensor, int], Tensor]:
 
 
 def _sensor(values: dict[str, float]) -> Callable[[Tensor, int], Tensor]:
-    names = ("aberration", "shot", "read", "mosaic", "red", "blue", "compression")
-    full = {name: torch.tensor(values.get(name, 0.0)) for name in names}
+    full = {one.name: torch.tensor(values.get(one.name, 0.0)) for one in SensorControl.parameters}
     return lambda picture, seed: through_sensor(picture, full, seed)
