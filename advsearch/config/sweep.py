@@ -77,7 +77,8 @@ class SweepConfig(SceneConfig):
     )
     path: str | None = setting_as_in(
         AttackConfig, "path", group="sweep",
-        description="sweep the frames of a drive, in which camera or object travel along this path", otherwise="no path",
+        description="sweep the frames of a drive, in which camera or object travel along this path",
+        otherwise="no path",
     )
     fps: float = setting(
         2.0, "sweep", "frames of the drive that are looked at", unit="frames a second", gt=0.0, le=1000.0
