@@ -1,5 +1,6 @@
 """The `sensor` control: what a camera's sensor and its processing do to a picture.
 
+    vignetting light / (1 + a r^2)^2,    r from the middle of the picture, 1 in its corners: cos^4 of the angle there
     light      the red and blue picture are a little larger or smaller than the green one (lateral aberration)
     noise      light + sqrt(shot^2 light + read^2) n,    n standard normal, one draw for each pixel and channel
     mosaic     of each pixel one channel is kept, in the pattern RGGB, the others are interpolated between neighbours
@@ -10,6 +11,8 @@ The noise is the usual model of a raw image, Gaussian with a variance that is af
 Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise modeling and fitting for single-image raw-data,
 section II). The pattern is Bayer's (1976, US patent 3971065); interpolation is bilinear. Chromatic aberration as a
 difference of magnification: Kang 2007, Automatic removal of chromatic aberration from a single image, section 2.
+Vignetting is that of light from off the axis: Kang and Weiss 2000, Can we calibrate a camera using an image of a flat,
+textureless Lambertian surface, section 2, with as much of it as is asked for.
 
 It happens to the finished picture, and nothing is rendered anew. Searched by default is what cameras do at their worst:
 noise of a tenth of white, a white balance half a stop off, a file of quality 40.
@@ -54,8 +57,11 @@ class SensorControl(NumberControl):
     """Noise, mosaic, white balance, chromatic aberration and compression of a camera."""
 
     kind: ClassVar[str] = "sensor"
-    summary: ClassVar[str] = "What a camera adds: noise, mosaic, white balance, chromatic aberration, JPEG."
+    summary: ClassVar[str] = "What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."
     parameters: ClassVar[tuple[Parameter, ...]] = (
+        _number(
+            "vignetting", "1", 0.0, 0.95, "Share of the light that is missing in the corners.", search=None,
+        ),
         _number(
             "aberration", "1", -0.02, 0.02, "How much larger the red picture is than the green one; blue smaller.",
             search=(-0.005, 0.005),
@@ -95,8 +101,9 @@ def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -
         (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value but `compression`, past which the
         derivative is that of the picture before it.
     """
-    light = aberrated(srgb_to_linear(image), values["aberration"])
     height, width = image.shape[:2]
+    light = srgb_to_linear(image) * vignette(height, width, values["vignetting"]).to(image.device)
+    light = aberrated(light, values["aberration"])
     variance = values["shot"] ** 2 * light + values["read"] ** 2
     spread = torch.sqrt(variance + _DARK**2) - _DARK
     light = light + spread * _normal(height, width, seed).to(light)
@@ -105,6 +112,14 @@ def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -
     seen = linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
     return coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
+
+
+def vignette(height: int, width: int, amount: Tensor) -> Tensor:
+    """Return the share of the light (H, W, 1) that comes through a lens, with `amount` () missing in the corners."""
+    down, across = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
+    corner = (height**2 + width**2) / 4.0
+    square = (down[:, None] ** 2 + across[None, :] ** 2) / corner
+    return ((1.0 + ((1.0 - amount) ** -0.5 - 1.0) * square.to(amount)) ** -2)[..., None]
 
 
 def aberrated(image: Tensor, amount: Tensor) -> Tensor:

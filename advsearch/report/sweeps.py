@@ -109,6 +109,7 @@ class SeenFrom:
         intervals: (m,) of these shares, 95 % each.
         distance: the estimate; None where it is seen at all distances, or at none.
         low, high: of the interval; None where the pictures do not bound it on that side.
+        lacking: pictures at a distance that any bound takes, where no distance has so many; None where one has.
     """
 
     unit: str
@@ -118,6 +119,7 @@ class SeenFrom:
     distance: float | None
     low: float | None
     high: float | None
+    lacking: int | None
 
 
 def distance_of(summary: SweepSummary) -> SeenFrom | None:
@@ -143,6 +145,7 @@ def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
         raise InputError(f"detection distance: expected at least two distances, got {len(counted)}; sweep over more")
     distances = tuple(at for at, _, _ in counted)
     chance = 0.025 / len(counted)
+    least = math.floor(-math.log2(chance)) + 1
     low = max((at for at, k, n in counted if _at_least(k, n) < chance), default=None)
     below = [at for at, k, n in counted if _at_least(n - k, n) < chance and at > (low or 0.0)]
     return SeenFrom(
@@ -153,6 +156,7 @@ def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
         distance=_crossing(distances, _falling([(float(k), float(n)) for _, k, n in counted])),
         low=low,
         high=min(below, default=None),
+        lacking=None if any(n >= least for _, _, n in counted) else least,
     )
 
 
@@ -164,6 +168,7 @@ def distance_sentence(found: SeenFrom) -> str:
         ends = "no bound" if found.low is found.high else f"at least {_text(found.low)}"
         ends = f"at most {_text(found.high)}" if found.low is None and found.high is not None else ends
     what = f"{ends}{'' if ends == 'no bound' else f' {unit}'} with 95 % confidence"
+    what += "" if found.lacking is None else f" (that takes at least {found.lacking} pictures at each distance)"
     if found.distance is not None:
         return f"Seen from {_text(found.distance)} {unit} in half of the pictures, {what}."
     if found.shares[0] >= HALF:

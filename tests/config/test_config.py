@@ -32,7 +32,7 @@ from advsearch.settings import Config, Setting, all_finite, parse_assignment, re
 
 WRONG: dict[str, tuple[Any, str]] = {
     "object": ("", "expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got ''"),
-    "path": ("", "expected approach, pass, orbit, or a .csv file, got ''"),
+    "path": ("", "expected approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
     "camera": (

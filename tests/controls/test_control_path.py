@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,15 @@ import pytest
 import torch
 from torch import Tensor
 
+import advsearch
 from advsearch.controls import BoundControl, make_space
 from advsearch.controls.path import CLEAN_AT, PATHS, PathControl
+from advsearch.engine.rendering import sight_of
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.framing import middle
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.tasks import Facts
 
 WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
 """A way of four seconds; the middle one is passed after one of them."""
@@ -109,6 +113,26 @@ def test_a_file_says_where_both_are(scene: SceneDescription, tmp_path: Path) -> 
     torch.testing.assert_close(turning["object.to_world"], alone, atol=1e-5, rtol=0)
     with pytest.raises(FileFormatError, match="expected columns"):
         PathControl(path=f"{file}+orbit")
+
+
+def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> None:
+    """A camera that looks ahead while the object comes from the right: the box is where its points are projected."""
+    file = tmp_path / "both.csv"
+    file.write_text(
+        "time,x,y,z,look_x,look_y,look_z,object_x,object_y,object_z,object_heading\n"
+        "0,6,0,0,0,0,0,0,1,0,0\n1,4,0,0,0,0,0,0,-0.5,0,180\n"
+    )
+    one = advsearch.load_scene("mug").renderer({"path": {"path": str(file)}}, resolution=64, denoise="none")
+    scene = one.scene.made[0]
+    vertices = torch.from_numpy(scene.object.mesh.vertices).double()
+    places = torch.cat([vertices, torch.ones(len(vertices), 1, dtype=torch.float64)], dim=1)
+    for share in (0.0, 0.8):
+        poses = {name: pose.double() for name, pose in one.space.inputs(torch.tensor([share])).items()}
+        seen = torch.linalg.inv(poses["camera.to_world"]) @ poses["object.to_world"] @ places.T
+        focal = 32.0 / math.tan(math.radians(scene.number("camera.fov") / 2.0))
+        flat = 32.0 - focal * (seen[:2] / seen[2]).T
+        box = Facts("mug", look=partial(sight_of, one.surfaces(torch.tensor([share])))).box
+        assert box == pytest.approx((*flat.amin(dim=0).tolist(), *flat.amax(dim=0).tolist()), abs=1.2)
 
 
 @pytest.mark.parametrize("path", PATHS)

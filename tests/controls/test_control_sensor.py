@@ -12,7 +12,7 @@ from advsearch.controls.sensor import SensorControl, aberrated, demosaiced, thro
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 
-NAMES = ("aberration", "shot", "read", "mosaic", "red", "blue", "compression")
+NAMES = ("vignetting", "aberration", "shot", "read", "mosaic", "red", "blue", "compression")
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +80,15 @@ def test_red_is_larger_and_blue_smaller() -> None:
     assert float(blue) == pytest.approx(50.0 + 40.0 * 0.98, abs=0.1)
 
 
+def test_light_falls_with_the_fourth_power_of_the_cosine_of_the_angle() -> None:
+    """Of a pinhole of 60 x 40 pixels, 35 away from the sensor."""
+    down, across = (torch.arange(side) + 0.5 - side / 2 for side in (40, 60))
+    cosine = 35.0 / torch.sqrt(35.0**2 + down[:, None] ** 2 + across[None, :] ** 2)
+    missing = 1.0 - (35.0 / math.sqrt(35.0**2 + 20.0**2 + 30.0**2)) ** 4
+    seen = srgb_to_linear(through_sensor(linear_to_srgb(torch.full((40, 60, 3), 0.8)), values(vignetting=missing)))
+    torch.testing.assert_close(seen, 0.8 * (cosine**4)[..., None].expand(40, 60, 3), atol=1e-4, rtol=0)
+
+
 def test_white_balance_is_in_stops() -> None:
     image = linear_to_srgb(torch.full((4, 4, 3), 0.2))
     seen = srgb_to_linear(through_sensor(image, values(red=1.0, blue=-1.0)))[0, 0]
@@ -96,7 +105,7 @@ def test_compression_is_a_jpeg_file_and_its_derivative_that_of_the_picture() -> 
 
 def test_the_derivatives_are_those_of_differences() -> None:
     image = 0.3 + 0.4 * random_picture(6, 8).double()
-    inside = [0.003, 0.05, 0.02, 0.6, 0.2, -0.3]
+    inside = [0.4, 0.003, 0.05, 0.02, 0.6, 0.2, -0.3]
     tensors = [torch.tensor(one, dtype=torch.float64, requires_grad=True) for one in inside]
 
     def seen(picture: Tensor, *numbers: Tensor) -> Tensor:

@@ -90,6 +90,23 @@ def test_rates_of_one_drive_are_those_worked_out_by_hand(
     assert (said.first_seen and said.first_seen.mean) == (None if first is None else pytest.approx(first, abs=1e-3))
 
 
+@pytest.mark.parametrize("workers", [False, True])
+def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_same(
+    tmp_path: Path, workers: bool
+) -> None:
+    """Level, from 2 sizes away: the camera comes from 4 times as far, the object from as far behind its place."""
+    config = SweepConfig(
+        object="mug", controls={"path": {"seconds": 4.0, "reach": 4.0}}, path="approach+approach", fps=1.0,
+        set_={"camera.elevation": 0.0, "camera.distance": 2.0}, resolution=16, spp=1, trials=0, batch=2,
+    )  # fmt: skip
+    job = job_of(config)
+    executor = Disorder(answering(Scenes(job).named), seed=1) if workers else None
+    with RunDirectory.create(tmp_path / "run") as run:
+        Sweep(job, run, NullProgress(), executor).carry_out()
+        away = {row.values["path.time"]["value"]: row.values["path.distance"]["value"] for row in run.store.rows()}
+    assert away == pytest.approx({0.0: 14.0, 1.0: 11.0, 2.0: 8.0, 3.0: 5.0, 4.0: 2.0}, abs=1e-4)
+
+
 def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(swept_scene, "make_renderer", Timed)
     path = tmp_path / "run"

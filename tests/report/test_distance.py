@@ -48,7 +48,14 @@ def test_a_share_that_rises_with_the_distance_is_pooled() -> None:
     [
         ([20] * 5, 20, "Seen as far as the sweep goes, 80 m, in half of the pictures; at least 80 m"),
         ([0] * 5, 20, "Not seen in half of the pictures, even from 5 m; at most 5 m"),
-        ([1, 1, 1, 0, 0], 1, "Seen from 28.3 m in half of the pictures, no bound with"),
+        (
+            [1, 1, 1, 0, 0],
+            1,
+            "Seen from 28.3 m in half of the pictures, no bound with 95 % confidence (that takes at "
+            "least 8 pictures at each distance).",
+        ),
+        ([7, 7, 7, 0, 0], 7, "Seen from 28.3 m in half of the pictures, no bound with 95 % confidence (that"),
+        ([8, 8, 8, 0, 0], 8, "Seen from 28.3 m in half of the pictures, 20 to 40 m with 95 % confidence."),
     ],
 )
 def test_what_the_pictures_do_not_bound_is_left_open(correct: list[int], of: int, said: str) -> None:

@@ -131,7 +131,7 @@ FILES = {
     "opencv.yaml": (
         "%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
         "   dt: d\n   data: [ 9.025e+02, 0., 6.4525e+02, 0., 911.75, 352.5, 0., 0., 1. ]\n"
-        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        "distortion_coefficients: !!opencv-nd-matrix\n   sizes: [ 5 ]\n   dt: d\n"
         "   data: [ -2.8e-01, 7.0e-02, 1e-3, -2.0e-03, 0. ]\n"
     ),
     "camchain.yaml#cam1": (
@@ -144,7 +144,7 @@ FILES = {
         "<image_height>720</image_height>\n<fisheye_model>0</fisheye_model>\n"
         '<camera_matrix type_id="opencv-matrix">\n  <rows>3</rows>\n  <cols>3</cols>\n  <dt>d</dt>\n  <data>\n'
         "    9.025e+02 0. 6.4525e+02 0. 911.75\n    352.5 0. 0. 1.</data></camera_matrix>\n"
-        '<distortion_coefficients type_id="opencv-matrix">\n  <rows>5</rows>\n  <cols>1</cols>\n  <dt>d</dt>\n'
+        '<distortion_coefficients type_id="opencv-nd-matrix">\n  <sizes>\n    5</sizes>\n  <dt>d</dt>\n'
         "  <data>\n    -2.8e-01 7.0e-02 1e-3 -2.0e-03 0.</data></distortion_coefficients>\n</opencv_storage>\n"
     ),
     "info.yaml": ros("plumb_bob", [*K, 0.0]),

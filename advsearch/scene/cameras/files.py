@@ -99,8 +99,8 @@ def read_camera(spec: str) -> CameraModel:
 
 
 def _yaml(path: str, text: str) -> dict[str, Any]:
-    """The mapping of a YAML text, also as OpenCV writes it: with a directive and a tag that are not YAML's."""
-    text = re.sub(r"\A%YAML[^\n]*\n", "", text).replace("!!opencv-matrix", "")
+    """The mapping of a YAML text, also as OpenCV writes it: with a directive and tags that are not YAML's."""
+    text = re.sub(r"!!opencv-(nd-)?matrix", "", re.sub(r"\A%YAML[^\n]*\n", "", text))
     text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
     try:
         data = parse_yaml(text)
