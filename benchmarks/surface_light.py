@@ -25,7 +25,8 @@ them. Each of `--views` searches compares two pictures. Beside it: how far the p
 
 With `--viewpoints`, the search of the recipe of that name up to its verified answer, predicted, and rendered where the
 object moves in place of the shift of the picture; with `--region`, a region over azimuth and elevation with its map,
-predicted and rendered: processor seconds and seconds (asked for, of the first: a quarter).
+and one over more of both and the distance, predicted and rendered: processor seconds and seconds (asked for, of the
+first: a quarter).
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.config import SweepConfig  # noqa: E402
+from advsearch.config import AttackConfig, SweepConfig  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.engine.surface_light import CHECK_SPP, COMPARED, levels_off, over_all  # noqa: E402
 from advsearch.engine.sweeps.answer import SweepResult  # noqa: E402
@@ -212,6 +213,7 @@ def searched(thing: str, environment: str, size: int) -> None:
     """Print what the search of the recipe for viewpoints takes, and one that moves the object instead."""
     asked = RecipeConfig(recipe="viewpoints", object=thing, environment=environment, resolution=(size, size))
     (config,) = [one.config for one in planned(read_recipe("viewpoints"), asked) if one.part == "search"]
+    assert isinstance(config, AttackConfig)
     camera = {name: ends for name, ends in config.controls["camera"].items() if not name.startswith("shift")}
     moved = {"camera": camera, "pose": {"x": [-0.2, 0.2], "y": [-0.2, 0.2]}}
     for name, one in (("predicted", config), ("rendered", config.model_copy(update={"controls": moved}))):
@@ -223,17 +225,19 @@ def searched(thing: str, environment: str, size: int) -> None:
 
 def grown(thing: str, environment: str) -> None:
     """Print what a region over azimuth and elevation takes, predicted and rendered."""
-    vary = ["camera.azimuth", "camera.elevation"]
-    for name, specialise in (("predicted", True), ("rendered", False)):
-        with tempfile.TemporaryDirectory() as folder:
-            begun = time.process_time()
-            found = advsearch.region(
-                thing, environment=environment, controls="camera", vary=vary, map=16, samples=60,
-                specialise=specialise, run=Path(folder) / "run", progress=False,
-            )  # fmt: skip
-        taken = f"{time.process_time() - begun:5.1f} processor seconds, {found.seconds['total']:5.1f} seconds"
-        told = f"{found.same} of {found.samples} in {found.volume:.2f} of the range" if found.volume else ""
-        print(f"{thing}@{environment} region {name:10s} {taken}, {told}", flush=True)
+    whole = {"azimuth": [0, 360], "elevation": [0, 80], "distance": [1.5, 5]}
+    two, three = ["camera.azimuth", "camera.elevation"], [f"camera.{name}" for name in whole]
+    for kind, side, controls, vary in (("with its map", 16, {}, two), ("farther", 0, whole, three)):
+        for name, specialise in (("predicted", True), ("rendered", False)):
+            with tempfile.TemporaryDirectory() as folder:
+                begun = time.process_time()
+                found = advsearch.region(
+                    thing, environment=environment, controls={"camera": controls}, vary=vary, map=side,
+                    samples=60 if side else 100, specialise=specialise, run=Path(folder) / "run", progress=False,
+                )  # fmt: skip
+            taken = f"{time.process_time() - begun:5.1f} processor seconds, {found.seconds['total']:5.1f} seconds"
+            told = f"{found.same} of {found.samples} in {found.volume:.2f} of the range" if found.volume else ""
+            print(f"{thing}@{environment} region {kind} {name:10s} {taken}, {told}", flush=True)
 
 
 def views(renderer: Renderer, count: int) -> list[Tensor]:
