@@ -3,6 +3,8 @@
     python benchmarks/surface_light.py [SCENE ...] [--views 5] [--truth 1024] [--repeats 5] [--sizes 128,224]
     python benchmarks/surface_light.py [SCENE ...] --sweep [--rows 1000]
     python benchmarks/surface_light.py [SCENE ...] --rule [--views 20]
+    python benchmarks/surface_light.py [SCENE ...] --viewpoints [--sizes 128]
+    python benchmarks/surface_light.py [SCENE ...] --region
 
 A SCENE is OBJECT@ENVIRONMENT, each a bundled name or a file; the default is the bundled mug, bottle and bowl. The model
 is the reference model, for scenes whose object has a class of it. For each scene and size, over random cameras within
@@ -20,6 +22,11 @@ accuracy; and in how many rows the verdict is not that of the rendered ones, and
 
 With `--rule`, how often the comparison before a search accepts predictions: as they are, and with mistakes planted in
 them. Each of `--views` searches compares two pictures. Beside it: how far the pictures are off, by more samples.
+
+With `--viewpoints`, the search of the recipe of that name up to its verified answer, predicted, and rendered where the
+object moves in place of the shift of the picture; with `--region`, a region over azimuth and elevation with its map,
+and one over more of both and the distance, predicted and rendered: processor seconds and seconds (asked for, of the
+first: a quarter).
 """
 
 from __future__ import annotations
@@ -27,6 +34,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,11 +43,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+import advsearch
 from advsearch import threads
 
 threads.configure()
 
-from advsearch.config import SweepConfig  # noqa: E402
+from advsearch.config import AttackConfig, SweepConfig  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.engine.surface_light import CHECK_SPP, COMPARED, levels_off, over_all  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
@@ -47,6 +56,9 @@ from advsearch.engine.sweeps.summary import SweepResult  # noqa: E402
 from advsearch.engine.transport import BOUND, Deviation  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
+from advsearch.questions.attack.carry_out import attack_once  # noqa: E402
+from advsearch.questions.recipe.description import planned, read_recipe  # noqa: E402
+from advsearch.questions.recipe.settings import RecipeConfig  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 from advsearch.scene.surface.plan import why_not  # noqa: E402
@@ -68,7 +80,17 @@ def main() -> None:
     parser.add_argument("--sweep", action="store_true", help="rows of a sweep")
     parser.add_argument("--rows", type=int, default=1000, help="of it, about (default 1000)")
     parser.add_argument("--rule", action="store_true", help="how often predictions are accepted, right and wrong ones")
+    parser.add_argument("--viewpoints", action="store_true", help="the search of the recipe of that name")
+    parser.add_argument("--region", action="store_true", help="a region over viewpoints, with its map")
     args = parser.parse_args()
+    if args.viewpoints or args.region:
+        for scene in args.scenes:
+            thing, _, environment = scene.partition("@")
+            for size in map(int, args.sizes.split(",")) if args.viewpoints else ():
+                searched(thing, environment or "studio", size)
+            if args.region:
+                grown(thing, environment or "studio")
+        return
     if args.rule:
         for scene in args.scenes:
             with torch.no_grad():
@@ -185,6 +207,37 @@ def ruled(scene: str, searches: int) -> None:
     print(f"{scene}: accepted in {searches} searches, and levels off")
     for name, count, levels in zip(names, accepted, off, strict=True):
         print(f"  {name:24s} {count:3d}   {statistics.fmean(one**2 for one in levels) ** 0.5:.2f}", flush=True)
+
+
+def searched(thing: str, environment: str, size: int) -> None:
+    """Print what the search of the recipe for viewpoints takes, and one that moves the object instead."""
+    asked = RecipeConfig(recipe="viewpoints", object=thing, environment=environment, resolution=(size, size))
+    (config,) = [one.config for one in planned(read_recipe("viewpoints"), asked) if one.part == "search"]
+    assert isinstance(config, AttackConfig)
+    camera = {name: ends for name, ends in config.controls["camera"].items() if not name.startswith("shift")}
+    moved = {"camera": camera, "pose": {"x": [-0.2, 0.2], "y": [-0.2, 0.2]}}
+    for name, one in (("predicted", config), ("rendered", config.model_copy(update={"controls": moved}))):
+        begun = time.process_time()
+        found = attack_once(one).summary
+        taken = f"{time.process_time() - begun:5.1f} processor seconds, {found.seconds['total']:5.1f} seconds"
+        print(f"{thing}@{environment} {size:4d} {name:10s} {taken}, {found.ending}", flush=True)
+
+
+def grown(thing: str, environment: str) -> None:
+    """Print what a region over azimuth and elevation takes, predicted and rendered."""
+    whole = {"azimuth": [0, 360], "elevation": [0, 80], "distance": [1.5, 5]}
+    two, three = ["camera.azimuth", "camera.elevation"], [f"camera.{name}" for name in whole]
+    for kind, side, controls, vary in (("with its map", 16, {}, two), ("farther", 0, whole, three)):
+        for name, specialise in (("predicted", True), ("rendered", False)):
+            with tempfile.TemporaryDirectory() as folder:
+                begun = time.process_time()
+                found = advsearch.region(
+                    thing, environment=environment, controls={"camera": controls}, vary=vary, map=side,
+                    samples=60 if side else 100, specialise=specialise, run=Path(folder) / "run", progress=False,
+                )  # fmt: skip
+            taken = f"{time.process_time() - begun:5.1f} processor seconds, {found.seconds['total']:5.1f} seconds"
+            told = f"{found.same} of {found.samples} in {found.volume:.2f} of the range" if found.volume else ""
+            print(f"{thing}@{environment} region {kind} {name:10s} {taken}, {told}", flush=True)
 
 
 def views(renderer: Renderer, count: int) -> list[Tensor]:

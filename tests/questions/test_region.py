@@ -53,7 +53,7 @@ def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Pa
     assert result.samples == 8 and checked % 8 == 0 and checked >= 8
     assert predicted and found.count(("map", True, 4)) == 9 and len(found) == predicted + checked + 9
     assert result.renders["products"] == predicted + 9
-    compared = 3 * carry_out.COMPARED
+    compared = 3 * surface_light.COMPARED
     assert result.renders["verification"] == carry_out.AT_CENTRE + checked + compared
 
 

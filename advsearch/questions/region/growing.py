@@ -55,9 +55,9 @@ LEVELS, ATTEMPTS = 6, 4
 """How often the step of the faces is halved, and final checks at most."""
 PROBES = 8
 """Random points at which what a face would win is probed."""
-USUAL = 100
-MOST_PROBED = 400
-"""Pictures of growing at most, for each parameter: more than twice what boxes, balls, planes and noise have taken."""
+USUAL, MOST_PROBED = 100, 400
+"""Pictures of growing for each parameter, usually and at most: that is more than twice what boxes, balls, planes and
+noise have taken."""
 
 
 def grow(
