@@ -18,7 +18,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.keywords import Names, RunKeywords, asks, configured
 from advsearch.controls.corruption import coded
-from advsearch.controls.sensor import through_sensor
+from advsearch.controls.sensor import SensorControl, through_sensor
 from advsearch.engine.attack_parts import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.naming import different
@@ -172,8 +172,7 @@ def _file(quality: int) -> Callable[[Tensor, int], Tensor]:
 
 
 def _sensor(values: dict[str, float]) -> Callable[[Tensor, int], Tensor]:
-    names = ("aberration", "shot", "read", "mosaic", "red", "blue", "compression")
-    full = {name: torch.tensor(values.get(name, 0.0)) for name in names}
+    full = {one.name: torch.tensor(values.get(one.name, 0.0)) for one in SensorControl.parameters}
     return lambda picture, seed: through_sensor(picture, full, seed)
 
 

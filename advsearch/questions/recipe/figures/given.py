@@ -24,7 +24,7 @@ from advsearch.questions.recipe.table import (
     plural,
     rate_with_interval,
 )
-from advsearch.report.figures import BLUE, RED
+from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
 from advsearch.report.wording import interval_text
 from advsearch.runs.results.base import Interval
