@@ -36,6 +36,8 @@ WANTED = {
     "noise": "one-sample heavy-tails heavy-tailed",
     "transport": "predicted-4-texels predicted-4096 predicted-epsilon-1 predicted-black predicted-mirror "
     "predicted-behind-glass predicted-out-of-sight predicted-without-light predicted-light-out",
+    "surface light": "lit-grazing lit-camera-inside lit-4-texels lit-black-and-white lit-unseen lit-map-half-black "
+    "lit-map-white lit-map-black lit-sun lit-out-of-sight lit-mirror lit-behind-glass",
 }
 """How the names of the extremes begin that the suite has to have."""
 

@@ -21,6 +21,7 @@ from advsearch.questions.stability import (
     cases_precision,
     cases_radiometric,
     cases_stiff,
+    cases_surface_light,
     cases_transport,
 )
 from advsearch.questions.stability.answer import CaseRow, DecidingNumber
@@ -35,6 +36,7 @@ _MODULES = (
     cases_precision,
     cases_noise,
     cases_transport,
+    cases_surface_light,
 )
 GROUPS: tuple[str, ...] = tuple(module.GROUP.name for module in _MODULES)
 """Every group, in the order in which they run."""
