@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 PrecisionPoints = Sequence["PrecisionPoint"]
 
-COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f")
-MARKERS = "osD^vP*X<"
+COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0", "#a06a50")
+MARKERS = "osD^vP*X<>d"
 PANEL = (5.6, 3.9)
 """Width and height of one diagram in inches."""
 PERCENT = 100.0
@@ -57,7 +57,7 @@ def _panels(report: PrecisionResult) -> list[tuple[str, str, PrecisionPoints]]:
     """Title, what the vertical axis shows, and points of each diagram."""
     image = [one for one in report.points if one.quantity == "image"]
     found: list[tuple[str, str, PrecisionPoints]] = []
-    for family, title in (("raw", "picture: samplers, denoiser"), ("depth", "picture: path depth")):
+    for family, title in (("raw", "picture: samplers, denoiser, predictions"), ("depth", "picture: path depth")):
         shown = [one for one in image if (one.family == "depth") == (family == "depth")]
         found += [(title, "error", shown)] if shown else []
     margin = [one for one in image if one.family != "depth"]
@@ -122,6 +122,10 @@ def _line(axes: Axes, line: PrecisionPoints, measure: str, number: int, label: s
                 (x, y),
                 arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 0.8, "shrinkA": 3},
             )
+    for one, x, y in zip(line, seconds, errors, strict=True):
+        if one.later_seconds:
+            axes.plot([one.later_seconds, x], [y, y], color=color, linewidth=1.0, linestyle=":")
+            axes.plot([one.later_seconds], [y], marker=marker, markersize=5, markerfacecolor="white", color=color)
     axes.plot([], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label)
 
 
@@ -210,4 +214,6 @@ def _explain(figure: Figure, report: PrecisionResult) -> None:
     figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
     place = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are medians of interleaved repeats."
     key = "Filled: known, with its 95 % interval. Open, with an arrow: at most this, the reference is no better."
+    if any(one.later_seconds for one in report.points):
+        key += "\nDotted: the first from a matrix or from light on surfaces, and every other one, which takes less."
     figure.supxlabel(f"{place}\n{key}", fontsize=8, color=GREY, x=0.01, ha="left")
