@@ -145,7 +145,8 @@ def _minus(value: float | None) -> str:
 
 
 def _theory(axes: Axes, points: PrecisionPoints, measure: str) -> None:
-    """A dashed line of slope -1/2 under the points."""
+    """A dashed line of slope -1/2 under the points of samples; what is predicted knows no such line."""
+    points = [one for one in points if not one.later_seconds] or points
     low, high = min(one.seconds for one in points), max(one.seconds for one in points)
     if high < 1.5 * low:
         return
@@ -215,5 +216,5 @@ def _explain(figure: Figure, report: PrecisionResult) -> None:
     place = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are medians of interleaved repeats."
     key = "Filled: known, with its 95 % interval. Open, with an arrow: at most this, the reference is no better."
     if any(one.later_seconds for one in report.points):
-        key += "\nDotted: the first from a matrix or from light on surfaces, and every other one, which takes less."
+        key += "\nDotted: from the first one by a matrix or light on surfaces, its making included, to every other one."
     figure.supxlabel(f"{place}\n{key}", fontsize=8, color=GREY, x=0.01, ha="left")
