@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from advsearch.questions.precision.answer import PrecisionPoint, PrecisionResult
 from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
 
 if TYPE_CHECKING:
@@ -17,9 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-    from advsearch.questions.precision.answer import PrecisionPoint, PrecisionResult
-
-PrecisionPoints = Sequence["PrecisionPoint"]
+PrecisionPoints = Sequence[PrecisionPoint]
 
 COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0", "#a06a50")
 MARKERS = "osD^vP*X<>d"
@@ -158,7 +157,7 @@ def _theory(axes: Axes, points: PrecisionPoints, measure: str) -> None:
 
 def _plain_axis(axis: Axis) -> None:
     """Ticks at 1, 2 and 5 times powers of ten (only at powers over a wide range), as plain numbers."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter  # takes long to import
 
     low, high = sorted(axis.get_view_interval())
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
