@@ -30,6 +30,8 @@ GOALS = (0.2, 0.5)
 """Relative errors of a gradient that the page says how to reach."""
 BESIDE = {PICTURE: ("texture", "image,objective", 4)}
 """Control, quantities and multiple of the time of what is no control."""
+FEW = ("--samplers", "independent,multijitter", "--depths", "2,4")
+"""Of the picture: what leaves time for the rest."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,7 +56,7 @@ def measured(name: str, seconds: int, resolution: int) -> dict[str, Any]:
     control, quantities, times = BESIDE.get(name, (name, "gradient", 1))
     command = [sys.executable, "-m", "advsearch", "precision", "--object", "mug", "--control", control]
     command += ["--quantities", quantities, "--seconds", str(times * seconds), "--resolution", str(resolution)]
-    command += ["--error", str(GOALS[0]), "--json", "--quiet"]
+    command += ["--error", str(GOALS[0]), "--json", "--quiet", *(FEW if name == PICTURE else ())]
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run([*command, "--out", f"{folder}/out"], capture_output=True, text=True, check=False)
         if done.returncode:
