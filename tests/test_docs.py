@@ -44,8 +44,8 @@ from advsearch.questions.recipe.description import recipe_names as recipes
 from advsearch.questions.recipe.parts import planned
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.replay.settings import WAYS, ReplayConfig
-from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.questions.stability.carry_out import chosen
+from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.questions.test.suite import read_suite
 from advsearch.runs import export
