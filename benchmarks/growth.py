@@ -1,12 +1,13 @@
 """Time and memory of a search step over two thousand steps: neither may grow.
 
-    python benchmarks/growth.py [--steps 2000] [--size 64] [--transport]
+    python benchmarks/growth.py [--steps 2000] [--size 64] [--transport | --over camera]
 
 The speed of a machine that others use too drifts by more than what is looked for. So every step is followed by a fixed
 piece of work that has nothing to do with the search (the model on a picture of its own), and the ratio of the two is
 what may not grow: its trend over the steps behind the first tenth (by then every kernel is compiled and every pool is
 filled), by Theil and Sen's slope, with a 95 % interval from a bootstrap over blocks. Memory is what is resident at the
-end over that after the first tenth.
+end over that after the first tenth. With `--over`, cameras vary by chance, and light on surfaces predicts pictures; its
+comparisons with traced ones, every hundred steps, are part of their steps.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ import os
 import resource
 import statistics
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,14 +30,11 @@ from advsearch import seeds, threads
 
 threads.configure()
 
-from advsearch.attacks import Query, get_objective, make_policy  # noqa: E402
-from advsearch.controls import make_space  # noqa: E402
-from advsearch.controls.texture import TextureControl  # noqa: E402
-from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
-from advsearch.engine.problem import Problem  # noqa: E402
+from advsearch.attacks import Evaluate, Query, make_policy  # noqa: E402
+from advsearch.config import AttackConfig  # noqa: E402
+from advsearch.engine.attack_parts import parts_of, problem_of_parts  # noqa: E402
+from advsearch.engine.surface_light import SurfaceLight  # noqa: E402
 from advsearch.engine.transport import Transport  # noqa: E402
-from advsearch.models import load_model  # noqa: E402
-from advsearch.tasks import Classification, Facts  # noqa: E402
 
 
 def main() -> None:
@@ -42,15 +42,18 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2000, help="steps of the search (default 2000)")
     parser.add_argument("--size", type=int, default=64, help="side of the picture in pixels (default 64)")
     parser.add_argument("--transport", action="store_true", help="predict pictures by a matrix of light transport")
+    parser.add_argument("--over", help="controls that vary by chance, camera among them: light on surfaces predicts")
     args = parser.parse_args()
-    description = load_scene("mug").description
-    space = make_space([TextureControl()], description)
-    model = load_model("reference")
-    renderer = make_renderer(description, space, args.size, "oidn", 0)
-    task = Classification().on(model)
-    problem = Problem(renderer, space, model, task, lambda *_: Facts("mug", "mug"), get_objective("margin"), 4, 0)
-    policy = make_policy("pgd")
-    evaluate = (Transport(problem, args.steps) if args.transport else problem).evaluate
+    settings: dict[str, Any] = {"controls": {"texture": {"epsilon": 0.05} if args.over else {}}, "spp": 4}
+    config = AttackConfig(object="mug", over=args.over or (), resolution=args.size, steps=args.steps, **settings)
+    problem, _ = problem_of_parts(parts_of(config))
+    model, policy = problem.model, make_policy("pgd")
+    traced, light = partial(map, problem.evaluate), SurfaceLight(problem, args.steps)
+    answered: Evaluate = traced
+    if args.over or args.transport:
+        predictor = light if args.over else Transport(problem, args.steps)
+        predictor.prepare()
+        answered = partial(predictor.answered, traced=traced)
     state = policy.start(problem.domain, torch.Generator().manual_seed(0), args.steps)
     ratios, seconds, memory = [], [], []
     yardstick = torch.rand(16, args.size, args.size, 3)
@@ -61,7 +64,8 @@ def main() -> None:
             break
         u = proposals[0].u
         query = Query(u, seeds.stream(0, "search", index), number=index, phase="search", gradient=True)
-        state = policy.update(state, [(u, evaluate(query))])
+        (answer,) = answered([query])
+        state = policy.update(state, [(u, answer)])
         seconds.append(time.perf_counter() - begun)
         begun = time.perf_counter()
         with torch.no_grad():
@@ -76,6 +80,9 @@ def main() -> None:
     print(f"  time of a step as it is, last tenth over second:       {late / early:.3f} (the machine's drift included)")
     print(f"  memory, end over after the first tenth:                {memory[-1] / memory[tenth]:.3f}")
     print(f"  memory at the end:                                     {memory[-1] / 2**20:.0f} MiB")
+    if args.over:
+        said = light.given_up or "all predicted"
+        print(f"  {len(light.deviations)} comparisons, light found anew {light.renewed} times; {said}")
 
 
 def trend(ratios: list[float], blocks: int = 60, draws: int = 400) -> tuple[float, float, float]:

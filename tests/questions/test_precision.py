@@ -24,7 +24,7 @@ from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import load_scene
 from advsearch.errors import ClusterError, InputError
 from advsearch.progress import NullProgress
-from advsearch.questions.precision import carry_out as measuring
+from advsearch.questions.precision import measurement as measuring
 from advsearch.questions.precision.answer import PrecisionReference, PrecisionResult, Recommended
 from advsearch.questions.precision.carry_out import precision_from_config, references_of
 from advsearch.questions.precision.diagrams import precision_figures

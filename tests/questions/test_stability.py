@@ -16,12 +16,24 @@ from covering import only
 from advsearch.attacks import Query
 from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.stability import suite
+from advsearch.questions.stability import carry_out as suite
 from advsearch.questions.stability.answer import StabilityResult
-from advsearch.questions.stability.case import Toy, box_domain, condition_number, hessian, holds, quadratic
+from advsearch.questions.stability.carry_out import CASES, GROUPS, chosen, run_case
+from advsearch.questions.stability.case import (
+    FELL_SHORT,
+    OK,
+    Case,
+    Check,
+    Outcome,
+    Toy,
+    box_domain,
+    condition_number,
+    hessian,
+    holds,
+    quadratic,
+)
 from advsearch.questions.stability.cases_noise import clipped_mean, median_of_means
 from advsearch.questions.stability.settings import StabilityConfig
-from advsearch.questions.stability.suite import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Outcome, chosen, run_case
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.summary import read_result
 
@@ -36,6 +48,8 @@ WANTED = {
     "noise": "one-sample heavy-tails heavy-tailed",
     "transport": "predicted-4-texels predicted-4096 predicted-epsilon-1 predicted-black predicted-mirror "
     "predicted-behind-glass predicted-out-of-sight predicted-without-light predicted-light-out",
+    "surface light": "lit-grazing lit-camera-inside lit-4-texels lit-black-and-white lit-unseen lit-map-half-black "
+    "lit-map-white lit-map-black lit-sun lit-out-of-sight lit-mirror lit-behind-glass",
 }
 """How the names of the extremes begin that the suite has to have."""
 

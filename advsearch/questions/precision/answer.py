@@ -42,7 +42,7 @@ class PrecisionPoint(SettingPlace):
     seconds: float
     repeats: int
     cosine: JsonFloat | None = Field(default=None, description="of a gradient with its reference")
-    later_seconds: JsonFloat | None = Field(default=None, description="of another gradient from the same matrix")
+    later_seconds: JsonFloat | None = Field(default=None, description="of another one from the same matrix or light")
     family: str | None = Field(default=None, description="what a line of the image is recommended among")
     objective: JsonFloat | None = Field(default=None, description="median over searches")
     quartiles: Interval | None = None

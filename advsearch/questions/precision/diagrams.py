@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from advsearch.questions.precision.answer import PrecisionPoint, PrecisionResult
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn
 
 if TYPE_CHECKING:
@@ -17,12 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-    from advsearch.questions.precision.answer import PrecisionPoint, PrecisionResult
+PrecisionPoints = Sequence[PrecisionPoint]
 
-PrecisionPoints = Sequence["PrecisionPoint"]
-
-COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f")
-MARKERS = "osD^vP*X<"
+COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0", "#a06a50")
+MARKERS = "osD^vP*X<>d"
 PANEL = (5.6, 3.9)
 """Width and height of one diagram in inches."""
 PERCENT = 100.0
@@ -57,7 +56,7 @@ def _panels(report: PrecisionResult) -> list[tuple[str, str, PrecisionPoints]]:
     """Title, what the vertical axis shows, and points of each diagram."""
     image = [one for one in report.points if one.quantity == "image"]
     found: list[tuple[str, str, PrecisionPoints]] = []
-    for family, title in (("raw", "picture: samplers, denoiser"), ("depth", "picture: path depth")):
+    for family, title in (("raw", "picture: samplers, denoiser, predictions"), ("depth", "picture: path depth")):
         shown = [one for one in image if (one.family == "depth") == (family == "depth")]
         found += [(title, "error", shown)] if shown else []
     margin = [one for one in image if one.family != "depth"]
@@ -122,6 +121,10 @@ def _line(axes: Axes, line: PrecisionPoints, measure: str, number: int, label: s
                 (x, y),
                 arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 0.8, "shrinkA": 3},
             )
+    for one, x, y in zip(line, seconds, errors, strict=True):
+        if one.later_seconds:
+            axes.plot([one.later_seconds, x], [y, y], color=color, linewidth=1.0, linestyle=":")
+            axes.plot([one.later_seconds], [y], marker=marker, markersize=5, markerfacecolor="white", color=color)
     axes.plot([], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label)
 
 
@@ -141,7 +144,8 @@ def _minus(value: float | None) -> str:
 
 
 def _theory(axes: Axes, points: PrecisionPoints, measure: str) -> None:
-    """A dashed line of slope -1/2 under the points."""
+    """A dashed line of slope -1/2 under the points of samples; what is predicted knows no such line."""
+    points = [one for one in points if not one.later_seconds] or points
     low, high = min(one.seconds for one in points), max(one.seconds for one in points)
     if high < 1.5 * low:
         return
@@ -153,7 +157,7 @@ def _theory(axes: Axes, points: PrecisionPoints, measure: str) -> None:
 
 def _plain_axis(axis: Axis) -> None:
     """Ticks at 1, 2 and 5 times powers of ten (only at powers over a wide range), as plain numbers."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter  # takes long to import
 
     low, high = sorted(axis.get_view_interval())
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
@@ -210,4 +214,6 @@ def _explain(figure: Figure, report: PrecisionResult) -> None:
     figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
     place = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are medians of interleaved repeats."
     key = "Filled: known, with its 95 % interval. Open, with an arrow: at most this, the reference is no better."
+    if any(one.later_seconds for one in report.points):
+        key += "\nDotted: from the first one by a matrix or light on surfaces, its making included, to every other one."
     figure.supxlabel(f"{place}\n{key}", fontsize=8, color=GREY, x=0.01, ha="left")

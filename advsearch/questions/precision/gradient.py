@@ -17,8 +17,11 @@ from advsearch.questions.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN,
 from advsearch.questions.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
 from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
 from advsearch.scene.gradients import BY_ADJOINT, Group, compared
+from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.renderer import LinearRenderer, linear_inputs
+from advsearch.scene.surface.plan import why_not_kept
+from advsearch.scene.surface.renderer import SurfaceRenderer
+from advsearch.scene.transport.renderer import LinearRenderer, PredictingRenderer, linear_inputs
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
 BY_COORDINATE = 32
@@ -26,10 +29,13 @@ BY_COORDINATE = 32
 ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
 """An adjoint takes about as long as so many renders, the kernels that the material form compiles included; any other
 as the dearest of these. It only decides what is measured first."""
-MATRIX = "matrix"
-"""The series of gradients by a matrix of light transport, from as many samples a pixel as its points have."""
-MATRIX_COST = 2.0
-"""Making a matrix takes about as long as so many renders of as many samples."""
+MATRIX, SURFACE_LIGHT = "matrix", "surface light"
+"""The series of what is predicted: by a matrix of light transport, from as many samples a pixel as its points have, and
+by light on surfaces, whose pictures take so many rays a pixel."""
+COUNTS_OF = {MATRIX: (16, 64, 256), SURFACE_LIGHT: (RAYS,)}
+"""Samples of predicted pictures."""
+COST_OF = {MATRIX: 3.0, SURFACE_LIGHT: 32.0}
+"""To make one and use it takes about as long as so many renders of as many samples."""
 CHECK_SPP = 64
 
 
@@ -62,13 +68,16 @@ class GradientPart:
         return _array(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
-def estimated_parts(groups: Sequence[Group], *, linear: bool, by_matrix: Collection[str] = ()) -> list[GradientPart]:
+def estimated_parts(
+    groups: Sequence[Group], *, linear: bool, by_matrix: Collection[str] = (), ways: Sequence[str] = (MATRIX,)
+) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them.
 
     Args:
         groups: of the plan.
         linear: whether the loss is linear: differences of the loss are then those of the picture, and left out.
-        by_matrix: names of the groups for which there is a matrix too; see `matrix_groups`.
+        by_matrix: names of the groups that are predicted too; see `matrix_groups`.
+        ways: what predicts them; see `ways_to_predict`.
     """
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in groups:
@@ -82,7 +91,7 @@ def estimated_parts(groups: Sequence[Group], *, linear: bool, by_matrix: Collect
             names = f"{members[0].parameter},... ({len(members)})"
         worth = compared(valid, sum(one.size for one in members))
         usable = [one for one in worth if not (linear and one == "secant")]
-        usable += [MATRIX] if all(one.name in by_matrix for one in members) else []
+        usable += ways if all(one.name in by_matrix for one in members) else []
         found.append(
             GradientPart(f"{control}.{names}" if control in several else control, tuple(members), tuple(usable))
         )
@@ -94,6 +103,19 @@ def matrix_groups(renderer: Renderer) -> frozenset[str]:
     linear = linear_inputs(renderer)
     routes = {group.name: renderer.routes.get(group.name, frozenset()) for group in renderer.plan.groups}
     return frozenset(name for name, inputs in routes.items() if inputs and inputs <= linear)
+
+
+def ways_to_predict(renderer: Renderer) -> list[str]:
+    """Return what predicts pictures of a renderer: a matrix where something changes base colours only, and light on
+    surfaces where it may be kept there. How noise is taken out does not matter."""
+    clean = renderer.like(denoiser="oidn")
+    by_matrix = bool(matrix_groups(renderer)) and not renderer.scene.volumetric
+    return [MATRIX] * by_matrix + [SURFACE_LIGHT] * (why_not_kept(clean) is None)
+
+
+def predicting(way: str, renderer: Renderer, u: Tensor, seed: int, spp: int) -> PredictingRenderer:
+    """Return what predicts pictures in a way, made at u."""
+    return SurfaceRenderer(renderer, u, seed) if way == SURFACE_LIGHT else LinearRenderer(renderer, u, seed, spp=spp)
 
 
 def theory_of(estimator: str, sampler: str) -> Theory:
@@ -140,7 +162,7 @@ class GradientBench:
         return [
             MeasuredSetting("gradient", one, count, count * self._cost(one), self.part.name)
             for one in self.part.estimators
-            for count in COUNTS
+            for count in COUNTS_OF.get(one, COUNTS)
         ]
 
     def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
@@ -154,12 +176,12 @@ class GradientBench:
             self._by_estimator(budget, seed, on_done)
 
     def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
-        """Take one gradient and return its error and cosine, and the seconds, the picture itself included; of a matrix
-        its making too, and beside that what another gradient from it takes."""
+        """Take one gradient and return its error and cosine, and the seconds, the picture itself included; of a
+        predicted one those of the matrix or the light too, and beside that what another gradient takes."""
         begun = time.perf_counter()
         later: dict[str, float] = {}
-        if setting.series == MATRIX:
-            made = LinearRenderer(self._renderer, self._u, seed, spp=setting.spp)
+        if setting.series in COUNTS_OF:
+            made = predicting(setting.series, self._renderer, self._u, seed, setting.spp)
             ready = time.perf_counter()
             found = self.part.of(made.gradient(self._loss, self._u, seed, setting.spp)[1])
             later = {"later_seconds": time.perf_counter() - ready}
@@ -192,8 +214,8 @@ class GradientBench:
     # ---- inside -----------------------------------------------------------------------------------------------------
 
     def _cost(self, estimator: str) -> float:
-        if estimator == MATRIX:
-            return 1.0 + MATRIX_COST
+        if estimator in COST_OF:
+            return COST_OF[estimator]
         renders = sum(replace(group, estimator=estimator).renders for group in self.part.groups)
         if estimator in BY_ADJOINT:
             return 1.0 + ADJOINT_COST[estimator]

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch.questions.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
+from advsearch.questions.precision.gradient import COST_OF, COUNTS_OF, predicting
 from advsearch.questions.precision.points import Array, MeasuredSetting, ReferenceValue, reference_through
 from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
 from advsearch.scene.renderer import Renderer
@@ -32,6 +33,9 @@ REFERENCE_SAMPLER = "multijitter"
 DENOISED = ("independent", "multijitter")
 """Samplers that are measured with the denoiser too."""
 OIDN = " + oidn"
+PREDICTED = "predicted"
+"""The family of pictures that a matrix of light transport or light on surfaces predicts. They stand beside the raw
+reference."""
 PATH = "path integrator"
 """Mitsuba's own path tracer, beside the path replay that the renderer uses for pictures too."""
 
@@ -42,7 +46,7 @@ class Variant:
 
     Attributes:
         series: its name in the diagram.
-        family: what it is compared with and recommended among: "raw", "oidn" or "depth".
+        family: what it is compared with and recommended among: "raw", "oidn", "depth" or `PREDICTED`.
         sampler: Mitsuba's name.
         denoiser: as of the image formation.
         depth: longest light path in segments.
@@ -61,28 +65,35 @@ class Variant:
     @property
     def counts(self) -> tuple[int, ...]:
         """Sample counts to measure it at; fewer for path depths, which are about their bias."""
+        if self.family == PREDICTED:
+            return COUNTS_OF[self.series]
         return POWERS[:3] if self.family == "depth" else COUNTS.get(self.series, POWERS)
 
     @property
     def weight(self) -> float:
         """Cost of a sample, as far as the order of the measurements goes."""
-        return (1.0 + 0.1 * self.depth) * (1.0 if self.series in FIRST else LATER)
+        return (1.0 + 0.1 * self.depth) * (COST_OF.get(self.series) or (1.0 if self.series in FIRST else LATER))
 
 
-def variants(samplers: Sequence[str], depths: Sequence[int], own: int, *, volumetric: bool = False) -> list[Variant]:
-    """Return what is compared: samplers, some with the denoiser, path depths beside the run's own, and an integrator.
+def variants(
+    samplers: Sequence[str], depths: Sequence[int], own: int, *, volumetric: bool = False, predicted: Sequence[str] = ()
+) -> list[Variant]:
+    """Return what is compared: samplers, some with the denoiser, path depths beside the run's own, an integrator, and
+    what predicts pictures.
 
     Args:
         samplers: Mitsuba's names.
         depths: longest light paths; the deepest of them and `own` is the truth for all of these.
         own: the run's own depth.
         volumetric: whether there is a medium, which leaves no choice of integrator.
+        predicted: what predicts pictures; see `ways_to_predict`.
     """
     theories = {"independent": INDEPENDENT}
     found = [Variant(one, "raw", one, "none", own, theory=theories.get(one, STRATIFIED)) for one in samplers]
     if not volumetric and "independent" in samplers:
         found.append(Variant(PATH, "raw", "independent", "none", own, "path", INDEPENDENT))
     found += [Variant(one + OIDN, "oidn", one, "oidn", own) for one in DENOISED if one in samplers]
+    found += [Variant(one, PREDICTED, REFERENCE_SAMPLER, "oidn", own) for one in predicted]
     compared = sorted({*depths, own}) if depths else []
     return found + [Variant(f"depth {one}", "depth", "independent", "none", one) for one in compared]
 
@@ -96,6 +107,7 @@ class PictureBench:
         margin: the model's.
         chosen: the variants.
         elsewhere: from a family and samples to what carries out parts of its reference, if not this process.
+        there: (d,) where predictions are made, from which they predict the configuration; None for itself.
     """
 
     def __init__(
@@ -105,8 +117,10 @@ class PictureBench:
         margin: Margin,
         chosen: Sequence[Variant],
         elsewhere: Callable[[str, int], Parts | None] = lambda family, spp: None,
+        there: Tensor | None = None,
     ) -> None:
         self._u, self._margin, self.elsewhere = u, margin, elsewhere
+        self._there = u if there is None else there
         self.variants = {one.series: one for one in chosen}
         self._renderer = renderer
         self._scenes: dict[tuple[str, int, str], Any] = {}
@@ -133,26 +147,35 @@ class PictureBench:
             self._refer(family, share, seed, on_done)
 
     def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
-        """Render one setting and return its errors, and the seconds that rendering and denoising took."""
-        variant = self.variants[setting.series]
+        """Make one picture and return its errors, and the seconds that rendering and denoising took; of a predicted one
+        those of the matrix or the light too, and beside that what another picture takes."""
+        variant, later = self.variants[setting.series], dict[str, float]()
         begun = time.perf_counter()
-        radiance = self._radiance(self.renderers[setting.series], seed, setting.spp)
-        seconds = time.perf_counter() - begun
+        if variant.family == PREDICTED:
+            made = predicting(variant.series, self.renderers[setting.series], self._there, seed, setting.spp)
+            radiance = self._radiance(made, seed, setting.spp)
+            seconds, again = time.perf_counter() - begun, time.perf_counter()
+            radiance = self._radiance(made, seed, setting.spp)
+            later = {"later_seconds": time.perf_counter() - again}
+        else:
+            radiance = self._radiance(self.renderers[setting.series], seed, setting.spp)
+            seconds = time.perf_counter() - begun
         picture = self._picture(radiance)
-        truth = self.pictures["depth" if variant.family == "depth" else "raw"]
-        numbers = {"error": truth.relative_error(_flat(picture))}
-        seen = _one(self._margin(picture))
-        numbers["margin_error"] = self.margins[variant.family].relative_error(seen)
-        return numbers, seconds
+        error = self._reference(variant.family, "error").relative_error(_flat(picture))
+        margin = self._reference(variant.family, "margin_error").relative_error(_one(self._margin(picture)))
+        return {"error": error, "margin_error": margin, **later}, seconds
 
     def floor(self, setting: MeasuredSetting, measure: str) -> float:
         """The reference's own relative error for a setting."""
-        family = self.variants[setting.series].family
-        if measure == "margin_error":
-            return self.margins[family].error
-        return self.pictures["depth" if family == "depth" else "raw"].error
+        return self._reference(self.variants[setting.series].family, measure).error
 
     # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _reference(self, family: str, measure: str) -> ReferenceValue:
+        """What a family is compared with: its margins with its own, but pictures with and without denoiser alike."""
+        if measure == "margin_error":
+            return self.margins["raw" if family == PREDICTED else family]
+        return self.pictures["depth" if family == "depth" else "raw"]
 
     def _truth(self, family: str) -> Renderer:
         """The renderer of a family's reference."""

@@ -27,14 +27,15 @@ from advsearch.questions.precision.fits import (
     recommend,
     warning_of,
 )
-from advsearch.questions.precision.image import OIDN
+from advsearch.questions.precision.gradient import COUNTS_OF, SURFACE_LIGHT
+from advsearch.questions.precision.image import OIDN, PREDICTED
 from advsearch.questions.precision.objective import PolicyCurve, missing, sooner
 from advsearch.questions.precision.points import MeasuredSetting, Point, ReferenceValue
 from advsearch.scene.formation import next_count
 
 TableLine = tuple[str, str, str]
 AGAINST: tuple[Against, ...] = ("samples", "seconds")
-FAMILIES = {"raw": "without denoiser", "oidn": "with denoiser", "depth": "by path depth"}
+FAMILIES = {"raw": "without denoiser", "oidn": "with denoiser", "depth": "by path depth", PREDICTED: "predicted"}
 
 
 @dataclass
@@ -240,10 +241,15 @@ def _recommended(section: Section, goal: float) -> list[Recommended]:
 
 
 def rounding(section: Section, quantity: str) -> RoundUp:
-    """A line of the picture is named after its sampler; one of a gradient has that of the run."""
-    return lambda series, samples: next_count(
-        section.sampler if quantity == "gradient" else series.removesuffix(OIDN), samples
-    )
+    """A line of the picture is named after its sampler; one of a gradient has that of the run. Light on surfaces has
+    one count."""
+
+    def up(series: str, samples: float) -> int:
+        if series == SURFACE_LIGHT:
+            return COUNTS_OF[SURFACE_LIGHT][0]
+        return next_count(section.sampler if quantity == "gradient" else series.removesuffix(OIDN), samples)
+
+    return up
 
 
 def _policy(section: Section, goal: float) -> list[Recommended]:

@@ -19,7 +19,7 @@ READING = (
     "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that "
     "error, and the seconds that one picture or gradient takes. A margin is how far the wrong answer leads the "
     "right one, in logits; a cosine of 1 means that a gradient points the right way. With a matrix of light "
-    "transport, `again` is what another gradient takes once the first one is there."
+    "transport or light on surfaces, `again` is what another one takes once the first one is there."
 )
 """What the tables show, and how to read them."""
 

@@ -40,7 +40,8 @@ def _radiance(value: float, texel: float | None = None) -> Floats:
     return radiance
 
 
-def _map(value: float, texel: float | None = None) -> EnvironmentAsset:
+def grey_map(value: float, texel: float | None = None) -> EnvironmentAsset:
+    """Return a grey map (16, 32, 3), one texel of it different."""
     return EnvironmentAsset("made", _radiance(value, texel))
 
 
@@ -53,7 +54,7 @@ def _map(value: float, texel: float | None = None) -> EnvironmentAsset:
 )
 def bright_texel() -> Outcome:
     """A sky of 0.3 with one texel of 100,000, raw and denoised."""
-    flash = _map(0.3, BRIGHT)
+    flash = grey_map(0.3, BRIGHT)
     seen = examine_gradient(
         small("mug", {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}, environment=flash)
     )
@@ -71,7 +72,9 @@ def bright_texel() -> Outcome:
 def black_environment() -> Outcome:
     """Nothing shines: the picture is black, no texel matters, and the search has to say that it is stuck."""
     seen = examine_gradient(
-        small("mug", {"texture": {"resolution": 8}}, environment=_map(0.0)), compare=False, evaluations=PLATEAU_STEPS
+        small("mug", {"texture": {"resolution": 8}}, environment=grey_map(0.0)),
+        compare=False,
+        evaluations=PLATEAU_STEPS,
     )
     return seen.findings(
         Check("mean of the picture", seen.mean, 0.0, 0.0),
@@ -89,7 +92,7 @@ def black_environment() -> Outcome:
 def lamp_in_the_dark() -> Outcome:
     """A black environment and a lamp: the lamp has to be able to light the scene."""
     controls = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z": 2.0}}
-    seen = examine_gradient(small("mug", controls, environment=_map(0.0)), torch.tensor([0.5]))
+    seen = examine_gradient(small("mug", controls, environment=grey_map(0.0)), torch.tensor([0.5]))
     return seen.findings(Check("mean of the picture", seen.mean, least=0.01))
 
 

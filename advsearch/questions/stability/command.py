@@ -37,13 +37,16 @@ class _Stability(QuestionCommand):
         """Run the cases, or list them."""
         if not args.list:
             return super().run(args)
+        # these take longer to import than `--help` takes
         from advsearch.cli.flags import config_from
         from advsearch.cli.output import at_work
         from advsearch.questions.stability.settings import StabilityConfig
 
         config = config_from(args, StabilityConfig)
         with at_work(as_json=args.json, quiet=args.quiet):
-            from advsearch.questions.stability.suite import chosen
+            from advsearch.questions.stability.carry_out import (
+                chosen,
+            )  # torch and the renderer, which `--help` leaves out
 
             cases = chosen(config.cases, config.groups)
         return _print_cases(cases, as_json=args.json)

@@ -32,6 +32,9 @@ HOT = 8.0
 """Multiples of the mean luminance above which light of the environment is found by rays of its own."""
 HOT_RAYS = 48
 """Rays from each texel towards such light."""
+SPREAD = (7, 11)
+"""Steps, down and across, of a lattice of so many points: 11 / 7 is 29 of 48, the golden ratio's neighbour, and both
+coordinates are even."""
 LITTLE = 0.02
 """Share of the light up to which it is left to the cells."""
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
@@ -74,18 +77,30 @@ def sky_of(padded: Tensor) -> SkyLight:
 
 
 def _hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
-    """Directions spread over what is hot by its power, and what comes from each."""
+    """Directions spread over what is hot by its power, and what comes from each.
+
+    A map is looked up between its texels, so that each shines over a tent that reaches its neighbours. Directions are
+    spread over that by `SPREAD`: a sun of one texel has a soft shadow.
+    """
     rows, columns = power.shape
     total = power.sum()
     order = torch.cumsum(power.double().reshape(-1), 0)
     steps = (torch.arange(HOT_RAYS, dtype=torch.float64) + 0.5) / HOT_RAYS * order[-1]
     index = torch.searchsorted(order, steps).clamp_max(power.numel() - 1)
     row, column = index // columns, index % columns
-    polar, across = row * (math.pi / (rows - 1)), (column + 0.5) * (2.0 * math.pi / columns)
+    number = torch.arange(HOT_RAYS, dtype=torch.float64)
+    down, beside = (_tent((number * step % HOT_RAYS + 0.5) / HOT_RAYS) for step in SPREAD)
+    polar = ((row + down) * (math.pi / (rows - 1))).clamp(0.0, math.pi)
+    across = (column + 0.5 + beside) * (2.0 * math.pi / columns)
     ways = torch.stack([polar.sin() * across.sin(), polar.cos(), -polar.sin() * across.cos()], dim=1).float()
     angle = math.pi / (rows - 1) * 2.0 * math.pi / columns
     colour = radiance[row, column] / (radiance[row, column] @ LUMINANCE)[:, None].clamp_min(1e-12)
     return ways, colour * (float(total) * angle / HOT_RAYS)
+
+
+def _tent(even: Tensor) -> Tensor:
+    """Numbers in [-1, 1] with a tent's density, from even ones in [0, 1]."""
+    return torch.where(even < 0.5, (2.0 * even).sqrt() - 1.0, 1.0 - (2.0 - 2.0 * even).sqrt())
 
 
 def _pooled(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:

@@ -15,6 +15,7 @@ from advsearch.scene.library import load_object
 from advsearch.scene.mitsuba_backend.lobes import measured
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import arrangement, renderer, texels
+from advsearch.scene.surface.light import sky_of
 from advsearch.scene.surface.plan import why_not
 from advsearch.scene.surface.renderer import SurfaceRenderer
 
@@ -280,3 +281,17 @@ def test_light_passes_cut_outs(opacity: float, whole: SurfaceRenderer) -> None:
             u = drawn(of, number)
             truth = of(u, seed=1, spp=256)
             assert levels(made(u), truth) < min(5.0, 0.5 * levels(whole(u), truth))
+
+
+def test_a_sun_of_one_texel_is_as_wide_as_the_map_shows_it() -> None:
+    """Looked up between texels it is a tent, a texel to each side, whose variance is a sixth of a texel squared."""
+    padded = torch.full((16, 34, 3), 0.3)
+    padded[7, 12] = 1e5
+    ways, light = sky_of(padded).hot
+    row, column = ways[:, 1].acos() * (15.0 / torch.pi), torch.atan2(ways[:, 0], -ways[:, 2]) * (16.0 / torch.pi)
+    for found, middle in ((row, 7.0), (column, 11.5)):
+        assert float(found.mean()) == pytest.approx(middle, abs=0.01)
+        assert float(found.var()) == pytest.approx(1.0 / 6.0, rel=0.1)
+        assert float((found - middle).abs().max()) < 1.0
+    solid = (torch.pi / 15.0) * (torch.pi / 16.0) * torch.sin(torch.tensor(7.0 * torch.pi / 15.0))
+    assert float(light.sum(dim=0)[0]) == pytest.approx(1e5 * float(solid), rel=0.03)  # the rest is left to the cells
