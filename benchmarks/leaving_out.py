@@ -138,8 +138,8 @@ def predicted(size: int, spp: int, repeats: int) -> str:
                 begun = time.process_time()
                 pictures.append(way(u, number, spp))
                 kept.append(time.process_time() - begun)
-            for kept, off in zip(squares, levels_off(renderer, pictures, u, number, 4 * CHECK_SPP), strict=True):
-                kept.append(off**2)
+            for kept, levels in zip(squares, levels_off(renderer, pictures, u, number, 4 * CHECK_SPP), strict=True):
+                kept.append(levels**2)
     times = [statistics.median(one[1:]) for one in seconds]
     errors = [statistics.fmean(one) for one in squares]
     gain = times[1] * errors[1] / (times[0] * errors[0])

@@ -30,7 +30,7 @@ from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import plan
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
-from advsearch.scene.surface.renderer import Look, SurfaceRenderer
+from advsearch.scene.surface.renderer import Look, Sketch, SurfaceRenderer
 
 WORTH = 32
 """Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones."""
@@ -93,6 +93,7 @@ class SurfaceLight(Predictor):
     seconds: float = 0.0
     _renderer: SurfaceRenderer | None = None
     _lights: list[Tensor] = field(default_factory=list)
+    _made: int = 0
     _next: int = 0
     _looks: dict[tuple[int, int], list[Look]] = field(default_factory=dict)
 
@@ -106,7 +107,7 @@ class SurfaceLight(Predictor):
     def conditions(self) -> Conditions | None:
         if self.problem.conditions is None:
             return None
-        return Conditions(len(self._lights), self._renderer.dropped if self._renderer else 0, 0, None)
+        return Conditions(self._made, self._renderer.dropped if self._renderer else 0, 0, None)
 
     @property
     def drawn(self) -> bool:
@@ -148,8 +149,9 @@ class SurfaceLight(Predictor):
             self._lights = [stratified(problem.conditions, number, seed) for number in range(count)]
         with torch.no_grad():
             for numbers in self._lights:
-                self.renderer.light(self._inputs(torch.cat([at, numbers])))
+                self.renderer.kept_light(self._inputs(torch.cat([at, numbers])))
                 tick(LIGHTS // len(self._lights))
+        self._made = len(self._renderer.lights) + self._renderer.dropped
         self.seconds += time.perf_counter() - begun
         self._compare(at, 0)
 
@@ -167,8 +169,16 @@ class SurfaceLight(Predictor):
 
     @cached_property
     def _of_light(self) -> Tensor:
-        """(k,) which numbers of the conditions are those of environments."""
-        return self._changing(frozenset({MAP}))[self.problem.domain.dim :]
+        """(k,) which numbers of the conditions take another light, and not only a brighter one."""
+        problem = self.problem
+        found, start = self._changing(frozenset({MAP})), problem.whole(problem.domain.start)
+        for group in problem.space.groups:
+            if bool(found[group.coordinates].all()):
+                one, other = start.clone(), start.clone()
+                one[group.coordinates], other[group.coordinates] = 0.3, 0.8
+                sketches = [Sketch.of(self._inputs(at)[MAP]) for at in (one, other)]
+                found[group.coordinates] = sketches[0].times(sketches[1]) is None
+        return found[problem.domain.dim :]
 
     def _changing(self, inputs: frozenset[str]) -> Tensor:
         """Which numbers of the whole space belong to controls that change some inputs of the scene."""

@@ -119,9 +119,7 @@ class SweptSurfaceLight(SweptPredictor):
                 # the same rays wherever things stand, so that it does not matter which group of an arrangement is first
                 arranged = SurfaceRenderer(self.renderer, u, seeds.stream(self.seed, "surface light"))
                 self._arranged.append(arranged)
-            light = arranged.light(inputs)
-            arranged.forget()
-            return LitGroup(arranged, light)
+            return LitGroup(arranged, arranged.light(inputs))
 
     def _predicted(self, made: LitGroup, us: Sequence[Tensor]) -> list[Tensor]:
         of, found = made.renderer, list[Tensor]()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -16,13 +16,38 @@ from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arran
 from advsearch.scene.surface.view import SurfaceView
 from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
 
+TEXELS = 333
+"""Of an environment's map, by which it is known again."""
+
 
 class Look(NamedTuple):
-    """What one of several cameras sees, by its number, and under which light."""
+    """What one of several cameras sees, by its number; under which light, and how many times as bright (3,) that is."""
 
     number: int
     view: SurfaceView
     light: Light
+    factor: Tensor | float
+
+
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """What tells an environment's map from others: its means (3,), and some of its texels (n, 3) over these."""
+
+    mean: Tensor
+    texels: Tensor
+
+    @classmethod
+    def of(cls, padded: Tensor) -> Sketch:
+        """Sketch a map (H, W + 2, 3)."""
+        flat = padded.reshape(-1, 3)
+        mean = flat.mean(dim=0)
+        return cls(mean, flat[:: max(1, len(flat) // TEXELS)] / mean.clamp_min(1e-12))
+
+    def times(self, other: Sketch) -> Tensor | None:
+        """Return how many times as bright (3,) another map is; None where it differs in more."""
+        if self.texels.shape != other.texels.shape or not torch.allclose(self.texels, other.texels, 1e-5, 1e-6):
+            return None
+        return torch.where(self.mean > 0.0, other.mean / self.mean, 1.0)
 
 
 class SurfaceRenderer(PredictingRenderer):
@@ -39,13 +64,14 @@ class SurfaceRenderer(PredictingRenderer):
     Attributes:
         arrangement: object and surroundings.
         there: (h, w, 3) the base colour whose light between surfaces is kept; see `renew`.
+        lights: those that are kept, the oldest first.
         dropped: lights that made room for others.
     """
 
     def __init__(self, renderer: Renderer, u: Tensor, seed: int) -> None:
         vars(self).update(vars(copy.copy(renderer)))
         self.products = self.dropped = 0
-        self._lights: OrderedDict[bytes, Light] = OrderedDict()
+        self.lights: dict[Sketch, Light] = {}
         self._base = {name: self.scene.base(name) for name in (*CAMERAS, MAP, COLOR) if name in self.scene.names}
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
@@ -61,15 +87,11 @@ class SurfaceRenderer(PredictingRenderer):
             return False
         return all(_same(own[name], others[name]) for name in own)
 
-    def forget(self) -> None:
-        """Let go of all light."""
-        self._lights.clear()
-
     def renew(self, u: Tensor) -> None:
         """Take the light between surfaces from the base colour at u from now on."""
         with torch.no_grad():
             self.there = self.color(self.scene.assembly(self.space.inputs(u)))
-        self._lights.clear()
+        self.lights.clear()
 
     @property
     def entries(self) -> int:
@@ -77,19 +99,25 @@ class SurfaceRenderer(PredictingRenderer):
 
     @property
     def bytes(self) -> int:
-        return self.arrangement.bytes + sum(one.bytes for one in self._lights.values())
+        return self.arrangement.bytes + sum(one.bytes for one in self.lights.values())
 
     def light(self, inputs: Mapping[str, Tensor]) -> Light:
-        """Return the light under the environment of scene inputs, made on first use; `MOST_BYTES` of them are kept."""
-        padded = inputs.get(MAP, self._base[MAP]).detach()
-        flat = padded.reshape(-1)
-        key = torch.cat([flat[:: max(1, flat.numel() // 997)], flat.sum()[None]]).numpy().tobytes()
-        if key not in self._lights:
-            self._lights[key] = self.arrangement.light(padded, self.there)
-            while len(self._lights) > 1 and self.bytes > scaled(MOST_BYTES):
-                self._lights.popitem(last=False)
-                self.dropped += 1
-        return self._lights[key]
+        """Make the light under the environment of scene inputs."""
+        return self.arrangement.light(inputs.get(MAP, self._base[MAP]).detach(), self.there)
+
+    def kept_light(self, inputs: Mapping[str, Tensor]) -> tuple[Light, Tensor]:
+        """Return the light under the environment of scene inputs, and a factor (3,) on it: exposures and tints of one
+        map have one light. It is made on first use, and `MOST_BYTES` of them are kept."""
+        sketch = Sketch.of(inputs.get(MAP, self._base[MAP]).detach())
+        for one, light in self.lights.items():
+            factor = one.times(sketch)
+            if factor is not None:
+                return light, factor
+        self.lights[sketch] = light = self.light(inputs)
+        while len(self.lights) > 1 and self.bytes > scaled(MOST_BYTES):
+            self.lights.pop(next(iter(self.lights)))
+            self.dropped += 1
+        return light, torch.ones(3)
 
     def pictures(self, inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]) -> Tensor:
         """Return the pictures (n, H, W, 3) sRGB of a base colour for several cameras and environments; those under one
@@ -109,16 +137,17 @@ class SurfaceRenderer(PredictingRenderer):
             inputs: of the scene, for each.
             light: in place of theirs.
         """
+        lights = [self.kept_light(one) if light is None else (light, 1.0) for one in inputs]
         groups: dict[Light, list[int]] = {}
-        for number, one in enumerate(inputs):
-            groups.setdefault(self.light(one) if light is None else light, []).append(number)
+        for number, (one, _) in enumerate(lights):
+            groups.setdefault(one, []).append(number)
         looks = (self.arrangement.look([self._camera(inputs[n]) for n in some], lit) for lit, some in groups.items())
         begun = next(looks)
         for lit, numbers in groups.items():
             seen = begun()
             begun = next(looks, begun)
             for place, number in enumerate(numbers):
-                yield Look(number, self.arrangement.view(seen, place), lit)
+                yield Look(number, self.arrangement.view(seen, place), lit, lights[number][1])
 
     def shown(
         self,
@@ -132,7 +161,7 @@ class SurfaceRenderer(PredictingRenderer):
         for look in looks:
             if look.light not in reflected:
                 reflected[look.light] = look.light.reflected(fine)
-            radiance = look.view.radiance(reflected[look.light])
+            radiance = look.view.radiance(reflected[look.light]) * look.factor
             found[look.number] = self._shown(radiance, inputs[look.number], wholes[look.number])
         self.products += len(found)
         return torch.stack([found[number] for number in range(len(inputs))])
@@ -140,7 +169,7 @@ class SurfaceRenderer(PredictingRenderer):
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
         (look,) = self.looks([inputs])
         self.products += 1
-        return look.view.radiance(look.light.reflected(self.arrangement.finer(self.color(inputs))))
+        return look.view.radiance(look.light.reflected(self.arrangement.finer(self.color(inputs)))) * look.factor
 
     def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {name: inputs.get(name, self._base[name]) for name in CAMERAS if name in self._base}
