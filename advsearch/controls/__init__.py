@@ -25,7 +25,10 @@ ORDER = (
     *("contents", "background", "haze", "lens", "sensor", "corruption", "mitsuba"),
 )
 """In which lists have controls; one that is not named comes last."""
-SHARED = ("base", "clean", "numbers", "space", "values")
+SHARED = (
+    *("base", "clean", "numbers", "space", "values"),
+    *("corruption_filters", "corruption_weather", "geometry_modes", "material_patterns", "patch_sticker"),
+)
 """Modules of this folder that are no control."""
 
 
