@@ -304,12 +304,12 @@ def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
     ("asked", "steps", "draws"),
     [
         ({"controls": "texture"}, 40, 1),
-        ({"controls": "texture", "over": "camera"}, 400, 8),
+        ({"controls": "texture", "over": "camera"}, 300, 8),
         ({"controls": "texture", "over": "camera", "specialise": False}, 150, 4),
         ({"controls": "texture", "over": "haze"}, 150, 4),
         ({"controls": "pose", "over": "camera"}, 40, 4),
         ({"controls": "pose", "over": "camera", "steps": 7}, 7, 4),
-        ({"controls": "texture", "over": "camera", "draws": 3}, 400, 3),
+        ({"controls": "texture", "over": "camera", "draws": 3}, 300, 3),
     ],
 )
 def test_a_search_is_as_long_as_what_is_asked_needs(asked: dict[str, Any], steps: int, draws: int) -> None:
