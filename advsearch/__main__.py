@@ -11,6 +11,7 @@ def start() -> int:
     """Run the command line and return its exit status."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the process, without a traceback, until `main` begins
 
+    # first the handling of signals above
     from advsearch.cli.main import INTERRUPTED, main
 
     status = main()

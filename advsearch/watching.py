@@ -256,6 +256,7 @@ def times_text(elapsed: float, done: float, total: float | None, at_most: bool) 
 
 
 def _seconds(seconds: float) -> str:
+    # late, so that --help answers at once
     from advsearch.report.wording import seconds_text
 
     return f"{seconds:.0f} s" if seconds < 99.5 else seconds_text(seconds)
@@ -282,6 +283,7 @@ def lines(stream: IO[str], written: Callable[[str], str] = str) -> Iterator[Line
 @contextmanager
 def bars(terminal: IO[str], written: Callable[[str], str] = str) -> Iterator[BarProgress]:
     """Draw bars on a terminal, which are gone behind the block; see `BarProgress`."""
+    # late, so that --help answers at once
     from rich.console import Console
     from rich.progress import BarColumn, ProgressColumn, Task, TextColumn
     from rich.progress import Progress as Bars

@@ -6,6 +6,7 @@ import ast
 import configparser
 import fnmatch
 import re
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -482,3 +483,13 @@ def test_no_file_names_a_path_of_the_machine_it_was_written_on() -> None:
 
 def test_the_repository_stays_small() -> None:
     assert sum(path.stat().st_size for path in repository_files()) < 27e6
+
+
+def test_imports_inside_functions_are_few_and_say_why() -> None:
+    inner = runpy.run_path(str(ROOT / "tools" / "concepts.py"))["inner_imports"]
+    found = {
+        f"{module}:{line}": why for module, path in python_files() for line, why in inner(path.read_text()).items()
+    }
+    bare = sorted(place for place, why in found.items() if not why)
+    assert not bare, "each takes a comment, beside it or above it, with the reason why it stands inside"
+    assert len(found) <= 195, "see whether this one can stand at the top: `advsearch --help` has to answer at once"

@@ -64,16 +64,18 @@ def at_import(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def inner_imports(text: str) -> dict[int, str]:
-    """Return the imports inside the functions of a module, by line: each with its reason, or an empty text."""
-    lines = text.splitlines()
-    found = {}
-    for function in ast.walk(ast.parse(text)):
-        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            for node in ast.walk(function):
-                if isinstance(node, (ast.Import, ast.ImportFrom)):
-                    beside = lines[node.lineno - 1].partition("#")[2]
-                    above = lines[node.lineno - 2].strip()
-                    found[node.lineno] = beside or (above if above.startswith("#") else "")
+    """Return the imports inside the functions of a module, by line: each with its reason, or an empty text.
+
+    A reason is a comment beside an import, or above it, or that of the import before it."""
+    lines, functions = text.splitlines(), (ast.FunctionDef, ast.AsyncFunctionDef)
+    inside = [node for one in ast.walk(ast.parse(text)) if isinstance(one, functions) for node in ast.walk(one)]
+    imports = {node.lineno: node for node in inside if isinstance(node, (ast.Import, ast.ImportFrom))}
+    found, ended, reason = dict[int, str](), 0, ""
+    for line, node in sorted(imports.items()):
+        above = lines[line - 2].strip()
+        before = reason if ended == line - 1 else above if above.startswith("#") else ""
+        found[line] = reason = lines[line - 1].partition("#")[2] or before
+        ended = node.end_lineno or line
     return found
 
 

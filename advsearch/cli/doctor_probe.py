@@ -20,6 +20,7 @@ NOISE = 0.08
 
 def numpy() -> str:
     """Solve a small system."""
+    # what is probed
     import numpy as np
 
     if not np.allclose(np.linalg.solve(np.diag([2.0, 4.0]), [2.0, 4.0]), 1.0):
@@ -29,9 +30,11 @@ def numpy() -> str:
 
 def torch() -> str:
     """A convolution and its gradient; say which build it is and how many threads it uses."""
+    # what is probed
     from advsearch import threads
 
     threads.configure()
+    # what is probed
     import torch
 
     image = torch.ones(1, 3, PIXELS, PIXELS, requires_grad=True)
@@ -45,9 +48,11 @@ def torch() -> str:
 
 def probe_renderer() -> str:
     """Render a few pixels of a lit wall and differentiate them with respect to its colour, which is linear."""
+    # what is probed
     from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
 
     mi = mitsuba()
+    # what is probed
     import drjit as dr
 
     wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
@@ -72,6 +77,7 @@ def probe_renderer() -> str:
 
 def probe_denoiser() -> str:
     """Denoise a constant picture, which must stay what it is."""
+    # what is probed
     import mitsuba_oidn
     import numpy as np
 
@@ -83,8 +89,10 @@ def probe_denoiser() -> str:
 
 def openexr() -> str:
     """Write a linear picture to a file and read it back."""
+    # what is probed
     import tempfile
 
+    # what is probed
     import numpy as np
     import OpenEXR
 
@@ -100,6 +108,7 @@ def openexr() -> str:
 
 def imageio() -> str:
     """Encode a picture as PNG and decode it."""
+    # what is probed
     import imageio.v3 as iio
     import numpy as np
 
@@ -111,8 +120,10 @@ def imageio() -> str:
 
 def pyarrow() -> str:
     """Write a Parquet table and read it back."""
+    # what is probed
     import io
 
+    # what is probed
     import pyarrow
     import pyarrow.parquet
 
@@ -126,8 +137,10 @@ def pyarrow() -> str:
 
 def matplotlib() -> str:
     """Draw an empty figure."""
+    # what is probed
     import io
 
+    # what is probed
     from matplotlib.figure import Figure
 
     stream = io.BytesIO()
@@ -137,6 +150,7 @@ def matplotlib() -> str:
 
 def cma() -> str:
     """Import the library of evolution strategies."""
+    # what is probed
     import cma as library
 
     return f"pycma {library.__version__.split()[0]}"
@@ -144,6 +158,7 @@ def cma() -> str:
 
 def xatlas() -> str:
     """Unwrap a triangle."""
+    # what is probed
     import numpy as np
     import xatlas
 

@@ -144,6 +144,7 @@ class SceneDescription:
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
         """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
+        # a circle: it takes descriptions
         from advsearch.scene.geometry import moved_part, object_to_world
 
         under_test = mesh_part(OBJECT, self.object, object_to_world(self), self.material)
@@ -229,6 +230,7 @@ class SceneDescription:
     @property
     def base_vertices(self) -> Doubles:
         """(V, 3) the object's vertices in world space, in its base pose."""
+        # a circle: it takes descriptions
         from advsearch.scene.geometry import object_to_world
 
         matrix = object_to_world(self)
@@ -284,6 +286,7 @@ class SceneDescription:
     @property
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
+        # a circle: it takes descriptions
         from advsearch.scene.exposure import metered_gain
 
         return (metered_gain(self) if self.metered else 1.0) * math.pow(2.0, self.number("camera.exposure"))
@@ -402,6 +405,7 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
 
 
 def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None) -> ImportedScene:
+    # a circle: it takes descriptions
     from advsearch.scene.mitsuba_backend.files.scene import import_plugins
 
     if up is not None:

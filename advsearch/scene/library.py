@@ -140,6 +140,7 @@ def _materials(runs: Iterable[tuple[str, int]]) -> dict[str, npt.NDArray[np.int6
 
 def _image(content: bytes) -> Floats:
     """Decode a PNG to (H, W, 3) display-referred sRGB in [0, 1]."""
+    # most scenes need no such file
     import imageio.v3 as iio
 
     levels = np.asarray(iio.imread(content, extension=".png"))[..., :3]
@@ -149,6 +150,7 @@ def _image(content: bytes) -> Floats:
 
 def _exr(content: bytes) -> Floats:
     """Decode an RGB EXR to (H, W, 3) float32."""
+    # most scenes need no such file
     import OpenEXR
 
     with OpenEXR.File(io.BytesIO(content)) as file:

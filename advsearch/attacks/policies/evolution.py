@@ -287,10 +287,9 @@ def _strategy(d: int, sigma: float, population: int, seed: int) -> Any:
         "verb_log": 0,
     }
     with _own_random(seed, 0):
-        # import pycma, which takes most of a second and complains that there is no matplotlib
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            import cma
+            import cma  # takes most of a second, and complains where there is no matplotlib
         return cma.CMAEvolutionStrategy(np.zeros(d), sigma, options)
 
 

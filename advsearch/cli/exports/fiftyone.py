@@ -14,6 +14,7 @@ EXAMPLE = "export mug-sweep-001 --format fiftyone --out folder"
 
 def write(args: argparse.Namespace, out: Path) -> Written:
     """Write a dataset of the pictures that were kept."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import find_run
     from advsearch.runs.fiftyone import write_fiftyone
     from advsearch.viewer.thumbnails import name_of_object, pictured

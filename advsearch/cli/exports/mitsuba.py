@@ -15,9 +15,11 @@ EXAMPLE = "export mug-texture-001 --format mitsuba --out folder"
 
 def write(args: argparse.Namespace, out: Path) -> Written:
     """Write the adversarial scene."""
+    # late, so that --help answers at once
     from advsearch.cli.output import at_work
 
     with at_work(as_json=True, quiet=False):
+        # late, so that --help answers at once
         from advsearch.api.export import write_mitsuba
 
         notes = write_mitsuba(args.run, out)

@@ -18,10 +18,12 @@ USUAL_SIZE = 100.0
 
 def write(args: argparse.Namespace, out: Path) -> Written:
     """Write the sheets."""
+    # late, so that --help answers at once
     from advsearch.cli.output import at_work
 
     longest = USUAL_SIZE if args.size is None else args.size
     with at_work(as_json=True, quiet=False):
+        # late, so that --help answers at once
         from advsearch.api.export import printable
         from advsearch.report.sheets import MOST_SHEETS, write_sheets
         from advsearch.runs.files import placed_by, replacing

@@ -14,6 +14,7 @@ EXAMPLE = "export mug-sweep-001 --format 3db --out folder"
 
 def write(args: argparse.Namespace, out: Path) -> Written:
     """Write a folder as 3DB does."""
+    # late, so that --help answers at once
     from advsearch.runs.directory import find_run
     from advsearch.runs.store import NAME, Store
     from advsearch.runs.threedb import write_threedb

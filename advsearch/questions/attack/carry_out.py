@@ -197,6 +197,7 @@ def attack_from_config(
     if config.is_matrix:
         return matrix_from_config(config, progress=progress, resumed=resumed)
     if config.is_curve:
+        # a circle: several attacks are attacks
         from advsearch.questions.attack.several import curve_from_config
 
         return curve_from_config(config, progress=progress, resumed=resumed)

@@ -36,6 +36,7 @@ class _Recipe(QuestionCommand):
 
 
 def _listed(as_json: bool) -> int:
+    # late, so that --help answers at once
     from advsearch.questions.recipe.description import titles
 
     found = titles()

@@ -44,6 +44,7 @@ class _Stability(QuestionCommand):
 
         config = config_from(args, StabilityConfig)
         with at_work(as_json=args.json, quiet=args.quiet):
+            # late, so that --help answers at once
             from advsearch.questions.stability.carry_out import (
                 chosen,
             )  # torch and the renderer, which `--help` leaves out

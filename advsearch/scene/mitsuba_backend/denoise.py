@@ -41,6 +41,7 @@ def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = F
     """
     with one_at_a_time:
         try:
+            # not before `mitsuba()`, which sees to libLLVM
             import mitsuba_oidn
         except ImportError as error:
             raise EnvironmentSetupError(

@@ -112,6 +112,7 @@ def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
     height, width = resolution
 
     def along_width(value: Any) -> Any:
+        # not before `mitsuba()`, which sees to libLLVM
         import drjit as dr
 
         half = dr.deg2rad(value.array) / 2.0

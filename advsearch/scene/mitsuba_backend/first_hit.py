@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import mitsuba_and_drjit
 from advsearch.scene.surfaces import Surfaces
 
 
@@ -21,8 +21,7 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
         sensor: Mitsuba's camera.
         resolution: (height, width) in pixels, which need not be the camera's own.
     """
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     height, width = resolution
     count = height * width

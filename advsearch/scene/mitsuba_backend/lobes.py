@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.texel_rays import Floats, TexelGrid, passed
-from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time
+from advsearch.scene.mitsuba_backend.variant import mitsuba_and_drjit, one_at_a_time
 
 Doubles = npt.NDArray[np.float64]
 
@@ -61,8 +61,7 @@ def measured(
     scene: MitsubaScene, inputs: Mapping[str, Tensor], grid: TexelGrid, place: Floats, normal: Floats
 ) -> Lobes:
     """Measure the BSDF of a shape, by sampling it, at one of its texels: a (3,) place and the unit normal there."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     key = f"{grid.name}.base_color"
     with one_at_a_time:

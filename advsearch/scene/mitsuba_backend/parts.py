@@ -53,6 +53,7 @@ def plain_number(value: Any) -> float:
 
 def color(value: Any) -> Any:
     """Three numbers: an RGB colour."""
+    # not before `mitsuba()`, which sees to libLLVM
     import mitsuba as mi
 
     return mi.Color3f(*_entries(value, 3))
@@ -60,6 +61,7 @@ def color(value: Any) -> Any:
 
 def point(value: Any) -> Any:
     """Three numbers: a place."""
+    # not before `mitsuba()`, which sees to libLLVM
     import mitsuba as mi
 
     return mi.Point3f(*_entries(value, 3))
@@ -67,6 +69,7 @@ def point(value: Any) -> Any:
 
 def transform(value: Any) -> Any:
     """A 4 x 4 matrix, row by row."""
+    # not before `mitsuba()`, which sees to libLLVM
     import mitsuba as mi
 
     found = _entries(value, 16)
@@ -75,6 +78,7 @@ def transform(value: Any) -> Any:
 
 def as_torch(value: Any) -> Tensor:
     """Return a Dr.Jit value as a torch tensor with memory of its own."""
+    # not before `mitsuba()`, which sees to libLLVM
     import mitsuba as mi
 
     if isinstance(value, (mi.Color3f, mi.Point3f)):  # Dr.Jit's own conversion gives a colour six entries
@@ -87,6 +91,7 @@ def as_torch(value: Any) -> Tensor:
 
 
 def _entries(value: Any, count: int) -> list[Any]:
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit as dr
     import mitsuba as mi
 

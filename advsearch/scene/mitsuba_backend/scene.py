@@ -34,7 +34,15 @@ from advsearch.scene.mitsuba_backend.parts import (
     translation,
 )
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import Plugin, media_in, mitsuba, one_at_a_time, population, recorded
+from advsearch.scene.mitsuba_backend.variant import (
+    Plugin,
+    media_in,
+    mitsuba,
+    mitsuba_and_drjit,
+    one_at_a_time,
+    population,
+    recorded,
+)
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -193,6 +201,7 @@ class MitsubaScene:
             surfaces; of "guides" (H, W, 6), the first hit's albedo in [0, 1] and its shading normal.
         """
         with one_at_a_time:
+            # not before `mitsuba()`, which sees to libLLVM
             import drjit as dr
             import mitsuba as mi
 
@@ -278,6 +287,7 @@ class MitsubaScene:
             For each of `wrt` a float32 tensor of the input's shape.
         """
         with one_at_a_time:
+            # not before `mitsuba()`, which sees to libLLVM
             import drjit as dr
             import mitsuba as mi
 
@@ -330,6 +340,7 @@ class MitsubaScene:
             meshes: names of the meshes.
         """
         with one_at_a_time:
+            # few scenes search a material
             from advsearch.scene.mitsuba_backend.material_form.adjoint import material_adjoint
 
             self._set(inputs)
@@ -362,8 +373,7 @@ class MitsubaScene:
             spp: samples a pixel.
         """
         with one_at_a_time:
-            mi = mitsuba()
-            import drjit as dr
+            mi, dr = mitsuba_and_drjit()
 
             self._set(inputs)
             key, spp = self.declared[name][0], next_count(self.sampler, spp)
@@ -389,6 +399,7 @@ class MitsubaScene:
         constants are part of a recording, so that every change makes all recordings stale.
         """
         mi = mitsuba()  # somebody else may have taken another variant since
+        # not before `mitsuba()`, which sees to libLLVM
         import drjit as dr
 
         unknown = [name for name in inputs if name not in self.declared]

@@ -31,7 +31,7 @@ from advsearch.scene.mitsuba_backend.texel_rays import (
     stopped,
     to_map,
 )
-from advsearch.scene.mitsuba_backend.variant import mitsuba, one_at_a_time, population, recorded
+from advsearch.scene.mitsuba_backend.variant import mitsuba, mitsuba_and_drjit, one_at_a_time, population, recorded
 
 SHARP, WIDE = 0.15, 0.4
 """Spreads of gloss between which what one ray meets on the ground gives way to what surrounds the object."""
@@ -146,8 +146,7 @@ class Views:
             lit: what it looks like.
         """
         with one_at_a_time:
-            mi = mitsuba()
-            import drjit as dr
+            mi, dr = mitsuba_and_drjit()
 
             height, width = self._scene.resolution
             count = len(cameras)
@@ -173,8 +172,7 @@ class Views:
 
     def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, lit: Lit) -> list[Any]:
         """The kernel: radiance but for the searched texture, coverage, and where and how much each ray sees of it."""
-        mi = mitsuba()
-        import drjit as dr
+        mi, dr = mitsuba_and_drjit()
 
         height, width = self._scene.resolution
         pixel, number = lane // RAYS, lane % RAYS
@@ -211,8 +209,7 @@ class Views:
     def _shaded(self, held: Any, hit: Any, valid: Any, way: Any, tables: Any, lit: Lit) -> tuple[Any, Any, Any]:
         """What was hit: its radiance, but for what the searched texture reflects diffusely; its diffuse share; and 1 on
         the front of the searched texture, -1 on its back, 0 elsewhere."""
-        mi = mitsuba()
-        import drjit as dr
+        mi, dr = mitsuba_and_drjit()
 
         to_local, layers = to_map(self._scene), layers_of(self._scene)
         ons = [on & valid for on in on_grids(held, self._grids, hit, way)]
@@ -249,8 +246,7 @@ class Views:
 
     def _measured(self, tables: Any, first: Any, cosine: Any) -> list[Any]:
         """The entries of the tables at a cosine."""
-        mi = mitsuba()
-        import drjit as dr
+        mi, dr = mitsuba_and_drjit()
 
         place = dr.clip(cosine * ANGLES - 0.5, 0.0, ANGLES - 1.0)
         low = dr.minimum(mi.UInt32(place), ANGLES - 2)
@@ -263,8 +259,7 @@ class Views:
 
     def _from_middle(self, place: Any, way: Any) -> Any:
         """The direction in which the middle of the object sees the ground that a place sees in a direction."""
-        mi = mitsuba()
-        import drjit as dr
+        mi, dr = mitsuba_and_drjit()
 
         if all(grid.warp is None for grid in self._grids):
             return way
@@ -273,8 +268,7 @@ class Views:
 
     def _shown(self, hit: Any, ons: Sequence[Any], lit: Lit, to_local: Any) -> Any:
         """Diffuse radiance of what was hit."""
-        mi = mitsuba()
-        import drjit as dr
+        mi, dr = mitsuba_and_drjit()
 
         found = self._texel(hit, ons, lit)
         if self._photographed is not None:
@@ -285,8 +279,7 @@ class Views:
 
     def _texel(self, hit: Any, ons: Sequence[Any], lit: Lit) -> Any:
         """What the texels say of what was hit; 0 where it has none."""
-        mi = mitsuba()
-        import drjit as dr
+        mi, dr = mitsuba_and_drjit()
 
         first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
         y, x, known = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
@@ -346,8 +339,7 @@ def _by_ray(layers: Sequence[Any]) -> Floats:
 
 def _chosen(number: Any, values: Sequence[float]) -> Any:
     """The value with a number."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     found = mi.Float(values[0])
     for index, value in enumerate(values[1:], 1):
@@ -357,8 +349,7 @@ def _chosen(number: Any, values: Sequence[float]) -> Any:
 
 def _bilinear(values: Any, first: Any, rows: Any, columns: Any, y: Any, x: Any, *, wraps: bool = False) -> Any:
     """Look three numbers up in a grid of a flat array, which ends at its border or goes round in its columns."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     y = dr.clip(y, 0.0, mi.Float(rows) - 1.0)
     upper, share = mi.UInt32(y), y - dr.floor(y)
@@ -381,8 +372,7 @@ def _bilinear(values: Any, first: Any, rows: Any, columns: Any, y: Any, x: Any, 
 
 def _gathered(values: Any, number: Any) -> Any:
     """The three numbers with a number; four at once is what the processor reads fastest."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     return mi.Color3f(*dr.gather(mi.Vector4f, values, number)[:3])
 
@@ -399,8 +389,7 @@ def _sky(lit: Lit, way: Any, to_local: Any) -> Any:
 
 def _blurred(lit: Lit, way: Any, to_local: Any, spread: Any, widths: Sequence[float]) -> Any:
     """The environment in a direction, blurred by an angle (root mean square)."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     rows, columns = lit.blurred_shape
     level = dr.clip(dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import mitsuba, mitsuba_and_drjit
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
@@ -75,8 +75,7 @@ def gather(
         rays: of each texel; the same well-spread points for all, shifted by chance.
         seed: number of the shifts.
     """
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     held, to_local, layers = scene._scene, to_map(scene), layers_of(scene)
     count, texels = len(places), grids[-1].first + grids[-1].count
@@ -116,8 +115,7 @@ def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) 
         places, normals: (n, 3), as of `gather`.
         ways: (k, 3) unit directions, in the axes of the environment's map.
     """
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     world = (ways @ np.array(to_map(scene))).astype(np.float32)  # the transpose turns back
     lane = dr.arange(mi.UInt32, len(places) * len(world))
@@ -144,8 +142,7 @@ def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
         name: of the shape.
         places: (n, 3) on it.
     """
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     generator = np.random.default_rng(0)
     ways = generator.standard_normal((PASS >> 7, 3))
@@ -180,8 +177,7 @@ def stopped(held: Any, ray: Any, layers: int, chance: Any = 0.5, active: Any = T
         chance: in [0, 1]; a ray goes on as long as the share of light that passes all it has met is larger.
         active: which lanes count.
     """
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     hit = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
     share = mi.Float(1.0)
@@ -195,6 +191,7 @@ def stopped(held: Any, ray: Any, layers: int, chance: Any = 0.5, active: Any = T
 
 def passed(hit: Any, active: Any) -> Any:
     """The share of light that passes what was hit."""
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit as dr
 
     return dr.mean(hit.bsdf().eval_null_transmission(hit, active & hit.is_valid()))
@@ -202,8 +199,7 @@ def passed(hit: Any, active: Any) -> Any:
 
 def _passing(held: Any, ray: Any, layers: int, active: Any) -> Any:
     """The share of light that passes all that is in the way of rays."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     share = mi.Float(1.0)
     for _ in range(layers):
@@ -234,8 +230,7 @@ def shapes_of(held: Any, grids: Sequence[TexelGrid]) -> list[Any]:
 
 def on_grids(held: Any, grids: Sequence[TexelGrid], hit: Any, way: Any) -> list[Any]:
     """Whether hits of rays in a direction lie on each grid."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     front = dr.dot(hit.n, way) < 0.0
     found = []
@@ -253,6 +248,7 @@ def to_map(scene: MitsubaScene) -> Any:
 
 def map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
     """Where in the environment's map a direction lies: shares of its width and of its height."""
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit as dr
 
     x, y, z = (row[0] * way.x + row[1] * way.y + row[2] * way.z for row in to_local)
@@ -262,6 +258,7 @@ def map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
 
 def grid_place(grid: TexelGrid, place: Any, uv: Any) -> tuple[Any, Any]:
     """Where in a grid something lies: shares of its height and of its width."""
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit as dr
 
     if grid.warp is None:
@@ -275,8 +272,7 @@ def grid_place(grid: TexelGrid, place: Any, uv: Any) -> tuple[Any, Any]:
 
 
 def _cell(share: Any, count: int) -> Any:
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     return mi.Int32(dr.minimum(share * count, count - 1.0))
 

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import mitsuba_and_drjit
 
 STEP = 0.0625
 """How much the base colour is changed for the derivative of a BSDF with respect to it."""
@@ -94,8 +94,7 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
         depth: segments of the longest path.
         spp: samples a pixel, those of the sampler.
     """
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     height, width = size
     sensor = scene.sensors()[0]
@@ -131,8 +130,7 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
 
 def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Vertices:
     """Take the vertices that take part out of all, as tensors."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     index: Any = dr.compress(taking_part)
     if dr.width(index) == 0:
@@ -165,6 +163,7 @@ class _First:
 
     def stops(self, hit: Any, bsdf: Any, where: Any) -> None:
         """Take reflectance and normal of a hit for those of the picture."""
+        # not before `mitsuba()`, which sees to libLLVM
         import drjit as dr
 
         self.albedo = dr.select(where, bsdf.eval_diffuse_reflectance(hit, where), self.albedo)
@@ -209,8 +208,7 @@ class _Step:
 
     def slopes(self) -> None:
         """Find the derivatives of the BSDF, now that the base colour is larger by `STEP`."""
-        mi = mitsuba()
-        import drjit as dr
+        mi, dr = mitsuba_and_drjit()
 
         context = mi.BSDFContext()
         value = self.bsdf.eval(context, self.at, self.to_light, self.lit)
@@ -221,8 +219,7 @@ class _Step:
 
 def _walk(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[_First, list[_Step]]:
     """Trace paths; return what the camera sees, and the vertices, the first one first. Rays of weight 0 see nothing."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     context = mi.BSDFContext()
     through = mi.Spectrum(1.0)
@@ -293,8 +290,7 @@ def _walk(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[_F
 
 def _seen(hit: Any, shown: Any) -> _First:
     """What the camera sees at the first vertices, and the radiance that these emit."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     covered, none = hit.is_valid(), dr.zeros(mi.Color3f, dr.width(hit.p))
     behind = dr.select(covered, 0.0, shown)
@@ -303,8 +299,7 @@ def _seen(hit: Any, shown: Any) -> _First:
 
 def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any, Any]]]:
     """Return the radiance that leaves the first vertices, and texture coordinates, weights and sharpness of all."""
-    mi = mitsuba()
-    import drjit as dr
+    mi, dr = mitsuba_and_drjit()
 
     beyond = mi.Spectrum(0.0)
     found: list[tuple[Any, Any, Any]] = []
@@ -318,6 +313,7 @@ def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any, Any]]]:
 
 def _difference(after: Any, before: Any, active: Any) -> Any:
     """The derivative of a BSDF from two values; zero where they differ by rounding alone, as on other surfaces."""
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit as dr
 
     change = after - before
@@ -326,6 +322,7 @@ def _difference(after: Any, before: Any, active: Any) -> Any:
 
 def _balance(one: Any, other: Any) -> Any:
     """The power heuristic's weight of a strategy with this density beside another one."""
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit as dr
 
     total = one * one + other * other

@@ -34,6 +34,7 @@ def mitsuba() -> ModuleType:
     first = "mitsuba" not in sys.modules
     if first:
         ensure_llvm()
+    # not before `mitsuba()`, which sees to libLLVM
     import mitsuba as mi
 
     if mi.variant() != VARIANT:
@@ -45,9 +46,18 @@ def mitsuba() -> ModuleType:
     return module
 
 
+def mitsuba_and_drjit() -> tuple[ModuleType, ModuleType]:
+    """`mitsuba`, and Dr.Jit, which may not be imported before: it looks for libLLVM then."""
+    mi = mitsuba()
+    import drjit as dr  # see above
+
+    return mi, dr
+
+
 @contextmanager
 def fewer_warnings() -> Iterator[None]:
     """Keep Mitsuba from warning of what is told here."""
+    # not before `mitsuba()`, which sees to libLLVM
     import mitsuba as mi
 
     before = mi.log_level()
@@ -64,6 +74,7 @@ def recorded(render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]
     Nothing may be freed while it records: memory that torch shares and scenes end with a host function, which Dr.Jit
     1.5.0 cannot record, and the process ends. So Python's garbage collector waits until after.
     """
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit as dr
 
     frozen = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
@@ -83,6 +94,7 @@ def recorded(render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]
 def _settle(mi: ModuleType) -> None:
     """Only warnings are logged, Dr.Jit's pool gets the size that `advsearch.threads` chose, and Python's garbage
     collector, which every change of the scenes calls, passes over what has been imported by now: 0.2 s each time."""
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit as dr
 
     mi.set_log_level(mi.LogLevel.Warn)

@@ -220,6 +220,7 @@ def _side_squared(charts: Charts, vertices: Floats) -> float:
 
 def _nearest(covered: npt.NDArray[np.bool_]) -> Ints:
     """For each cell of a grid the nearest covered one, by their places in the flat grid."""
+    # takes long to import
     from scipy import ndimage
 
     rows, columns = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)

@@ -22,6 +22,7 @@ _OUTLINES, _PATHS, _SHADOWS = 1, 2, 3
 def both_backends() -> tuple[Any, Any]:
     """Mitsuba and Dr.Jit, untyped: what Dr.Jit says of its types is incomplete."""
     mi = mitsuba()
+    # not before `mitsuba()`, which sees to libLLVM
     import drjit
 
     return mi, drjit
