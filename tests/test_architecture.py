@@ -486,10 +486,9 @@ def test_the_repository_stays_small() -> None:
 
 
 def test_imports_inside_functions_are_few_and_say_why() -> None:
-    inner = runpy.run_path(str(ROOT / "tools" / "concepts.py"))["inner_imports"]
-    found = {
-        f"{module}:{line}": why for module, path in python_files() for line, why in inner(path.read_text()).items()
-    }
+    concepts = runpy.run_path(str(ROOT / "tools" / "concepts.py"))
+    inner = {name: concepts["inner_imports"](path.read_text()) for name, path in concepts["modules_of"](ROOT).items()}
+    found = {f"{name}:{line}": why for name, imports in inner.items() for line, why in imports.items()}
     bare = sorted(place for place, why in found.items() if not why)
     assert not bare, "each takes a comment, beside it or above it, with the reason why it stands inside"
     assert len(found) <= 195, "see whether this one can stand at the top: `advsearch --help` has to answer at once"
