@@ -167,8 +167,8 @@ def attacks_of(settings: JsonObject) -> Call:
                 path = Path(folder) / part.name
                 own = part.config.model_copy(update={"run": str(path), "overwrite": True})
                 ending = attack_once()(own, clean=clean).summary.ending
-                files = (one for one in path.rglob("*") if one.is_file() and one.name != files.NAME)
-                read = {one.relative_to(path).as_posix(): one.read_bytes() for one in files}
+                kept = (one for one in path.rglob("*") if one.is_file() and one.name != files.NAME)
+                read = {one.relative_to(path).as_posix(): one.read_bytes() for one in kept}
                 found.append((part.name, str(path), read))
                 if ending in SETTLED:
                     break

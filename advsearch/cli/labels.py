@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 
 from advsearch.cli import output
-from advsearch.cli.flags import add_settings
 from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 
@@ -15,6 +14,9 @@ EXAMPLES = ("labels", "labels mug --labels labels.json", "labels mug --model mod
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    # late, so that --help answers at once
+    from advsearch.cli.flags import add_settings
+
     parser.add_argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it")
     add_settings(parser, only=("model", "labels"))
     output.add_flags(parser)

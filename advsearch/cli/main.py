@@ -21,13 +21,10 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from advsearch import __version__
-from advsearch.cli.flags import with_flags
 from advsearch.cli.output import end_output, open_descriptors, screens, shortened
-from advsearch.config import CONFIGS
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.rooms import there
-from advsearch.settings import settings
 
 GROUPS = {
     "ask: what does a model get wrong?": {
@@ -142,6 +139,8 @@ def _run_and_tell(given: list[str]) -> int:
         sys.stdout.flush()
         return status
     except AdvsearchError as error:
+        from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+
         asks_for_flag = isinstance(error, UnknownNameError) or "`code=" in str(error)  # no file may name its own code
         in_a_file = given[0] in ("run", "resume") and not asks_for_flag
         text = str(error) if in_a_file else with_flags(str(error))
@@ -235,6 +234,10 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
 
 def _owners(flag: str) -> list[str]:
     """Commands that have a flag."""
+    # late, so that --help answers at once
+    from advsearch.config import CONFIGS
+    from advsearch.settings import settings
+
     return [name for name, config in CONFIGS.items() if flag in (one.flag for one in settings(config))]
 
 

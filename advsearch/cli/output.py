@@ -19,12 +19,9 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, redi
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
-from advsearch.cli.flags import with_flags
-from advsearch.config import SceneConfig
 from advsearch.errors import AdvsearchError, StorageError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress, Progress
-from advsearch.settings import split_names
 from advsearch.watching import bars, lines
 
 if TYPE_CHECKING:
@@ -221,8 +218,10 @@ def go_on_command(run: str | Path) -> str:
 
 def _code_in(file: Path) -> Sequence[str]:
     """The Python code that a run.yaml names."""
-    # late: it imports this module
+    # late: it imports this module; and so that --help answers at once
     from advsearch.cli.run import command_in, config_of_file
+    from advsearch.config import SceneConfig
+    from advsearch.settings import split_names
 
     config = config_of_file(command_in(file), file, {})
     if not isinstance(config, SceneConfig):
@@ -295,6 +294,8 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
 
 def as_notes(texts: Sequence[str]) -> str:
     """Return notes below an answer, each a paragraph, with the flags of the settings that they name."""
+    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+
     return "".join(f"\n\nNote: {with_flags(text)}" for text in texts)
 
 
@@ -315,6 +316,8 @@ def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
 @contextmanager
 def watch_progress(*, quiet: bool = False) -> Iterator[Progress]:
     """Yield the progress that suits standard error: none when `quiet`, bars on a terminal, lines elsewhere."""
+    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+
     if quiet:
         yield NullProgress()
     elif sys.stderr.isatty():

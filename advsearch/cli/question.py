@@ -9,11 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
-from advsearch.cli.flags import add_settings, config_from
 from advsearch.cli.output import at_work
-from advsearch.config import CONFIGS
 from advsearch.errors import InputError
-from advsearch.settings import split_names
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -62,6 +59,10 @@ class QuestionCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add a flag for each of the settings, and those that commands share."""
+        # late, so that --help answers at once
+        from advsearch.cli.flags import add_settings
+        from advsearch.config import CONFIGS
+
         add_settings(parser, CONFIGS[self.name])
         output.add_flags(parser, quiet=True)
         if self.place:
@@ -99,6 +100,7 @@ class QuestionCommand:
         """Return the settings of the first run that the question is about, if it is about one."""
         # late, so that --help answers at once
         from advsearch.runs.directory import CONFIG, find_run
+        from advsearch.settings import split_names
 
         if self.about not in args:
             return None
@@ -109,6 +111,10 @@ class QuestionCommand:
 
     def config(self, args: argparse.Namespace) -> Config:
         """Return the configuration that the arguments describe."""
+        # late, so that --help answers at once
+        from advsearch.cli.flags import config_from
+        from advsearch.config import CONFIGS
+
         return config_from(args, CONFIGS[self.name])
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import main, output
-from advsearch.config import CONFIGS
 from advsearch.errors import UnknownNameError
-from advsearch.settings import parse_assignment, read_yaml
 
 if TYPE_CHECKING:
     from advsearch.settings import Config
@@ -51,6 +49,9 @@ def changes_in(words: Sequence[str]) -> dict[str, object]:
     Raises:
         InputError: a word is no such assignment.
     """
+    # late, so that --help answers at once
+    from advsearch.settings import parse_assignment
+
     return dict(parse_assignment(text, f"change {text!r}") for text in words)
 
 
@@ -60,11 +61,17 @@ def command_in(file: str | Path) -> str:
     Raises:
         FileFormatError: it is not a file with settings.
     """
+    # late, so that --help answers at once
+    from advsearch.settings import read_yaml
+
     return str(read_yaml(file).get("command", "attack"))
 
 
 def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
     """Return the configuration that a file describes; arguments and errors as for `run_file`."""
+    # late, so that --help answers at once
+    from advsearch.config import CONFIGS
+
     if command not in COMMANDS:
         raise UnknownNameError("command", command, COMMANDS, f"It stands in {file}.")
     return CONFIGS[command].from_yaml(file, changes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from advsearch.config import AttackConfig
 from advsearch.engine import bank, transport
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.bank import Bank, stratified
+from advsearch.engine.problem import hard_first
 from advsearch.errors import ClusterError
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.scene.surface import plan
@@ -150,7 +152,7 @@ def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Under each condition, but for noise and what a matrix leaves out; and the derivative is the mean one."""
+    """Under each condition, but for noise and what a matrix leaves out; and the derivative is the weighted mean."""
     seen: list[Bank] = []
     monkeypatch.setattr(Bank, "prepare", lambda self, tick: seen.append(self))
     monkeypatch.setattr(bank, "FIRST", 2)
@@ -166,11 +168,17 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
             wholes = (torch.cat([at, one.numbers]) for at in (problem.domain.start, u))
             first, second = (problem.renderer(whole, seed=1, spp=64) for whole in wholes)
             assert float((change - second + first).square().mean()) < 0.1 * float((second - first).square().mean())
-    whole, parts = (made._evaluated(some, u, True).gradient for some in (made._held, made._held[:1]))
-    other = made._evaluated(made._held[1:], u, True).gradient
-    assert whole is not None and parts is not None and other is not None
-    alone = len(made._held) - 1
-    torch.testing.assert_close(whole, (parts + other * alone) / (alone + 1), rtol=1e-4, atol=1e-8)
+    each = [made._evaluated([one], u, True) for one in made._held]
+    values, gradients = torch.tensor([one.objective for one in each]), [one.gradient for one in each]
+    weights = hard_first(values)
+    assert float(weights.mean()) == pytest.approx(1.0) and int(weights.argmax()) == int(values.argmin())
+    mean = sum(weight * one for weight, one in zip(weights, gradients, strict=True) if one is not None) / len(each)
+    torch.testing.assert_close(made._evaluated(made._held, u, True).gradient, mean, rtol=1e-3, atol=1e-7)
+
+
+def test_conditions_that_are_all_alike_count_the_same() -> None:
+    for values in (torch.tensor([2.0, 2.0]), torch.tensor([3.0]), torch.tensor([math.inf, 1.0])):
+        assert hard_first(values).tolist() == [1.0] * len(values)
 
 
 @pytest.mark.usefixtures("growing")

@@ -447,8 +447,8 @@ def test_torchscript_touches_nothing(kind: type[Scripted], tmp_path: Path, capfd
 ANSWER = """
 import sys
 from advsearch.cli.main import main
-from advsearch.models import deadline
-deadline.LONGEST = 40
+from advsearch.models import guards
+guards.LONGEST = 40
 sys.exit(main(["labels", "mug", "--model", sys.argv[1]]))
 """
 

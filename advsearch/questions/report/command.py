@@ -15,7 +15,6 @@ from advsearch.cli import output
 from advsearch.cli.show import photos_of
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.options import FROM_RUN
-from advsearch.settings import read_yaml
 
 if TYPE_CHECKING:
     from advsearch.questions.report.answer import Evidence, EvidenceRun
@@ -118,6 +117,7 @@ def _settings(folder: Path) -> Mapping[str, object]:
     """What its run.yaml says; nothing where there is none that can be read."""
     # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG
+    from advsearch.settings import read_yaml
 
     with suppress(AdvsearchError):
         return read_yaml(folder / CONFIG)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from advsearch.cli.flags import config_from
 from advsearch.cli.question import QuestionCommand
-from advsearch.config import AttackConfig, SweepConfig
 
 if TYPE_CHECKING:
     from advsearch.settings import Config
@@ -27,6 +25,10 @@ class _Sweep(QuestionCommand):
 
     def config(self, args: argparse.Namespace) -> Config:
         """Return what the flags describe, over what the run of an answer brings."""
+        # late, so that --help answers at once
+        from advsearch.cli.flags import config_from
+        from advsearch.config import AttackConfig, SweepConfig
+
         file = self.file(args)
         if file is None:
             return super().config(args)
