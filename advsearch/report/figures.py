@@ -255,7 +255,7 @@ ROWS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceView:
+class MapView:
     """What a camera sees of an object.
 
     Attributes:
@@ -288,7 +288,7 @@ class SurfacePanel:
     surface: npt.NDArray[np.bool_]
     compared: npt.NDArray[np.bool_]
     difference: Doubles
-    views: tuple[SurfaceView, ...]
+    views: tuple[MapView, ...]
 
 
 def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
@@ -342,7 +342,7 @@ def _coloured(panel: SurfacePanel, scale: Any) -> Doubles:
     return np.where(panel.surface[..., None], colours, NOTHING)
 
 
-def _mosaic(views: Sequence[SurfaceView], colours: Doubles, across: int) -> Doubles:
+def _mosaic(views: Sequence[MapView], colours: Doubles, across: int) -> Doubles:
     """The object in the colours (n, n, 3) of its cells, shaded a little, side after side; white beside it."""
     tiles = []
     for view in views:

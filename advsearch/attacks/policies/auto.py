@@ -78,7 +78,7 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class Tried:
     """A random move of the box coordinates during an ascent: where they stood, and the objective there."""
 
     x: Tensor
@@ -108,7 +108,7 @@ class AutoState:
     ascent: PGDState | None = None
     climbing: bool = False
     last: float = -math.inf
-    trial: Trial | None = None
+    trial: Tried | None = None
 
     @property
     def box(self) -> Coordinates:
@@ -266,7 +266,7 @@ def _climb(state: AutoState, proposal: Proposal) -> tuple[Proposal, AutoState]:
         x = state.box.take(proposal.u)
         moved = state.box.moves(x[None], seeded(state.seed, state.plan.steps + state.ascent.count))[0]
         u = state.domain.project(state.box.put(proposal.u, moved))
-        return replace(proposal, u=u, gradient=state.plan.gradient), replace(state, trial=Trial(x, state.last))
+        return replace(proposal, u=u, gradient=state.plan.gradient), replace(state, trial=Tried(x, state.last))
     return replace(proposal, gradient=state.plan.gradient), state
 
 

@@ -33,7 +33,7 @@ from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.summary import rate
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.progress import Progress
-from advsearch.report.figures import SurfacePanel, SurfaceView, surface_figure
+from advsearch.report.figures import MapView, SurfacePanel, surface_figure
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.sweep import SurfaceMap, SurfacePart, SurfaceTable
@@ -352,7 +352,7 @@ def _told(job: Job, counts: Mapping[str, SurfaceCounts], run: RunDirectory) -> S
 
 
 def _panel(
-    name: str, model: str, parts: SurfaceParts, tally: PartCounts, found: Association, views: Sequence[SurfaceView]
+    name: str, model: str, parts: SurfaceParts, tally: PartCounts, found: Association, views: Sequence[MapView]
 ) -> SurfacePanel:
     square = (CELLS, CELLS)
     return SurfacePanel(
@@ -365,7 +365,7 @@ def _panel(
     )
 
 
-def _views(asset: ObjectAsset, parts: SurfaceParts) -> list[SurfaceView]:
+def _views(asset: ObjectAsset, parts: SurfaceParts) -> list[MapView]:
     """What cameras from some sides see of the object alone."""
     alone = framed(load_scene(asset, settings={"ground.size": 0.0}).description, SIDE_PIXELS)
     scene, views = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS)), []
@@ -375,5 +375,5 @@ def _views(asset: ObjectAsset, parts: SurfaceParts) -> list[SurfaceView]:
         there = shown.seen(OBJECT).numpy()
         cells = np.full(there.shape, -1, np.int64)
         cells[there] = parts.cells(shown.face.numpy()[there], shown.uv.numpy()[there].astype(np.float64))
-        views.append(SurfaceView(f"{azimuth:g}°, {elevation:g}° up", cells, shown.normal.numpy()))
+        views.append(MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shown.normal.numpy()))
     return views

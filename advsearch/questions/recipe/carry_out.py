@@ -26,7 +26,7 @@ from advsearch.questions.photographs.carry_out import Photographs, photographs_i
 from advsearch.questions.recipe.answer import RecipeFigure, RecipePart, RecipeResult
 from advsearch.questions.recipe.description import (
     ANY,
-    Planned,
+    PlannedRun,
     Recipe,
     check_figures,
     made_of,
@@ -165,7 +165,7 @@ def _check(described: Recipe, config: RecipeConfig) -> None:
             )
 
 
-def _check_runs(runs: Sequence[Planned]) -> dict[str, set[str]]:
+def _check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
     """Load everything that the runs name; a wrong name or label would end hours of rendering.
 
     Returns:
@@ -209,7 +209,7 @@ def _declared_columns(config: SceneConfig, *, trials: bool) -> set[str]:
     return found
 
 
-def _photographed(described: Recipe, runs: Iterable[Planned]) -> list[Planned]:
+def _photographed(described: Recipe, runs: Iterable[PlannedRun]) -> list[PlannedRun]:
     """The runs that photographs are compared with: they keep all pictures, with which those can be aligned."""
     own = [one for one in runs if described.parts[one.part].drawn_as is None]
     return [one for one in own if isinstance(one.config, SweepConfig) and one.config.keep_pictures == "all"]
@@ -219,8 +219,8 @@ def _photographed(described: Recipe, runs: Iterable[Planned]) -> list[Planned]:
 
 
 def _carried_out(
-    runs: Sequence[Planned], run: RunDirectory, progress: Progress, notes: list[str]
-) -> list[tuple[Planned, Result]]:
+    runs: Sequence[PlannedRun], run: RunDirectory, progress: Progress, notes: list[str]
+) -> list[tuple[PlannedRun, Result]]:
     """Carry out the runs that are not done, until one is interrupted; return all that there are.
 
     Args:
@@ -229,7 +229,7 @@ def _carried_out(
         progress: told how far it is.
         notes: gets a sentence for each run that cannot be carried out after another one's answer.
     """
-    results: list[tuple[Planned, Result]] = []
+    results: list[tuple[PlannedRun, Result]] = []
     for number, one in enumerate(runs):
         path = run.path / PARTS / one.name
         progress.message(f"run {number + 1} of {len(runs)}: {one.part}, {one.config.object}")
@@ -282,7 +282,7 @@ def _range(name: str, mean: DescribedValue, searched: FoundValue, deviation: flo
     return [math.exp(end) for end in ends] if declared.log else ends
 
 
-def _take(folder: Path, wanted: Sequence[Planned], run: RunDirectory) -> Iterable[str]:
+def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> Iterable[str]:
     """Take the photographs in a folder into the runs that are compared with some; return what is missing.
 
     Raises:
@@ -303,7 +303,7 @@ def _take(folder: Path, wanted: Sequence[Planned], run: RunDirectory) -> Iterabl
 
 
 def _figures(
-    described: Recipe, config: RecipeConfig, results: Sequence[tuple[Planned, Result]], run: RunDirectory
+    described: Recipe, config: RecipeConfig, results: Sequence[tuple[PlannedRun, Result]], run: RunDirectory
 ) -> Iterable[RecipeFigure]:
     """Compute and draw the figures."""
     rows: list[Answered] = []
@@ -329,7 +329,7 @@ def _result(
     described: Recipe,
     config: RecipeConfig,
     run: RunDirectory,
-    results: Sequence[tuple[Planned, Result]],
+    results: Sequence[tuple[PlannedRun, Result]],
     figures: Sequence[RecipeFigure],
     notes: Sequence[str],
     seconds: float,
@@ -357,7 +357,7 @@ def _result(
     )
 
 
-def _part(one: Planned, result: Result) -> RecipePart:
+def _part(one: PlannedRun, result: Result) -> RecipePart:
     assert isinstance(result, (AttackSummary, SweepSummary))
     return RecipePart(
         name=one.name,

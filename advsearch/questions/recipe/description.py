@@ -271,7 +271,7 @@ MOST_RUNS = 1000
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedRun:
     """One run of a recipe.
 
     Attributes:
@@ -287,7 +287,7 @@ class Planned:
     around: str | None
 
 
-def planned(recipe: Recipe, config: RecipeConfig) -> list[Planned]:
+def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """Return the runs of a recipe in the order in which they are carried out.
 
     A run is about one object. Where a part's command takes one environment or one model only, it has a run for each.
@@ -318,7 +318,7 @@ def names_listed(value: object) -> list[str]:
     return [str(one) for one in value] if isinstance(value, (list, tuple)) else list(split_names(str(value)))
 
 
-def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[Planned]:
+def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[PlannedRun]:
     part, kind = recipe.parts[name], CONFIGS[recipe.parts[name].command]
     settings = {**recipe.settings, **part.settings}
     several = kind.several if issubclass(kind, SceneConfig) and part.command != "attack" else ()
@@ -332,7 +332,7 @@ def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[Planned]:
         words = [value for axis, value in one.items() if axis == "object" or len(axes[axis]) > 1]
         where, stream = f"{config.recipe}: parts: {name}", f"{part.drawn_as or name} {number}"
         made = _config(part, {**settings, **one}, where, config, stream)
-        yield Planned(_folder(name, number, words), name, made, part.around and _folder(part.around, number, words))
+        yield PlannedRun(_folder(name, number, words), name, made, part.around and _folder(part.around, number, words))
 
 
 def _config(part: Part, settings: Settings, where: str, config: RecipeConfig, stream: str) -> SceneConfig:

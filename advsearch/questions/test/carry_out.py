@@ -47,7 +47,7 @@ NOTE = "suite"
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedClaim:
     """A claim or a counterexample, and what it is tried with."""
 
     name: str
@@ -116,7 +116,7 @@ class _SuiteRun:
 
     config: SuiteConfig
     suite: Suite
-    planned: Sequence[Planned]
+    planned: Sequence[PlannedClaim]
     trial: Trial
     expected: Mapping[str, str]
 
@@ -143,7 +143,7 @@ class _SuiteRun:
             self.trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
         return OUT_OF_TIME if any(words.TIME_OVER in one.reason for one in self.answers) else "done"
 
-    def _tried(self, one: Planned, results: Results) -> ClaimAnswer:
+    def _tried(self, one: PlannedClaim, results: Results) -> ClaimAnswer:
         """What a claim says; what is decided, or has used its pictures, is stored."""
         key = f"claim {one.name}"
         if (stored := results.stored(key)) is not None:
@@ -164,12 +164,12 @@ class _SuiteRun:
             raise KeyboardInterrupt
         return found
 
-    def _not_tried(self, one: Planned, reason: str) -> ClaimAnswer:
+    def _not_tried(self, one: PlannedClaim, reason: str) -> ClaimAnswer:
         claim = self.suite.claims.get(one.name)
         said = "" if claim is None or one.one is not None else words.statement(claim, one.config)
         return ClaimAnswer(name=one.name, kind=one.kind, statement=said, answer=UNDECIDED, reason=reason)
 
-    def _add(self, one: Planned, found: ClaimAnswer) -> None:
+    def _add(self, one: PlannedClaim, found: ClaimAnswer) -> None:
         only = {"only": one.name, "seed": self.suite.seed, "fresh": False, "add": None, "update": False, "run": None}
         files = {"junit": None, "sarif": None, "markdown": None, "overwrite": False}
         again = self.config.model_copy(update={**only, **files}).with_only_here(self.config.only_here)
@@ -223,17 +223,17 @@ def _seeded(suite: Suite, config: SuiteConfig) -> Suite:
     return suite.model_copy(update={"seed": seed})
 
 
-def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[Planned]:
+def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[PlannedClaim]:
     """What is tried, counterexamples first."""
     changes = {"model": config.model, "threads": config.threads, "deterministic": config.deterministic or None}
     kept = counterexamples(config.suite) if added is None else [added]
-    first = [Planned(one.name, "counterexample", one.config_for(suite, changes), one) for one in kept]
+    first = [PlannedClaim(one.name, "counterexample", one.config_for(suite, changes), one) for one in kept]
     if twice := [one.name for one in first if one.name in suite.claims]:
         raise InputError(f"claims.{twice[0]}: a counterexample is called so, too; call the claim something else")
     if added is not None:
         return first
     rest = [
-        Planned(name, one.claim, suite.config_of(name, **changes).with_only_here(config.only_here))
+        PlannedClaim(name, one.claim, suite.config_of(name, **changes).with_only_here(config.only_here))
         for name, one in suite.claims.items()
     ]
     chosen, planned = config.chosen, [*first, *rest]
@@ -246,7 +246,7 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
     return [one for one in planned if one.name in chosen or (one.one is not None and COUNTEREXAMPLES in chosen)]
 
 
-def _check(planned: Sequence[Planned], suite: Suite) -> None:
+def _check(planned: Sequence[PlannedClaim], suite: Suite) -> None:
     """Load everything that claims name; a wrong name would end minutes of rendering.
 
     Raises:

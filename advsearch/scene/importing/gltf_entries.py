@@ -148,7 +148,7 @@ class Cone(_Entry):
     outerConeAngle: Annotated[float, Field(gt=0.0, lt=1.571)] = math.pi / 4.0
 
 
-class Light(_Entry):
+class LightEntry(_Entry):
     """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in lux."""
 
     type: Literal["point", "spot", "directional"]
@@ -160,7 +160,7 @@ class Light(_Entry):
 
 
 class _Lights(_Entry):
-    lights: List[Light] = []
+    lights: List[LightEntry] = []
 
 
 class _FileExtensions(_Extensions):
@@ -365,7 +365,7 @@ class Header(_Entry):
     extensionsRequired: List[str] = []
 
     @property
-    def lights(self) -> list[Light]:
+    def lights(self) -> list[LightEntry]:
         """The lights that nodes may carry."""
         found = self.extensions.punctual if self.extensions else None
         return [] if found is None else found.lights

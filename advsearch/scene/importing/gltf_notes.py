@@ -73,7 +73,7 @@ WORDS = {
     "Sampler": "entry of a sampler",
     "Texture": "entry of a texture",
     "Image": "entry of an image",
-    "Light": "entry of a light",
+    "LightEntry": "entry of a light",
 }
 """What is left out of entries whose contents are seen."""
 

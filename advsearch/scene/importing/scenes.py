@@ -23,7 +23,7 @@ from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
-from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light
+from advsearch.scene.importing.gltf_entries import CameraEntry, Header, LightEntry
 from advsearch.scene.importing.gltf_parts import poses
 from advsearch.scene.importing.imported_part import ImportedPart, visible
 from advsearch.scene.importing.objects import GLTF, object_of, read_parts
@@ -288,7 +288,7 @@ def _below(header: Header, index: int) -> set[int]:
     return found
 
 
-def _lamp(name: str, light: Light, pose: Doubles, frame: FileFrame) -> PointLamp | SpotLamp:
+def _lamp(name: str, light: LightEntry, pose: Doubles, frame: FileFrame) -> PointLamp | SpotLamp:
     """A light at its place; light falls off with the square of the distance in object sizes as it does in the file."""
     power = np.array(light.color) * light.intensity / LUMENS
     if light.type == "directional":
