@@ -144,8 +144,7 @@ class SceneDescription:
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
         """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
-        # a circle: it takes descriptions
-        from advsearch.scene.geometry import moved_part, object_to_world
+        from advsearch.scene.geometry import moved_part, object_to_world  # a circle: it takes descriptions
 
         under_test = mesh_part(OBJECT, self.object, object_to_world(self), self.material)
         return {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
@@ -230,8 +229,7 @@ class SceneDescription:
     @property
     def base_vertices(self) -> Doubles:
         """(V, 3) the object's vertices in world space, in its base pose."""
-        # a circle: it takes descriptions
-        from advsearch.scene.geometry import object_to_world
+        from advsearch.scene.geometry import object_to_world  # a circle: it takes descriptions
 
         matrix = object_to_world(self)
         return np.asarray(self.object.mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3])
@@ -286,8 +284,7 @@ class SceneDescription:
     @property
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
-        # a circle: it takes descriptions
-        from advsearch.scene.exposure import metered_gain
+        from advsearch.scene.exposure import metered_gain  # a circle: it takes descriptions
 
         return (metered_gain(self) if self.metered else 1.0) * math.pow(2.0, self.number("camera.exposure"))
 
@@ -405,8 +402,7 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
 
 
 def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None) -> ImportedScene:
-    # a circle: it takes descriptions
-    from advsearch.scene.mitsuba_backend.files.scene import import_plugins
+    from advsearch.scene.mitsuba_backend.files.scene import import_plugins  # a circle: it takes descriptions
 
     if up is not None:
         raise InputError("up: the first camera of a Mitsuba scene says which way is up; leave `up` out")

@@ -12,6 +12,7 @@ from stand_ins import Impatient, rows, shared
 
 import advsearch
 from advsearch.attacks import make_policy
+from advsearch.attacks.evaluation import Query
 from advsearch.config import AttackConfig
 from advsearch.engine import surface_light
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
@@ -170,3 +171,21 @@ def test_a_texture_and_its_viewpoint_are_searched_together() -> None:
     summary = advsearch.attack("mug", **CAMERA | {"controls": {"texture": {"resolution": 8}, "camera": {}}}).summary
     assert summary.transport is not None and summary.transport.way == "surface light"
     assert (summary.renders["products"], summary.renders["gradient"]) == (80, 0)
+
+
+def test_a_random_search_looks_through_the_same_cameras_again() -> None:
+    """Every fourth time, where a search that learns sees new ones and other exposures each time."""
+    problem, _ = problem_of_parts(parts_of(AttackConfig(object="mug", **SMALL)))
+    light, u = SurfaceLight(problem, 18), problem.domain.start
+
+    def objective(kind: str, number: int) -> float:
+        return light.evaluate(Query(u, number, kind, number, gradient=False, phase="search")).objective
+
+    light.prepare()
+    assert objective("baseline", 1) == objective("baseline", 5) != objective("baseline", 2)
+    assert len({objective("search", number) for number in (1, 5, 9)}) == 3
+    exposures = [group.coordinates for group in problem.space.groups if group.name == "environment.exposure"]
+    seen = {
+        float(one[exposures[0].start - len(u)]) for n in range(9) for one in light._drawn(Query(u, n, "search", n), 2)
+    }
+    assert len(seen) == 18 and len(light.renderer.lights) <= 4

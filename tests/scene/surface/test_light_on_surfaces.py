@@ -295,3 +295,21 @@ def test_a_sun_of_one_texel_is_as_wide_as_the_map_shows_it() -> None:
         assert float((found - middle).abs().max()) < 1.0
     solid = (torch.pi / 15.0) * (torch.pi / 16.0) * torch.sin(torch.tensor(7.0 * torch.pi / 15.0))
     assert float(light.sum(dim=0)[0]) == pytest.approx(1e5 * float(solid), rel=0.03)  # the rest is left to the cells
+
+
+def test_exposures_of_one_map_share_its_light(traced: Renderer, light: SurfaceRenderer) -> None:
+    """Its pictures are those of light that was found for the other exposure; a turned map has a light of its own."""
+    first = drawn(traced, 1)
+    brighter, turned = first.clone(), first.clone()
+    for group in traced.space.groups:
+        for changed, name in ((brighter, "environment.exposure"), (turned, "environment.rotation")):
+            if group.name == name:
+                changed[group.coordinates] = 1.0 - 0.8 * first[group.coordinates]
+    assert not torch.equal(brighter, first) and not torch.equal(turned, first)
+    with torch.no_grad():
+        inputs = [traced.scene.assembly(traced.space.inputs(u)) for u in (first, brighter, turned)]
+        lights, factors = zip(*map(light.kept_light, inputs), strict=True)
+        own = SurfaceRenderer(traced, traced.start, seed=0)(brighter)
+        assert lights[1] is lights[0] and lights[2] is not lights[0]
+        assert float((factors[1] - factors[0]).abs().min()) > 0.05
+        torch.testing.assert_close(light(brighter), own, rtol=1e-3, atol=1e-4)
