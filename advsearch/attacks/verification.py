@@ -72,7 +72,7 @@ all but the last, with the successes of `OVER_EARLY`, and of all at the last.
 What holds in 85 % or less is found in 3.3 % of all cases at most, and in 2.6 % by 180 of 200 alone."""
 OVER_CONFIDENCE = 0.97
 """Confidence of a Clopper-Pearson interval after `OVER_LOOKS`, so that it covers the rate in 95 % of all cases
-(`benchmarks/verdicts.py`): somebody who looks four times is lucky more often than somebody who looks once."""
+(`benchmarks/verdicts.py`): somebody who looks five times is lucky more often than somebody who looks once."""
 
 LEAST_RATE = 0.5
 """Where the 95 % interval of a claim's rate may begin: what is called found holds more often than not. So 6 trials are

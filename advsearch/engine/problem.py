@@ -354,8 +354,9 @@ class Problem:
                 values = torch.cat([self.objective(*one) for one in of_each])
             else:
                 values = self.objective(outputs, pictures, truths[0], self.asked(*places))
-            weighted = (values * hard_first(values)).sum()
-            derivative = torch.autograd.grad(weighted, at)[0] if values.requires_grad else None
+            derivative = None
+            if values.requires_grad:
+                derivative = torch.autograd.grad((values * hard_first(values)).sum(), at)[0]
         said = judgements(self.task, outputs, pictures, truths, self.metrics)
         evaluations = [
             Evaluation(float(value), None, judgement.success, judgement=judgement)

@@ -22,6 +22,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
+from advsearch.controls import Space
 from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import BOUND, Conditions, Deviation, Predictor, Tick
@@ -48,8 +49,6 @@ TOGETHER = 8
 AGAIN = 4
 """Evaluations of a random search from which on cameras and environments come again: nothing learns from them, and what
 each camera sees is known then."""
-MOST_RAYS = 1 << 21
-"""Rays of cameras of one launch."""
 
 
 def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise: bool) -> str | None:
@@ -224,8 +223,7 @@ class SurfaceLight(Predictor):
 
     def _ahead(self, queries: Sequence[Query], place: int) -> dict[int, Tensor]:
         """The pictures of the next queries, made at once; by the places of these."""
-        height, width = self.renderer.formation.resolution
-        some = [one.u for one in queries[place : place + max(1, MOST_RAYS // (height * width * RAYS))]]
+        some = [one.u for one in queries[place : place + self.renderer.at_once]]
         with torch.no_grad():
             pictures = self.renderer.pictures([self._inputs(u) for u in some], self.renderer.there, some)
         return dict(enumerate(pictures, place))
@@ -242,7 +240,7 @@ class SurfaceLight(Predictor):
             ((answer, _),), _ = self.problem.judged(lambda at: picture[None], [query.u], query.u, False)
             kept = to_8_bit(picture) if query.keep else None
             return replace(answer, cost=query.samples, predicted=RAYS, picture=kept)
-        again = query.kind == "baseline" and self.problem.conditions is not None and not bool(self._moving.any())
+        again = query.kind == "baseline" and self.problem.conditions is not None and not self._moves
         number = query.number % AGAIN if again else query.number
         drawn = self._drawn(replace(query, number=number), self.problem.draws)
         wholes = [torch.cat([query.u, numbers]) for numbers in drawn]
@@ -275,11 +273,22 @@ class SurfaceLight(Predictor):
     def _inputs(self, whole: Tensor) -> dict[str, Tensor]:
         """What a configuration of the whole space sets in the scene; without the base colour, where the searched
         controls set nothing else."""
-        space, searched = self.problem.space, self.problem.domain.dim
-        if not bool(self._moving.any()):
-            space, whole = replace(space, controls=space.controls[self.problem.searched or 0 :]), whole[searched:]
+        space, first = self._asked
         with torch.no_grad():
-            return self.problem.renderer.scene.assembly(space.inputs(whole))
+            return self.problem.renderer.scene.assembly(space.inputs(whole[first:]))
+
+    @cached_property
+    def _asked(self) -> tuple[Space, int]:
+        """The controls that are asked for inputs, and the first of their numbers."""
+        problem = self.problem
+        if self._moves:
+            return problem.space, 0
+        return replace(problem.space, controls=problem.space.controls[problem.searched or 0 :]), problem.domain.dim
+
+    @cached_property
+    def _moves(self) -> bool:
+        """Whether any number of u moves something."""
+        return bool(self._moving.any())
 
     def _pictures(self, wholes: Sequence[Tensor], u: Tensor, key: tuple[int, int] | None = None) -> Tensor:
         """Return pictures (n, H, W, 3) of u under conditions, with a graph. What the cameras of a key see is kept."""

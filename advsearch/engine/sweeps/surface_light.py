@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.surface_light import MOST_RAYS, levels_off, over_all
+from advsearch.engine.surface_light import levels_off, over_all
 from advsearch.engine.sweeps.predicting import PAYS, Groups, SweptPredictor
 from advsearch.engine.transport import BOUND, Deviation
 from advsearch.files import scaled
@@ -123,12 +123,10 @@ class SweptSurfaceLight(SweptPredictor):
 
     def _predicted(self, made: LitGroup, us: Sequence[Tensor]) -> list[Tensor]:
         of, found = made.renderer, list[Tensor]()
-        height, width = of.formation.resolution
-        together = max(1, MOST_RAYS // (height * width * RAYS))
         with torch.no_grad():
             inputs = [of.scene.assembly(of.space.inputs(u)) for u in us]
-            for begin in range(0, len(us), together):
-                some = slice(begin, begin + together)
+            for begin in range(0, len(us), of.at_once):
+                some = slice(begin, begin + of.at_once)
                 found += of.shown(of.looks(inputs[some], made.light), inputs[some], of.there, us[some])
         return found
 

@@ -11,11 +11,14 @@ import torch
 from torch import Tensor
 
 from advsearch.files import scaled
+from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light
 from advsearch.scene.surface.view import SurfaceView
 from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
 
+MOST_RAYS = 1 << 21
+"""Rays of cameras of one launch."""
 TEXELS = 333
 """Of an environment's map, by which it is known again."""
 
@@ -92,6 +95,12 @@ class SurfaceRenderer(PredictingRenderer):
         with torch.no_grad():
             self.there = self.color(self.scene.assembly(self.space.inputs(u)))
         self.lights.clear()
+
+    @property
+    def at_once(self) -> int:
+        """Cameras of one launch, at most."""
+        height, width = self.formation.resolution
+        return max(1, MOST_RAYS // (height * width * RAYS))
 
     @property
     def entries(self) -> int:
