@@ -20,29 +20,23 @@ from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, next_count
 from advsearch.scene.leaving_out import EVERYTHING
-from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, loaded, scene_dict
-from advsearch.scene.mitsuba_backend.first_hit import first_hits
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
 from advsearch.scene.mitsuba_backend.parts import (
+    GROUND_INPUT,
     IDLE_LOBES,
     SceneInput,
     as_torch,
+    camera_inputs,
     key_of,
     leave_dark_lamps_out,
+    loaded,
     mesh_translation,
     plain_number,
+    scene_dict,
     translation,
 )
-from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import (
-    Plugin,
-    media_in,
-    mitsuba,
-    mitsuba_and_drjit,
-    one_at_a_time,
-    population,
-    recorded,
-)
+from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
+from advsearch.scene.mitsuba_backend.variant import Plugin, dr, media_in, mi, one_at_a_time, population, recorded
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -95,7 +89,8 @@ class MitsubaScene:
         integrator: str = "prb",
     ) -> None:
         with one_at_a_time:
-            mi = mitsuba()
+            import advsearch.scene.mitsuba_backend.own_plugins  # noqa: F401  (registers them; it needs the variant)
+
             if population.unused:  # first: kernels are compiled for the numbers of their objects, which it sets free
                 population.bury()
             self.made = (description, filter)
@@ -116,8 +111,6 @@ class MitsubaScene:
                 )
             self._guides: Plugin = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
             if description.cut_out:
-                import advsearch.scene.mitsuba_backend.guides  # noqa: F401  (registers the integrator)
-
                 self._guides = {"type": "advsearch_guides"}
             self.volumetric = any(part.volumetric for part in description.parts)
             plugins = scene_dict(description, resolution, filter, sampler)
@@ -201,9 +194,6 @@ class MitsubaScene:
             surfaces; of "guides" (H, W, 6), the first hit's albedo in [0, 1] and its shading normal.
         """
         with one_at_a_time:
-            # not before `mitsuba()`, which sees to libLLVM
-            import drjit as dr
-            import mitsuba as mi
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
                 image = integrator.render(scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=False)
@@ -287,10 +277,6 @@ class MitsubaScene:
             For each of `wrt` a float32 tensor of the input's shape.
         """
         with one_at_a_time:
-            # not before `mitsuba()`, which sees to libLLVM
-            import drjit as dr
-            import mitsuba as mi
-
             wanted = tuple(inputs if wrt is None else wrt)
             beside = set() if "gradients" in self._leave_out else set(self.interior)
             plain = method == "path" and self._pinhole and not self.volumetric
@@ -373,8 +359,6 @@ class MitsubaScene:
             spp: samples a pixel.
         """
         with one_at_a_time:
-            mi, dr = mitsuba_and_drjit()
-
             self._set(inputs)
             key, spp = self.declared[name][0], next_count(self.sampler, spp)
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
@@ -398,10 +382,6 @@ class MitsubaScene:
         Vertices are written into the memory where they are: recordings hold on to it. Numbers that Mitsuba takes for
         constants are part of a recording, so that every change makes all recordings stale.
         """
-        mi = mitsuba()  # somebody else may have taken another variant since
-        # not before `mitsuba()`, which sees to libLLVM
-        import drjit as dr
-
         unknown = [name for name in inputs if name not in self.declared]
         if any(name.endswith(".base_color") for name in unknown):
             raise InputError(
@@ -446,7 +426,6 @@ class MitsubaScene:
         """Return the integrator of one method for the paths that are rendered now, made on first use."""
         key = method, self._depth
         if key not in self._integrators:
-            mi = mitsuba()
             path = {"type": "prb", "max_depth": self._depth, "rr_depth": NO_ROULETTE, **self._path}
             recipes: dict[str, Plugin] = {
                 "path": path,

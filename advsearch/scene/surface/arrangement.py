@@ -24,9 +24,8 @@ from torch.nn import functional
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
-from advsearch.scene.mitsuba_backend.lobes import Lobes, measured
 from advsearch.scene.mitsuba_backend.surface import Lit, Seen, Views, lit_arrays
-from advsearch.scene.mitsuba_backend.texel_rays import Ints, gather, seen_from_behind, to_map, towards
+from advsearch.scene.mitsuba_backend.texel_rays import Ints, Lobes, gather, measured, seen_from_behind, to_map, towards
 from advsearch.scene.photograph import irradiance as unshadowed
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.light import (

@@ -22,12 +22,10 @@ from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
 from advsearch.scene.importing.surfaces import BRIGHTEST, ImportedSurface
 from advsearch.scene.importing.texture import textured
-from advsearch.scene.mitsuba_backend.files.haze import haze_in
-from advsearch.scene.mitsuba_backend.files.shapes import MESHES, ShapeMesh, mesh_of
+from advsearch.scene.mitsuba_backend.files.shapes import MESHES, ShapeMesh, haze_in, mesh_of
 from advsearch.scene.mitsuba_backend.files.surfaces import ShapeSurface, constant, surface_of
-from advsearch.scene.mitsuba_backend.files.trusted import trusted
-from advsearch.scene.mitsuba_backend.files.xml import read_scene
-from advsearch.scene.mitsuba_backend.plugins import plain
+from advsearch.scene.mitsuba_backend.files.xml import read_scene, trusted
+from advsearch.scene.mitsuba_backend.meshes import plain
 from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, plugins_in
 
 Doubles = npt.NDArray[np.float64]
@@ -172,7 +172,6 @@ def _pixels(value: Mapping[str, object]) -> Floats | None:
         picture = picture[:, :, None] if picture.ndim == 2 else picture
         picture = picture[:, :, :1] if picture.shape[2] == 2 else picture[:, :, :3]
         return np.broadcast_to(picture, (*picture.shape[:2], 3)).astype(np.float32)
-    mi = mitsuba()
     if picture is None and "filename" not in value:
         return None
     try:

@@ -40,7 +40,6 @@ from advsearch.scene.mitsuba_backend.material_form.view import (
     Camera,
     FilmView,
     as_array,
-    both_backends,
     gradient_of,
     is_rough,
     moving_mesh,
@@ -50,7 +49,7 @@ from advsearch.scene.mitsuba_backend.material_form.view import (
     still_meshes,
     stream_of,
 )
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 
 @dataclass(frozen=True)
@@ -147,14 +146,13 @@ def material_adjoint(
     Returns:
         The gradients by the vertices and by the normals, (V, 3) float32 each; two lists if `mesh_key` is one.
     """
-    _, dr = both_backends()
     single = isinstance(mesh_key, str)
     keys: list[str] = [mesh_key] if isinstance(mesh_key, str) else list(mesh_key)
     places, bent = ([vertices], [normals]) if single else (vertices, normals)
     meshes = [moving_mesh(scene, parameters, *one) for one in zip(keys, places, bent, strict=True)]
     still = still_meshes(scene, parameters, keys)
     view = FilmView(scene, read_camera(sensor), meshes, still, as_array(padded(cotangent)), max_depth)
-    total = mitsuba().Float(0)
+    total = mi.Float(0)
     if spp > 0:
         total += _interior(view, seed, spp, ROUGH_TILE if is_rough(cotangent) else 1)
     for number, mesh in enumerate([*meshes, *still]):
@@ -171,7 +169,6 @@ def material_adjoint(
 
 def _interior(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     """A number whose gradient is the interior term's."""
-    mi, dr = both_backends()
     with dr.suspend_grad():
         film, hit, sampler = _first_hits(view, seed, spp, tile)
         if dr.width(film) == 0:
@@ -194,7 +191,6 @@ def _first_hits(view: FilmView, seed: int, spp: int, tile: int) -> tuple[Any, An
 
     The film is cut into cells between pixel centres, `spp` samples in each, stratified.
     """
-    mi, dr = both_backends()
     columns, rows = view.camera.width + 1, view.camera.height + 1
     lane = dr.arange(mi.UInt32, columns * rows * spp)
     cell, sample = lane // spp, lane % spp
@@ -217,7 +213,6 @@ def _first_hits(view: FilmView, seed: int, spp: int, tile: int) -> tuple[Any, An
 
 def _contributions(view: FilmView, film: Any, si: Any, sampler: Any, place: Any, facet: Any, bent: Any) -> Any:
     """Sum of W L J / J over all samples, attached to the given places and normals."""
-    mi, dr = both_backends()
     camera = view.camera
     spread = dr.dot(facet, place - camera.eye) / camera.depth(place) ** 3
     seen = dr.replace_grad(film, camera.project(place))
@@ -228,7 +223,6 @@ def _contributions(view: FilmView, film: Any, si: Any, sampler: Any, place: Any,
 
 def _relative(value: Any) -> Any:
     """1 with the relative gradient of a value; without gradient where the value is all but zero."""
-    _, dr = both_backends()
     fixed = dr.detach(value)
     usable = dr.abs(fixed) > 1e-20
     return dr.replace_grad(dr.full(type(fixed), 1.0), dr.select(usable, value / dr.select(usable, fixed, 1.0), 1.0))
@@ -236,7 +230,6 @@ def _relative(value: Any) -> Any:
 
 def _attached(camera: Camera, si: Any, place: Any, facet: Any, bent: Any) -> Any:
     """Mitsuba's surface interaction, moving with the surface and turning with its normals."""
-    mi, dr = both_backends()
 
     def turned(fixed: Any, normal: Any) -> Any:
         """A normal with the gradient of ours, which may point the other way."""
@@ -254,7 +247,6 @@ def _attached(camera: Camera, si: Any, place: Any, facet: Any, bent: Any) -> Any
 
 def _reflected(view: FilmView, at: Any, si: Any, sampler: Any) -> Any:
     """One sample of the light reflected towards the camera, from directions fixed in the world."""
-    mi, dr = both_backends()
     context, bsdf = mi.BSDFContext(), si.bsdf()
     with dr.suspend_grad():
         active = mi.Bool(view.max_depth > 1)
@@ -277,7 +269,6 @@ def _reflected(view: FilmView, at: Any, si: Any, sampler: Any) -> Any:
 
 def _attached_light(view: FilmView, at: Any, ds: Any, light: Any, lit: Any) -> tuple[Any, Any]:
     """A light sample seen from a moving point. What is infinitely far away does not change."""
-    mi, dr = both_backends()
     near = lit & ~mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
     surface = near & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
     moved = dr.copy(ds)
@@ -290,8 +281,6 @@ def _attached_light(view: FilmView, at: Any, ds: Any, light: Any, lit: Any) -> t
 
 def _arriving(view: FilmView, si: Any, direction: Any, pdf: Any, smooth: Any, sampler: Any, active: Any) -> Any:
     """Radiance from a sampled direction; what shines there itself is weighted against light sampling."""
-    mi = mitsuba()
-
     ray = si.spawn_ray(direction)
     everything = view.radiance(ray, sampler, view.max_depth - 1, active)
     there = view.scene.ray_intersect(ray, active)
@@ -302,6 +291,5 @@ def _arriving(view: FilmView, si: Any, direction: Any, pdf: Any, smooth: Any, sa
 
 def _mis(own: Any, other: Any) -> Any:
     """Power heuristic."""
-    _, dr = both_backends()
     weight = dr.fma(own, own, other * other)
     return dr.select(weight > 0.0, own * own / weight, 0.0)
