@@ -32,7 +32,7 @@ from advsearch.scene.description import (
     describe,
 )
 from advsearch.scene.formation import SAMPLER, ImageFormation
-from advsearch.scene.importing.images import read_picture
+from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.motion import Motion

@@ -14,7 +14,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.importing.files import read_bytes, safe_name
 from advsearch.scene.importing.hdr import Plane, Planes, linear, read_exr, read_radiance
-from advsearch.scene.importing.images import area_average, banded_average
+from advsearch.scene.importing.pictures import area_average, banded_average
 
 Floats = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]

@@ -26,8 +26,8 @@ from advsearch.scene import library
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import objects, unwrap
-from advsearch.scene.importing.images import area_average, display_image
 from advsearch.scene.importing.objects import guess_up, import_object
+from advsearch.scene.importing.pictures import area_average, display_image
 from advsearch.scene.importing.texture import filtered, sampled
 
 DATA = conftest.DATA / "objects"
@@ -1018,7 +1018,7 @@ def test_textures_have_a_limit_in_all(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_large_pictures_are_averaged_in_bands_to_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
     image = Image.fromarray(np.random.default_rng(0).integers(0, 256, (1100, 1300, 3), np.uint8))
     whole = display_image(image, 100)
-    monkeypatch.setattr("advsearch.scene.importing.images._BAND", 50_000)
+    monkeypatch.setattr("advsearch.scene.importing.pictures._BAND", 50_000)
     assert np.array_equal(display_image(image, 100), whole)
 
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh
-from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.parts import ImportedPart
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -28,7 +28,7 @@ class _Entry(BaseModel):
 
 
 class _Extensions(BaseModel):
-    """Extensions of an entry; those that are not understood are named by `gltf_notes`."""
+    """Extensions of an entry; those that are not understood are named by `gltf.left_out`."""
 
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False, frozen=True)
 

@@ -22,9 +22,15 @@ from advsearch.scene.importing.mtl import (
     share_of,
     without_comment,
 )
-from advsearch.scene.importing.normal_maps import holds_normals, normal_map
+from advsearch.scene.importing.parts import (
+    NEUTRAL,
+    ImportedSurface,
+    holds_normals,
+    limited_radiance,
+    normal_map,
+    with_opacity,
+)
 from advsearch.scene.importing.pictures import Kind, Pictures
-from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface, limited_radiance, with_opacity
 
 Floats = npt.NDArray[np.float32]
 

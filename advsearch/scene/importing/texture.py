@@ -15,9 +15,8 @@ from scipy.ndimage import distance_transform_edt
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.geometry import Array, Bools, Ints, Soup, connected, unit_vectors
-from advsearch.scene.importing.images import TEXTURE_LIMIT
-from advsearch.scene.importing.normal_maps import FLAT, texels_of
-from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
+from advsearch.scene.importing.parts import FLAT, NEUTRAL, ImportedSurface, texels_of
+from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.importing.unwrap import unwrapped
 from advsearch.scene.raster import doubled_areas, pixels_in
 from advsearch.scene.surface_map import looked_up
@@ -47,7 +46,7 @@ class SurfaceMaps:
     Attributes:
         color: (H, W, 3) float32 display-referred base colour in [0, 1]; (H, W, 4) with the opacity where light passes
             through a part.
-        normals: (H', W', 3) float32 of `advsearch.scene.importing.normal_maps`; None where there is no normal map.
+        normals: (H', W', 3) float32 of `advsearch.scene.importing.parts`; None where there is no normal map.
         emission: (H", W", 3) float32 linear radiance; (1, 1, 3) where it is the same everywhere, None where there is
             none.
     """

@@ -28,11 +28,10 @@ from advsearch.scene.importing.files import (
     shown,
     text_of,
 )
-from advsearch.scene.importing.imported_part import ImportedPart, Looked, split_at_corners
 from advsearch.scene.importing.mtl import without_comment
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
+from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
 from advsearch.scene.importing.polygons import triangulated
-from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

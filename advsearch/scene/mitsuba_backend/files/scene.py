@@ -18,9 +18,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
-from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
-from advsearch.scene.importing.surfaces import BRIGHTEST, ImportedSurface
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.mitsuba_backend.files.shapes import MESHES, ShapeMesh, haze_in, mesh_of
 from advsearch.scene.mitsuba_backend.files.surfaces import ShapeSurface, constant, surface_of

@@ -26,8 +26,8 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
 from advsearch.scene.environments import import_environment, read_light
 from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
-from advsearch.scene.importing.images import TEXTURE_LIMIT, banded_average, read_picture
 from advsearch.scene.importing.objects import read_parts
+from advsearch.scene.importing.pictures import TEXTURE_LIMIT, banded_average, read_picture
 from advsearch.scene.mitsuba_backend.variant import Plugin
 
 SUFFIX = ".xml"
