@@ -41,8 +41,7 @@ from advsearch.scene.description import NO_MAP, OBJECT
 from advsearch.scene.exporting.gltf import PLAIN, glb, posed
 from advsearch.scene.mitsuba_backend.files.writing import NAME, SCATTERINGS, write_scene
 from advsearch.scene.parts import HazePart
-from advsearch.scene.raster import doubled_areas
-from advsearch.scene.surface_map import Ints, rasterised
+from advsearch.scene.raster import Ints, doubled_areas, rasterised
 
 GLB, XML = ".glb", ".xml"
 

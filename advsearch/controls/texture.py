@@ -38,7 +38,7 @@ from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.surface_map import Mask, texel_area, texels_of_faces
+from advsearch.scene.raster import Mask, texel_area, texels_of_faces
 
 RESOLUTIONS = (256, 512)
 """Smallest and largest side that is taken from the object's own texture when none is asked for."""

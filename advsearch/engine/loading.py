@@ -31,13 +31,12 @@ from advsearch.scene.description import (
     check_one_environment,
     describe,
 )
-from advsearch.scene.formation import SAMPLER, ImageFormation
+from advsearch.scene.formation import EVERYTHING, SAMPLER, ImageFormation
+from advsearch.scene.grounds import on_its_ground
 from advsearch.scene.importing.pictures import read_picture
-from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.motion import Motion
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.road import on_its_ground
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 

@@ -23,11 +23,10 @@ from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.cameras.files import read_camera
 from advsearch.scene.cameras.model import CameraModel, bundled
+from advsearch.scene.grounds import Photograph, on_its_ground, photograph_of
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
-from advsearch.scene.photograph import Photograph, photograph_of
-from advsearch.scene.road import on_its_ground
 
 Doubles = npt.NDArray[np.float64]
 

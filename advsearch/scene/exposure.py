@@ -24,12 +24,11 @@ from advsearch.scene.assets import EnvironmentAsset, Floats
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import pixels_in
-from advsearch.scene.road import paved
+from advsearch.scene.raster import looked_up, pixels_in
 from advsearch.scene.settings import resolve
 from advsearch.scene.silhouettes import NEAREST, Frame
-from advsearch.scene.surface_map import looked_up
 
 Doubles = npt.NDArray[np.float64]
 

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from advsearch.scene.assets import Mesh
 from advsearch.scene.importing.geometry import Soup
 from advsearch.scene.importing.unwrap import unwrapped
-from advsearch.scene.raster import doubled_areas, pixels_in, weights_at
-from advsearch.scene.surface_map import rasterised
+from advsearch.scene.raster import doubled_areas, pixels_in, rasterised, weights_at
 
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

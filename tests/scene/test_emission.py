@@ -24,8 +24,8 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription, describe
 from advsearch.scene.exporting.gltf import glb, posed
 from advsearch.scene.exposure import irradiance
+from advsearch.scene.formation import EVERYTHING
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.files.writing import write_scene
 from advsearch.scene.mitsuba_backend.meshes import sampling_weights
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene

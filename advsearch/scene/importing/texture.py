@@ -18,8 +18,7 @@ from advsearch.scene.importing.geometry import Array, Bools, Ints, Soup, connect
 from advsearch.scene.importing.parts import FLAT, NEUTRAL, ImportedSurface, texels_of
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.importing.unwrap import unwrapped
-from advsearch.scene.raster import doubled_areas, pixels_in
-from advsearch.scene.surface_map import looked_up
+from advsearch.scene.raster import doubled_areas, looked_up, pixels_in
 
 Floats = npt.NDArray[np.float32]
 

@@ -20,6 +20,7 @@ from advsearch.scene.cameras.model import NUMBERS
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.grounds import paved
 from advsearch.scene.mitsuba_backend.meshes import (
     NORMALS,
     POSITIONS,
@@ -44,7 +45,6 @@ from advsearch.scene.parts import (
     ScenePart,
     SpotLamp,
 )
-from advsearch.scene.road import paved
 
 Write = Callable[[Any], Any]
 """From a Dr.Jit `TensorXf` (perhaps with gradients enabled) to the type that the Mitsuba parameter takes."""
@@ -300,7 +300,7 @@ def leave_dark_lamps_out(plugins: Plugin, parts: Sequence[ScenePart]) -> None:
 
 GROUND = "ground"
 GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True)
-"""(h, w, 3): the texture of a ground that shows the environment's photograph (`advsearch.scene.photograph`)."""
+"""(h, w, 3): the texture of a ground that shows the environment's photograph (`advsearch.scene.grounds`)."""
 
 
 def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:

@@ -18,8 +18,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import SAMPLER, next_count
-from advsearch.scene.leaving_out import EVERYTHING
+from advsearch.scene.formation import EVERYTHING, SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
 from advsearch.scene.mitsuba_backend.parts import (
     GROUND_INPUT,
@@ -71,7 +70,7 @@ class MitsubaScene:
         description: what to build.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
-        leave_out: names from `advsearch.scene.leaving_out.ITEMS`; less than everything only to measure what it brings.
+        leave_out: names from `advsearch.scene.formation.ITEMS`; less than everything only to measure what it brings.
         max_depth: longest light path in segments.
         sampler: Mitsuba's name of the sampler; some round sample counts up, see `scene.samplers`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
