@@ -183,9 +183,8 @@ class SurfaceLight(Predictor):
         """Which numbers of the whole space belong to controls that change some inputs of the scene."""
         space = self.problem.space
         found = torch.zeros(len(space.start), dtype=torch.bool)
-        names = {
-            one.name for one in space.controls if inputs & surface_renderer.varied(self.problem.renderer, [one.name])
-        }
+        renderer = self.problem.renderer
+        names = {one.name for one in space.controls if inputs & surface_renderer.varied(renderer, [one.name])}
         for group in space.groups:
             found[group.coordinates] = group.control in names
         return found

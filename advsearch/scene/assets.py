@@ -14,6 +14,9 @@ import numpy.typing as npt
 from advsearch.errors import InputError
 
 Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
 
 SLACK = 1e-3
 """How far texture coordinates of a texture that does not repeat may lie beyond its edges."""
@@ -39,7 +42,7 @@ class Mesh:
     normals: Floats
     uvs: Floats
     attributes: Mapping[str, Floats] = field(default_factory=dict)
-    materials: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
+    materials: Mapping[str, Ints] = field(default_factory=dict)
 
     @property
     def repeats(self) -> bool:
@@ -192,8 +195,6 @@ GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)
 TEXTURE_CELLS = 32
 """Cells of the texture along each side: vertices of one place that lie in different ones stay apart, as at seams."""
 
-Numbers = npt.NDArray[np.int64]
-
 
 @dataclass(frozen=True, eq=False)
 class Simpler:
@@ -206,9 +207,9 @@ class Simpler:
         faces: (G, 3) indices of those left.
     """
 
-    kept: Numbers
-    place: Numbers
-    places: Numbers
+    kept: Ints
+    place: Ints
+    places: Ints
     faces: npt.NDArray[np.uint32]
 
     def of(self, mesh: Mesh) -> Mesh:
@@ -247,7 +248,7 @@ def simpler(mesh: Mesh, most: int) -> Simpler | None:
     return Simpler(kept, places[kept], places, np.unique(faces, axis=0).astype(np.uint32))
 
 
-def _key(rows: Numbers) -> Numbers:
+def _key(rows: Ints) -> Ints:
     """Return one number for each row of whole numbers, the same for equal rows only."""
     low = rows.min(axis=0)
     sizes = rows.max(axis=0) - low + 1

@@ -10,18 +10,14 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.assets import Bools, EnvironmentAsset, Floats
 from advsearch.scene.importing.files import read_bytes, safe_name
 from advsearch.scene.importing.hdr import Plane, Planes, linear, read_exr, read_radiance
 from advsearch.scene.importing.pictures import area_average, banded_average
-
-Floats = npt.NDArray[np.float32]
-Bools = npt.NDArray[np.bool_]
 
 SUFFIXES = (".hdr", ".exr")
 """The pictures that can be imported."""

@@ -20,15 +20,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from advsearch.scene.assets import Doubles
 from advsearch.scene.description import FRAME_FILL, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import POSE, SETTINGS
-
-Doubles = npt.NDArray[np.float64]
 
 CLEARANCE = 0.02
 """Smallest distance, in object sizes, to the sphere around the object."""

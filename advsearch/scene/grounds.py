@@ -8,19 +8,17 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from advsearch.scene import settings
-from advsearch.scene.assets import EnvironmentAsset, Floats, Material, Mesh
+from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-Doubles = npt.NDArray[np.float64]
 
 SECTORS = 128
 RINGS = 64

@@ -14,11 +14,10 @@ from importlib import resources
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.errors import FileFormatError, UnknownNameError
 from advsearch.files import MESHES, either
-from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
+from advsearch.scene.assets import EnvironmentAsset, Floats, Ints, Material, Mesh, ObjectAsset
 from advsearch.scene.parts import BASE_COLOR
 from advsearch.scene.raster import rasterised
 
@@ -53,7 +52,6 @@ def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> di
 if TYPE_CHECKING:
     from importlib.abc import Traversable
 
-Floats = npt.NDArray[np.float32]
 BUNDLED_ENVIRONMENT = "bundled environment"
 """Source of an environment that is bundled."""
 _PLY = (
@@ -161,7 +159,7 @@ def _mesh(content: bytes) -> Mesh:
     )
 
 
-def _materials(runs: Iterable[tuple[str, int]]) -> dict[str, npt.NDArray[np.int64]]:
+def _materials(runs: Iterable[tuple[str, int]]) -> dict[str, Ints]:
     """Return the faces of each material, from how many faces in a row have which."""
     names = np.repeat([name for name, _ in runs], [count for _, count in runs])
     return {str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)}

@@ -19,10 +19,7 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Floats, Mesh
-
-Doubles = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from advsearch.scene.assets import Bools, Doubles, Floats, Ints, Mesh
 
 TOLERANCE = 1e-6
 """Barycentric weight by which a pixel's centre may miss a triangle, so that shared edges leave no gaps."""
@@ -65,7 +62,7 @@ def pixels_near(corners: Doubles, shape: tuple[int, int], miss: float = MISS) ->
     return face[span], row[span], column
 
 
-def texels_read(corners: Doubles, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+def texels_read(corners: Doubles, shape: tuple[int, int]) -> Bools:
     """Return the texels (h, w) that bilinear lookups anywhere in some triangles read; lookups repeat at the border.
 
     Args:
@@ -131,8 +128,6 @@ def _crossing(corners: Doubles, row: Ints, miss: float) -> tuple[Doubles, Double
     return np.where(empty, 0.0, left), np.where(empty, -1.0, right)
 
 
-Mask = npt.NDArray[np.bool_]
-
 BORDER = 2.0
 """Texels around a chart that still belong to it: a bilinear lookup inside a chart reaches one texel beyond it."""
 
@@ -152,11 +147,11 @@ class Charts:
     mesh: Mesh
     face: Ints
     weights: Doubles
-    covered: Mask
+    covered: Bools
     distance: Doubles
 
     @property
-    def touched(self) -> Mask:
+    def touched(self) -> Bools:
         """(h, w): a lookup on the surface can touch the texel; it is in a chart or `BORDER` texels around one."""
         return np.asarray(self.distance <= BORDER)
 
@@ -182,7 +177,7 @@ class Charts:
         return np.where(self.covered, share[self.face], 0.0).astype(np.float32)
 
 
-def texel_positions(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Mask]:
+def texel_positions(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Bools]:
     """Return where each texel of a square texture lies on a mesh, and the surface's normal there.
 
     Args:
@@ -201,7 +196,7 @@ def texel_positions(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Mask]:
     return charts.positions(), charts.normals(), charts.touched
 
 
-def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Mask, float]:
+def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Bools, float]:
     """Return the texels (h, w) that bilinear lookups on some faces read and lookups on all others do not, and their
     share of those that lookups on these faces read.
 
@@ -312,7 +307,7 @@ class MeshSurface:
         face, corner = np.unravel_index(aside.argmin(), aside.shape)
         return int(face), self._corners[face, corner]
 
-    def region(self, face: int, point: Doubles, normal: Doubles, radius: float) -> Mask:
+    def region(self, face: int, point: Doubles, normal: Doubles, radius: float) -> Bools:
         """Return which faces (F,) lie within a radius of a point, face a direction, and are reached from one face.
 
         Reached means: over edges between such faces. The other wall of a cup, or the next slat of a chair, are not.

@@ -102,26 +102,8 @@ _pose, _camera = partial(moving, GEOMETRIC), partial(moving, ORBIT)
 
 POSE = (
     _pose("yaw", "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", (0.0, 360.0), periodic=True),
-    _pose(
-        "pitch",
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        "Rotation about the object's y axis.",
-        (-15.0, 15.0),
-        periodic=True,
-    ),
-    _pose(
-        "roll",
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        "Rotation about the object's x axis.",
-        (-15.0, 15.0),
-        periodic=True,
-    ),
+    _pose("pitch", "degrees", -360.0, 360.0, 0.0, "Rotation about the object's y axis.", (-15.0, 15.0), periodic=True),
+    _pose("roll", "degrees", -360.0, 360.0, 0.0, "Rotation about the object's x axis.", (-15.0, 15.0), periodic=True),
     _pose("x", "object sizes", -1e4, 1e4, 0.0, "Shift of the object along x.", (-0.15, 0.15)),
     _pose("y", "object sizes", -1e4, 1e4, 0.0, "Shift of the object along y.", (-0.15, 0.15)),
     _pose("z", "object sizes", -1e4, 1e4, 0.0, "Height of the lowest point above the ground."),
@@ -199,13 +181,7 @@ GROUND = (
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
     *colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
     Parameter(
-        "height",
-        (),
-        "object sizes",
-        0.1,
-        1000.0,
-        3.0,
-        "Height above the floor from which the photograph was taken.",
+        "height", (), "object sizes", 0.1, 1000.0, 3.0, "Height above the floor from which the photograph was taken."
     ),
 )
 MATERIAL = (

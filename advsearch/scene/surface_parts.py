@@ -9,15 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Doubles, Ints, Mesh
 from advsearch.scene.importing.geometry import Soup
 from advsearch.scene.importing.unwrap import unwrapped
 from advsearch.scene.raster import doubled_areas, pixels_in, rasterised, weights_at
-
-Doubles = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 CELLS = 64
 """Cells along each side of the map."""

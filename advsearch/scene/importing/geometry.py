@@ -10,17 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Bools, Doubles, Ints, Mesh
 from advsearch.scene.importing.parts import ImportedPart
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 WELD = 1e-6
 """Points closer than this share of the largest extent are one point; text and 32-bit files round to about that."""
@@ -49,12 +44,12 @@ class Soup:
         flat: (F,) the faces that are flat where they have no normals; None where none are.
     """
 
-    points: Array
+    points: Doubles
     faces: Ints
     part: Ints
-    normals: Array
-    uvs: Array
-    colors: Array
+    normals: Doubles
+    uvs: Doubles
+    colors: Doubles
     flat: Bools | None = None
 
     def only(self, keep: Bools) -> Soup:
@@ -76,7 +71,7 @@ class Soup:
             colors=self.colors[rows, order],
         )
 
-    def face_vectors(self) -> Array:
+    def face_vectors(self) -> Doubles:
         """Return (F, 3) vectors along the face normals, as long as twice the faces' areas."""
         a, b, c = (self.points[self.faces[:, k]] for k in range(3))
         return np.cross(b - a, c - a)
@@ -197,7 +192,7 @@ def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
     return left, right, start[left] == start[right]
 
 
-def _agreement(area: Array, left: Ints, right: Ints, same_way: Bools) -> tuple[Bools, Ints, bool]:
+def _agreement(area: Doubles, left: Ints, right: Ints, same_way: Bools) -> tuple[Bools, Ints, bool]:
     """Decide which faces to turn over so that neighbours agree, keeping the way of most of each shell's area.
 
     Every face stands for two nodes of a graph, "as it is" and "turned"; neighbours that agree are linked like to like,
@@ -248,7 +243,7 @@ def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
     return np.where(closed, negative ^ mostly, agreement < 0.0)
 
 
-def _per_shell(values: Array, shell: Ints) -> Array:
+def _per_shell(values: Doubles, shell: Ints) -> Doubles:
     """Sum (F, 3) values over the faces of each shell."""
     return np.stack([np.bincount(shell, weights=values[:, k]) for k in range(3)], axis=1)
 
@@ -280,7 +275,7 @@ def _shaded(soup: Soup) -> tuple[Soup, list[str]]:
     return replace(soup, normals=normals), notes
 
 
-def smooth_normals(soup: Soup) -> Array:
+def smooth_normals(soup: Soup) -> Doubles:
     """Compute corner normals, smooth except across creases.
 
     At each point, the faces that can be reached from one another over edges with less than the crease angle share one
@@ -298,9 +293,9 @@ def smooth_normals(soup: Soup) -> Array:
     group = connected(soup.faces.size, a, b)
     corners = soup.points[soup.faces]
     ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-    angles: Array = np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2))
+    angles: Doubles = np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2))
     weighted = unit[:, None] * angles[:, :, None]
-    sums: Array = np.stack([np.bincount(group, weighted[:, :, k].ravel()) for k in range(3)], axis=1)
+    sums: Doubles = np.stack([np.bincount(group, weighted[:, :, k].ravel()) for k in range(3)], axis=1)
     smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
     sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0  # NaN, where normals cancel, is not
     return np.where(sound, smooth, unit[:, None])
@@ -309,7 +304,7 @@ def smooth_normals(soup: Soup) -> Array:
 # --- small pieces ----------------------------------------
 
 
-def _welded(points: Array) -> tuple[Array, Ints]:
+def _welded(points: Doubles) -> tuple[Doubles, Ints]:
     """Merge points closer than `WELD`; return the merged points, and for each old point its new index."""
     unique, index = np.unique(points + 0.0, axis=0, return_inverse=True)
     pairs = cKDTree(unique).query_pairs(WELD, output_type="ndarray")
@@ -320,12 +315,12 @@ def _welded(points: Array) -> tuple[Array, Ints]:
     return unique[first], merged[index.reshape(-1)].astype(np.int64)
 
 
-def _corners(values: Array | None, faces: Ints, width: int) -> Array:
+def _corners(values: Doubles | None, faces: Ints, width: int) -> Doubles:
     """Spread per-vertex values to the corners of faces; NaN where there are none."""
     return np.full((len(faces), 3, width), np.nan) if values is None else values[faces]
 
 
-def unit_vectors(vectors: Array) -> Array:
+def unit_vectors(vectors: Doubles) -> Doubles:
     """Scale vectors, along the last axis, to unit length; NaN where they have no direction."""
     with np.errstate(all="ignore"):
         largest = np.abs(vectors).max(axis=-1, keepdims=True)

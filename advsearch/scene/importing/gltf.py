@@ -22,6 +22,7 @@ from pydantic import BaseModel, ValidationError
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
+from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.importing.files import (
     Inventory,
     References,
@@ -241,8 +242,6 @@ def _check_tree(path: Path, header: Header) -> None:
         raise damaged(path, "nodes that form trees", "a cycle")
 
 
-Array = npt.NDArray[np.float64]
-
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 
 
@@ -343,10 +342,10 @@ class Buffers:
         found: npt.NDArray[Any] = np.ndarray(shape, kind, data, offset, (step, kind.itemsize))
         return found
 
-    def numbers(self, index: int, rows: npt.NDArray[np.int64]) -> Array:
+    def numbers(self, index: int, rows: Ints) -> Doubles:
         """Return rows (N,) of an accessor as (N, width), normalised integers as the numbers that they stand for."""
         values = self.values(index)[rows]
-        numbers: Array = values.astype(np.float64)
+        numbers: Doubles = values.astype(np.float64)
         if not self._header.accessors[index].normalized or values.dtype.kind == "f":
             return numbers
         return np.asarray(numbers / np.iinfo(values.dtype).max).clip(-1.0)

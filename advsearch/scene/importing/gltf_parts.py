@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS
+from advsearch.scene.assets import Doubles, Floats, Ints
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import References, check_faces, damaged, shown
 from advsearch.scene.importing.gltf import Buffers, binary_chunk, counted, left_out, read_header
@@ -42,9 +42,7 @@ from advsearch.scene.importing.parts import (
 )
 from advsearch.scene.importing.pictures import Kind, Pictures
 
-Array = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.float32]
-Fit = Callable[[Array], Array]
+Fit = Callable[[Doubles], Doubles]
 """Takes texture coordinates (V, 2) of the format to those of the pictures that were made."""
 
 BEYOND = 1e-4
@@ -78,7 +76,7 @@ class GltfSurfaces:
     def __post_init__(self) -> None:
         self._pictures = Pictures(len(self.header.materials), self.references.get, self.references.refused)
 
-    def surface(self, number: int | None, uvs: Sequence[Array]) -> tuple[ImportedSurface, Fit]:
+    def surface(self, number: int | None, uvs: Sequence[Doubles]) -> tuple[ImportedSurface, Fit]:
         """Return the surface of a material, and how texture coordinates fit its pictures.
 
         Args:
@@ -188,7 +186,7 @@ class GltfSurfaces:
     # --- beyond the edges ----------------------------------------
 
     def _fitted(
-        self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Array]
+        self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Doubles]
     ) -> tuple[ImportedSurface, Fit]:
         """Give the pictures of a surface what lies beyond their edges, where they do not repeat there."""
         places = np.concatenate([*uvs, np.zeros((0, 2))])
@@ -247,8 +245,6 @@ def _differ_at_edges(pictures: Sequence[Floats], side: int) -> bool:
         for one in pictures
     )
 
-
-Ints = npt.NDArray[np.int64]
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 """Modes of primitives; those below are points and lines."""
@@ -361,7 +357,7 @@ def _triangles(order: Ints, mode: int) -> Ints:
     return np.asarray(faces[~joints], np.int64)
 
 
-def _moved(uvs: Array, use: TextureUse | None) -> Array:
+def _moved(uvs: Doubles, use: TextureUse | None) -> Doubles:
     """Return texture coordinates (V, 2) as the transform of a texture moves them."""
     if use is None:
         return uvs
@@ -371,12 +367,12 @@ def _moved(uvs: Array, use: TextureUse | None) -> Array:
     return np.stack([cosine * u + sine * v, cosine * v - sine * u], axis=1) + given.offset
 
 
-def _upwards(uvs: Array) -> Array:
+def _upwards(uvs: Doubles) -> Doubles:
     """Return texture coordinates with v = 0 at the bottom."""
     return uvs * [1.0, -1.0] + [0.0, 1.0]
 
 
-def poses(header: Header) -> Iterator[tuple[int, Array]]:
+def poses(header: Header) -> Iterator[tuple[int, Doubles]]:
     """Yield the nodes of the file's scene with their poses (4, 4) in it."""
     children = {child for node in header.nodes for child in node.children}
     roots = [index for index in range(len(header.nodes)) if index not in children]
@@ -390,7 +386,7 @@ def poses(header: Header) -> Iterator[tuple[int, Array]]:
         level.extend((child, pose) for child in header.nodes[index].children)
 
 
-def _matrix(node: Node) -> Array:
+def _matrix(node: Node) -> Doubles:
     """The transform (4, 4) of one node."""
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)

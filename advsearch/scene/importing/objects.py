@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import MESHES
 from advsearch.pictures import without_pillows_limit
-from advsearch.scene.assets import Material, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.blender import read_mesh_bytes
@@ -35,7 +35,6 @@ from advsearch.scene.importing.ply import read_ply
 from advsearch.scene.importing.texture import by_material, textured
 from advsearch.scene.importing.wavefront import read_obj
 
-Array = npt.NDArray[np.float64]
 Attributes = npt.NDArray[np.uint16]
 
 _FACET = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -81,7 +80,7 @@ def read_stl(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     return [part], [f"{path.name}: {clause}" for clause in inventory.left()]
 
 
-def _of_text(path: Path, data: bytes, inventory: Inventory) -> Array:
+def _of_text(path: Path, data: bytes, inventory: Inventory) -> Doubles:
     """Return the corners (3 F, 3) of the facets of an ASCII file."""
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
         raise damaged(path, "an ASCII STL file that ends in 'endsolid'", "one that is cut short")
@@ -100,7 +99,7 @@ def _of_text(path: Path, data: bytes, inventory: Inventory) -> Array:
     return points.reshape(-1, 3)
 
 
-def _colors(head: bytes, attributes: Attributes, inventory: Inventory) -> Array | None:
+def _colors(head: bytes, attributes: Attributes, inventory: Inventory) -> Doubles | None:
     """Return the linear colours (F, 3) of facets, or None.
 
     Two programs have their own ways, with 5 bits a channel. Magics writes ``COLOR=`` and four bytes, the colour of all,
@@ -154,8 +153,6 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         warnings.simplefilter("ignore")
         return READERS[path.suffix.lower()](path, data)
 
-
-Floats = npt.NDArray[np.float32]
 
 MOST_WARNINGS = 20
 """Warnings about one file."""
@@ -313,7 +310,7 @@ CLEAR = 1.1
 """The shares of two axes differ by more than this factor, or the shape does not tell which one is up."""
 
 
-def guess_up(points: Array, name: str) -> UpAxis:
+def guess_up(points: Doubles, name: str) -> UpAxis:
     """Return the axis that points up, y or z, by the shape alone; z where that does not tell.
 
     What stands on a table touches it with a large part of what it covers, seen from above: the foot of a vase, the four
@@ -334,7 +331,7 @@ def guess_up(points: Array, name: str) -> UpAxis:
     return UpAxis(axis, f"{name}: {axis} is taken for up, because {why}; if it lies on its side, give `up={other}`")
 
 
-def touching_share(points: Array) -> float:
+def touching_share(points: Doubles) -> float:
     """Return which share, in [0, 1], of what an object covers from above (along its third axis) touches the ground.
 
     Both are areas of convex hulls.
@@ -345,7 +342,7 @@ def touching_share(points: Array) -> float:
     return _hull_area(points[touching, :2]) / covered if covered > 0.0 else 0.0
 
 
-def _hull_area(points: Array) -> float:
+def _hull_area(points: Doubles) -> float:
     """Area of the convex hull of (N, 2) points; 0 where they lie on a line."""
     if len(points) < 3:
         return 0.0

@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
+from advsearch.scene.assets import Doubles, Floats, Ints
 from advsearch.scene.color import srgb_to_linear
-
-Floats = npt.NDArray[np.float32]
 
 FLAT = np.array([0.5, 0.5, 1.0], np.float32)
 """The texel of a normal map that changes nothing."""
@@ -108,9 +107,7 @@ class ImportedSurface:
         return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
 
 
-def limited_radiance(
-    factor: npt.NDArray[np.float64], picture: Floats | None = None
-) -> tuple[Floats | None, str | None]:
+def limited_radiance(factor: Doubles, picture: Floats | None = None) -> tuple[Floats | None, str | None]:
     """Return a factor (3,) times the linear values of a picture (H, W, 3), as in `ImportedSurface`, and a warning where
     that is cut to `BRIGHTEST`."""
     cut = f"emission brighter than {BRIGHTEST:g} is cut to that" if factor.max() > BRIGHTEST else None
@@ -148,9 +145,6 @@ def unit(value: float | None) -> float | None:
     return None if value is None or value != value else min(max(float(value), 0.0), 1.0)
 
 
-Array = npt.NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False)
 class ImportedPart:
     """One piece of a mesh file, with the transform of its place in the file applied.
@@ -167,11 +161,11 @@ class ImportedPart:
         flat: where the file gives no normals, its faces are flat; otherwise smooth normals are made.
     """
 
-    vertices: Array
-    faces: npt.NDArray[np.int64]
-    normals: Array | None
-    uvs: Array | None
-    colors: Array | None
+    vertices: Doubles
+    faces: Ints
+    normals: Doubles | None
+    uvs: Doubles | None
+    colors: Doubles | None
     surface: ImportedSurface
     node: int = -1
     flat: bool = False
@@ -182,7 +176,7 @@ def visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
     return [part for part in parts if not part.surface.clear] or list(parts)
 
 
-def placed(part: ImportedPart, matrix: Array) -> ImportedPart:
+def placed(part: ImportedPart, matrix: Doubles) -> ImportedPart:
     """Return a part moved to its place in the file by an affine transform (4, 4)."""
     if np.array_equal(matrix, np.eye(4)):
         return part
@@ -199,9 +193,6 @@ def placed(part: ImportedPart, matrix: Array) -> ImportedPart:
     )
 
 
-Ints = npt.NDArray[np.int64]
-
-
 @dataclass(frozen=True, eq=False)
 class Looked:
     """Values that the corners of triangles look up.
@@ -211,7 +202,7 @@ class Looked:
         index: (F, 3) int64 rows of `values`; -1 where a corner has none.
     """
 
-    values: Array
+    values: Doubles
     index: Ints
 
     def at(self, chosen: Ints) -> Looked | None:
@@ -224,7 +215,7 @@ def split_at_corners(
     points: Looked,
     normals: Looked | None,
     uvs: Looked | None,
-    colors: Array | None,
+    colors: Doubles | None,
     surface: ImportedSurface,
     *,
     flat: bool = False,
@@ -249,7 +240,7 @@ def split_at_corners(
         most *= len(one.values) + 1
     _, first, faces = np.unique(key, return_index=True, return_inverse=True)
 
-    def rows(one: Looked | None) -> Array | None:
+    def rows(one: Looked | None) -> Doubles | None:
         if one is None:
             return None
         index = one.index.reshape(-1)[first]

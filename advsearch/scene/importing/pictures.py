@@ -10,17 +10,15 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 from scipy import sparse
 
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_decodable, check_pixels, opened, steps_of
+from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import LARGEST_FILE, plain_name, shown
-
-Floats = npt.NDArray[np.float32]
 
 TEXTURE_LIMIT = 1024
 """Longest side of an imported texture, in texels; larger ones are averaged down."""

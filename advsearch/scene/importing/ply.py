@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
@@ -29,7 +30,6 @@ from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurfa
 from advsearch.scene.importing.pictures import Pictures
 from advsearch.scene.importing.polygons import triangulated
 
-Ints = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.generic]
 
 _TYPES = {
@@ -229,8 +229,6 @@ def _cut(path: Path, element: Element, cells: _Words | _Bytes) -> FileFormatErro
     )
 
 
-Array = npt.NDArray[np.float64]
-
 COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 ALPHAS = ("alpha", "a", "diffuse_alpha")
 MAPPED = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"), ("tx", "ty"), ("uv1", "uv2"))
@@ -321,7 +319,7 @@ class _Reader:
         """Return the warnings, each as what follows the file's name."""
         return [note if note.startswith(" ") else f": {note}" for note in [*self.notes, *self.inventory.left()]]
 
-    def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Array | None:
+    def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Doubles | None:
         """Return the values (N, C) of the first of several groups of properties that an element has; None for none."""
         table = self.elements.get(element)
         for group in names:
@@ -386,7 +384,7 @@ class _Reader:
         index[np.repeat(whole, counts)] = same.reshape(-1)
         return Looked(values.view(np.float64).reshape(-1, 2), index[triangles])
 
-    def colors(self, at: Ints, face: Ints) -> Array | None:
+    def colors(self, at: Ints, face: Ints) -> Doubles | None:
         """Return the linear colours (T, 3, 3) of the corners of triangles, or None: those of vertices, unless these are
         all the same and those of faces are not."""
         found = {}
@@ -468,7 +466,7 @@ def _whole(values: npt.NDArray[np.generic]) -> Ints:
     return values.astype(np.int64)
 
 
-def _scale(values: Array, kind: np.dtype[np.generic]) -> float:
+def _scale(values: Doubles, kind: np.dtype[np.generic]) -> float:
     """Return what full brightness is in colours of a type: 1 for floats, unless they are those of bytes."""
     most = float(np.nan_to_num(values).max(initial=0.0))
     if kind.kind == "f":

@@ -14,11 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import MESHES
-from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.assets import Doubles, ObjectAsset
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name, shown
@@ -28,8 +27,6 @@ from advsearch.scene.importing.gltf_parts import poses
 from advsearch.scene.importing.objects import GLTF, object_of, read_parts
 from advsearch.scene.importing.parts import ImportedPart, visible
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
-
-Doubles = npt.NDArray[np.float64]
 
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From y up to z up."""

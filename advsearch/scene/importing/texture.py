@@ -13,14 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
+from advsearch.scene.assets import Bools, Doubles, Floats, Ints
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.geometry import Array, Bools, Ints, Soup, connected, unit_vectors
+from advsearch.scene.importing.geometry import Soup, connected, unit_vectors
 from advsearch.scene.importing.parts import FLAT, NEUTRAL, ImportedSurface, texels_of
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.importing.unwrap import unwrapped
 from advsearch.scene.raster import doubled_areas, looked_up, pixels_in
-
-Floats = npt.NDArray[np.float32]
 
 PLAIN_SIZE = 8
 """Width and height, in texels, of the base colour map of an object of one colour."""
@@ -89,7 +88,7 @@ def by_material(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[list[s
     return list(numbers), np.array([numbers[surface.name] for surface in surfaces])[soup.part]
 
 
-def _overlap(uvs: Array, material: Ints) -> bool:
+def _overlap(uvs: Doubles, material: Ints) -> bool:
     """Whether places of different materials (F,) lie at the same texture coordinates (F, 3, 2)."""
     if material.min() == material.max():
         return False
@@ -106,7 +105,7 @@ def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
     return np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32)
 
 
-def _kept(soup: Soup, uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats]) -> tuple[Soup, SurfaceMaps]:
+def _kept(soup: Soup, uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats]) -> tuple[Soup, SurfaceMaps]:
     """Return the soup with the file's own UVs, and its pictures, as `ImportedSurface.pictures` has them, as maps."""
     left = list(pictures)
     color = _of_one_color(soup, surface) if surface.texture is None else left.pop(0)
@@ -117,7 +116,7 @@ def _kept(soup: Soup, uvs: Array, surface: ImportedSurface, pictures: Sequence[F
     return replace(soup, uvs=uvs), SurfaceMaps(color, normals, emission)
 
 
-def _lit_twice(uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats]) -> bool:
+def _lit_twice(uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats]) -> bool:
     """Whether a texel that emits light lies on several faces: Mitsuba would send light from one of them only."""
     if surface.emission is None or surface.emission.shape == (1, 1, 3):
         return False
@@ -162,7 +161,7 @@ def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -
 # --- the file's UVs ----------------------------------------
 
 
-def _usable(soup: Soup, uvs: Array) -> bool:
+def _usable(soup: Soup, uvs: Doubles) -> bool:
     """Tell whether UVs are known, inside the unit square, not squashed to lines, and use the square."""
     if not np.isfinite(uvs).all() or uvs.min() < -_SLACK or uvs.max() > 1.0 + _SLACK:
         return False
@@ -170,7 +169,7 @@ def _usable(soup: Soup, uvs: Array) -> bool:
     return bool(surface[flat < 1e-12].sum() <= _SQUASHED * surface.sum() and flat.sum() >= _CRAMPED)
 
 
-def _into_unit_square(soup: Soup) -> Array:
+def _into_unit_square(soup: Soup) -> Doubles:
     """Move each chart by whole textures so that it starts in the unit square; a repeating texture looks the same."""
     corners = np.column_stack([soup.faces.reshape(-1), soup.uvs.reshape(-1, 2)])
     _, vertex = np.unique(corners, axis=0, return_inverse=True)
@@ -179,11 +178,11 @@ def _into_unit_square(soup: Soup) -> Array:
     chart = connected(int(vertex.max()) + 1, a, b)
     low = np.full((int(chart.max()) + 1, 2), np.inf)
     np.minimum.at(low, chart[vertex.reshape(-1)], soup.uvs.reshape(-1, 2))
-    moved: Array = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
+    moved: Doubles = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
     return moved
 
 
-def _windowed(uvs: Array, pictures: Sequence[Floats], colors: Floats | None) -> tuple[Array, Sequence[Floats]]:
+def _windowed(uvs: Doubles, pictures: Sequence[Floats], colors: Floats | None) -> tuple[Doubles, Sequence[Floats]]:
     """Cut pictures to the window that UVs span where they overstep the unit square a little or use a corner of it.
 
     The layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the textures repeat.
@@ -200,7 +199,7 @@ def _windowed(uvs: Array, pictures: Sequence[Floats], colors: Floats | None) -> 
     return (uvs - low) / size, [_cut(one, low, high, filtered if one is colors else sampled) for one in pictures]
 
 
-def _cut(picture: Floats, low: Array, high: Array, look_up: Callable[[Floats, Array], Floats]) -> Floats:
+def _cut(picture: Floats, low: Doubles, high: Doubles, look_up: Callable[[Floats, Doubles], Floats]) -> Floats:
     """Return the window of a repeating picture (H, W, C) between two corners (u, v), with texels of the same size."""
     size = high - low
     width, height = np.clip(np.ceil(size * np.array(picture.shape[1::-1])), 1, TEXTURE_LIMIT).astype(int)
@@ -213,7 +212,7 @@ def _cut(picture: Floats, low: Array, high: Array, look_up: Callable[[Floats, Ar
 # --- baking ----------------------------------------
 
 
-def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
+def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
     """Paint the colours and the normals of a soup into maps for new UVs.
 
     Args:
@@ -254,7 +253,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
     return SurfaceMaps(image[whole], None if normals is None else normals[whole], emission)
 
 
-def _looked_up(surface: ImportedSurface, at: Array) -> Floats:
+def _looked_up(surface: ImportedSurface, at: Doubles) -> Floats:
     """Return the base colour (T, 3 or 4) of a surface at UVs (T, 2)."""
     if surface.texture is not None and np.isfinite(at).all():
         return filtered(surface.texture, at)
@@ -284,7 +283,7 @@ def _mean(texture: Floats) -> Floats:
     return mean[None]
 
 
-def filtered(colors: Floats, uvs: Array) -> Floats:
+def filtered(colors: Floats, uvs: Doubles) -> Floats:
     """Look a repeating texture of display-referred colours up with bilinear interpolation in linear light; what is
     transparent does not count. Arguments and result as for `sampled`."""
     return _in_display(sampled(_in_linear(colors), uvs))
@@ -304,7 +303,7 @@ def _in_display(colors: Floats) -> Floats:
     return np.concatenate([linear_to_srgb(linear), opacity], axis=-1)
 
 
-def sampled(texture: Floats, uvs: Array) -> Floats:
+def sampled(texture: Floats, uvs: Doubles) -> Floats:
     """Look a repeating texture up with bilinear interpolation of its values, as they are.
 
     Args:
@@ -328,7 +327,7 @@ FEW = 1e-3
 """Share of the surface whose texture coordinates may be mirrored without anything being done about it."""
 
 
-def mirrored(soup: Soup, uvs: Array) -> Bools:
+def mirrored(soup: Soup, uvs: Doubles) -> Bools:
     """Return (F,) which faces have their texture mirrored; where these, or the others, are `FEW`, none or all have."""
     turned = doubled_areas(uvs) < 0.0
     area = np.linalg.norm(soup.face_vectors(), axis=1)
@@ -337,8 +336,8 @@ def mirrored(soup: Soup, uvs: Array) -> Bools:
 
 
 def unmirrored(
-    uvs: Array, over: Bools, color: Floats, normals: Floats, emission: Floats | None
-) -> tuple[Array, tuple[Floats, Floats, Floats | None]]:
+    uvs: Doubles, over: Bools, color: Floats, normals: Floats, emission: Floats | None
+) -> tuple[Doubles, tuple[Floats, Floats, Floats | None]]:
     """Return texture coordinates that mirror no face, and the maps for them; no texel is resampled.
 
     The maps get a second half, which is the first one mirrored, and there the faces go.
@@ -366,7 +365,7 @@ def _beside(left: Floats, right: Floats) -> Floats:
     return np.concatenate([left, right], axis=1)
 
 
-def turned(texels: Floats, before: Soup, after: Array, face: Ints, weights: Array) -> Floats:
+def turned(texels: Floats, before: Soup, after: Doubles, face: Ints, weights: Doubles) -> Floats:
     """Return texels of a normal map for other texture coordinates.
 
     Args:
@@ -385,7 +384,7 @@ def turned(texels: Floats, before: Soup, after: Array, face: Ints, weights: Arra
     return texels_of(np.where(np.isfinite(found).all(axis=1, keepdims=True), found, [0.0, 0.0, 1.0]))
 
 
-def _tangents(soup: Soup, normal: Array, face: Ints) -> Array:
+def _tangents(soup: Soup, normal: Doubles, face: Ints) -> Doubles:
     """Unit directions (T, 3) along u in the plane across the normals (T, 3); NaN where there is none."""
     used, at = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used, k]] for k in range(3))

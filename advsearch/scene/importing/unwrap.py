@@ -8,7 +8,8 @@ import numpy as np
 import xatlas
 from scipy.sparse import coo_array
 
-from advsearch.scene.importing.geometry import Array, Ints, Soup, connected, neighbours, unit_vectors
+from advsearch.scene.assets import Doubles, Ints
+from advsearch.scene.importing.geometry import Soup, connected, neighbours, unit_vectors
 
 ATLAS_SIZE = 512
 ATLAS_PADDING = 4
@@ -58,14 +59,14 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
     return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(result, 0.0, 1.0))
 
 
-def _side_by_side(count: int) -> Array:
+def _side_by_side(count: int) -> Doubles:
     """Return UVs (F, 3, 2) of so many faces, two to each cell of a grid."""
     columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
     cell = np.arange(count) // 2
     corner = np.stack([cell % columns, cell // columns], axis=1)[:, None, :]
     half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
     inside = np.where((np.arange(count) % 2 == 0)[:, None, None], half, 1.0 - half)
-    uvs: Array = (corner + inside) / columns
+    uvs: Doubles = (corner + inside) / columns
     return uvs
 
 
@@ -77,12 +78,12 @@ def _patches(soup: Soup) -> Ints:
     surface leaves no border, the process crashes. Such meshes, and large ones for the sake of speed, are cut where the
     surface turns from one of 14 directions to another.
     """
-    unit: Array = unit_vectors(soup.face_vectors())
+    unit: Doubles = unit_vectors(soup.face_vectors())
     left, right, _ = neighbours(soup.faces)
     f, g = left // 3, right // 3
     flush = (unit[f] * unit[g]).sum(axis=1) > _FLUSH
     plane = connected(len(unit), f[flush], g[flush])
-    mean: Array = np.stack([np.bincount(plane, unit[:, k]) for k in range(3)], axis=1)
+    mean: Doubles = np.stack([np.bincount(plane, unit[:, k]) for k in range(3)], axis=1)
     straight = (unit * unit_vectors(mean)[plane]).sum(axis=1) > _PLANE
     if straight.all() and len(unit) <= _MANY:
         return np.zeros(len(unit), dtype=np.int64)
@@ -99,7 +100,7 @@ def _patches(soup: Soup) -> Ints:
     return connected(len(unit), f[near], g[near])
 
 
-def _cells(middles: Array, patch: Ints) -> Ints:
+def _cells(middles: Doubles, patch: Ints) -> Ints:
     """Halve patches until they are small; return the cell (F,) of each face.
 
     Args:
@@ -119,7 +120,7 @@ def _cells(middles: Array, patch: Ints) -> Ints:
     return cell
 
 
-def _smoothed(unit: Array, f: Ints, g: Ints) -> Array:
+def _smoothed(unit: Doubles, f: Ints, g: Ints) -> Doubles:
     """Average the normals (F, 3) of faces with their neighbours', a few times."""
     count = len(unit)
     links = np.concatenate([f, g, np.arange(count)]), np.concatenate([g, f, np.arange(count)])

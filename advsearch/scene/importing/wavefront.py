@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
@@ -32,9 +33,6 @@ from advsearch.scene.importing.mtl import without_comment
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
 from advsearch.scene.importing.polygons import triangulated
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 GROUPING = frozenset(("g", "o"))
 """Statements that only name parts; all parts are joined."""
@@ -165,7 +163,7 @@ def _note_unknown(reader: MtlReader, said: _Said, name: str, instead: str) -> No
 # --- colours of vertices ----------------------------------------
 
 
-def _colors(lines: Lines, table: Array, inventory: Inventory) -> Array | None:
+def _colors(lines: Lines, table: Doubles, inventory: Inventory) -> Doubles | None:
     """Return the linear colour (V, 3) of every vertex; neutral grey where a file with colours has none.
 
     A vertex is three coordinates, then perhaps a weight, or a colour, or a colour and its opacity; or ZBrush has put
@@ -187,7 +185,9 @@ def _colors(lines: Lines, table: Array, inventory: Inventory) -> Array | None:
     return np.asarray(srgb_to_linear(np.clip(colors, 0.0, 1.0).astype(np.float32)), dtype=np.float64)
 
 
-def _tinted(reader: MtlReader, surface: ImportedSurface, tint: Array | None) -> tuple[ImportedSurface, Array | None]:
+def _tinted(
+    reader: MtlReader, surface: ImportedSurface, tint: Doubles | None
+) -> tuple[ImportedSurface, Doubles | None]:
     """Return a surface and the colours (F, 3, 3) of its corners that multiply it: all but those of a texture."""
     if tint is None:
         return surface, None
@@ -202,7 +202,7 @@ def _tinted(reader: MtlReader, surface: ImportedSurface, tint: Array | None) -> 
     return surface, tint
 
 
-def _beyond(uvs: Array) -> bool:
+def _beyond(uvs: Doubles) -> bool:
     """Whether texture coordinates (N, 2) leave the texture by more than `BEYOND`."""
     return bool(len(uvs)) and not (uvs.min() >= -BEYOND and uvs.max() <= 1.0 + BEYOND)
 
@@ -259,7 +259,7 @@ class Lines:
             key, _, rest = line.partition(" ")
             yield int(row), key, rest.strip()
 
-    def table(self, kind: str) -> Array:
+    def table(self, kind: str) -> Doubles:
         """Return the numbers of all lines of a kind in a table; where one has fewer, 0 for ``vt``, else NaN.
 
         Raises:
@@ -274,7 +274,7 @@ class Lines:
         begins[1:] &= blank[:-1]
         ends = np.flatnonzero(data == _NEWLINE)
         counts = np.add.reduceat(begins, np.concatenate([[0], ends[:-1] + 1]), dtype=np.int64)
-        values: Array = numbers_in(data.tobytes(), np.float64).astype(np.float64, copy=False)
+        values: Doubles = numbers_in(data.tobytes(), np.float64).astype(np.float64, copy=False)
         if counts.min() < fewest or len(values) != counts.sum():
             self._blame_numbers(kind, fewest, rows)
         if (counts == counts[0]).all():
@@ -332,7 +332,7 @@ class Lines:
                 raise damaged(self.path, f"at least {index.max()} {kind!r} lines", f"{got} (is the file cut short?)")
         return corners - 1, sizes, rows
 
-    def zbrush_colors(self, count: int) -> Array | None:
+    def zbrush_colors(self, count: int) -> Doubles | None:
         """Return the colours (N, 3) in [0, 255] that ZBrush writes into comments (``#MRGB``), or None."""
         if b"#MRGB" not in self.text:
             return None

@@ -9,11 +9,10 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.assets import Doubles, Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, MeshPart
@@ -135,9 +134,7 @@ def repeating(uv: Tensor, options: Mapping[str, object], size: tuple[int, int]) 
     return (torch.floor(uv * texels) + 0.5) / texels if options.get("filter_type") == "nearest" else uv
 
 
-def mitsuba_mesh(
-    name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: Plugin, light: Plugin | None = None
-) -> Any:
+def mitsuba_mesh(name: str, mesh: Mesh, to_world: Doubles, bsdf: Plugin, light: Plugin | None = None) -> Any:
     """Return a Mitsuba mesh of the given geometry under a pose, with shading normals and texture coordinates.
 
     Mitsuba's bitmaps have row 0 at v = 0 while ours have it at v = 1, hence the flip.

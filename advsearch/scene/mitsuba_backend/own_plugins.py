@@ -63,15 +63,7 @@ class HazePath(RBIntegrator):  # type: ignore[misc]
 
     @dr.syntax  # type: ignore[untyped-decorator]
     def sample(
-        self,
-        mode: Any,
-        scene: Any,
-        sampler: Any,
-        ray: Any,
-        δL: Any,
-        state_in: Any,
-        active: Any,
-        **rest: Any,
+        self, mode: Any, scene: Any, sampler: Any, ray: Any, δL: Any, state_in: Any, active: Any, **rest: Any
     ) -> Any:
         """See `RBIntegrator.sample`."""
         primal = mode == dr.ADMode.Primal

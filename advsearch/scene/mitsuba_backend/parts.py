@@ -307,10 +307,7 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     """Mitsuba's dictionary of a scene: its camera, its environment and the ground; objects come as parts."""
     place = mi.ScalarTransform4f
     number = description.number
-    scene: Plugin = {
-        "type": "scene",
-        "camera": _camera(description, resolution, filter, sampler),
-    }
+    scene: Plugin = {"type": "scene", "camera": _camera(description, resolution, filter, sampler)}
     if description.environment is not None:
         scene["environment"] = {
             "type": "envmap",

@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from advsearch.scene.assets import Floats
 from advsearch.scene.cameras.model import CameraModel
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.texel_rays import (
     ANGLES,
     SHIFT,
     TABLES,
-    Floats,
     Lobes,
     TexelGrid,
     grid_place,

@@ -17,10 +17,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time
 
-Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 
 SHIFT = 1e-4
@@ -261,8 +261,6 @@ def _points(kind: Any, values: Floats) -> Any:
     """Rows of numbers as Dr.Jit's points, vectors or normals."""
     return kind(*(mi.Float(np.ascontiguousarray(values[:, k], dtype=np.float32)) for k in range(values.shape[1])))
 
-
-Doubles = npt.NDArray[np.float64]
 
 ANGLES = 32
 """Entries of a table over the cosine of the angle of view."""

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.assets import Bools
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
 from advsearch.scene.grounds import irradiance as unshadowed
@@ -188,7 +188,7 @@ class Arrangement:
     def _value(self, name: str) -> Tensor:
         return self.inputs[name] if name in self.inputs else self._scene.base(name)
 
-    def _buried(self, seen: Ints, side: int) -> npt.NDArray[np.bool_]:
+    def _buried(self, seen: Ints, side: int) -> Bools:
         """Which texels of a side of the object lie inside of something: they see nothing but backs, or much of them
         and no sky where backs have light of their own."""
         here = seen[self.texels.of(side)]

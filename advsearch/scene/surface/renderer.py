@@ -163,11 +163,7 @@ class SurfaceRenderer(PredictingRenderer):
                 yield Look(number, self.arrangement.view(seen, place), lit, lights[number][1])
 
     def shown(
-        self,
-        looks: Iterable[Look],
-        inputs: Sequence[Mapping[str, Tensor]],
-        color: Tensor,
-        wholes: Sequence[Tensor],
+        self, looks: Iterable[Look], inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]
     ) -> Tensor:
         """Return the pictures of what cameras see; arguments as of `pictures`."""
         fine, reflected, found = self.arrangement.finer(color), dict[Light, Tensor](), dict[int, Tensor]()

@@ -21,12 +21,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from advsearch.scene.assets import Bools, Floats, Ints
 from advsearch.scene.mitsuba_backend.texel_rays import TexelGrid
 from advsearch.scene.raster import BORDER, Charts, rasterised
 from advsearch.scene.transport.matrix import by_rows
-
-Floats = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int64]
 
 SIDE = 160
 """Texels a side over the searched object."""
@@ -135,7 +133,7 @@ def between(
     shape: tuple[int, int],
     vertices: Floats,
     normals: Floats,
-    buried: npt.NDArray[np.bool_],
+    buried: Bools,
 ) -> Tensor:
     """Return the matrix (cells of a finer grid x texels of the first surface) that smooths light and looks it up.
 
@@ -182,7 +180,7 @@ def between(
     return by_rows(scipy.sparse.coo_matrix((weight[taken].astype(np.float32), (cell, chosen[taken])), size).tocsr())
 
 
-def smoothed(ground: Texels, lit: npt.NDArray[np.bool_]) -> Tensor:
+def smoothed(ground: Texels, lit: Bools) -> Tensor:
     """Return the matrix (cells x texels of a ground) that smooths its light, by the binomial of 5 x 5 texels.
 
     Those that see nothing of the sky lie under something. What is next to it takes no part of their darkness, which a
@@ -228,7 +226,7 @@ def _side_squared(charts: Charts, vertices: Floats) -> float:
     return float(areas[charts.covered].mean()) * float(scale) ** 2
 
 
-def _nearest(covered: npt.NDArray[np.bool_]) -> Ints:
+def _nearest(covered: Bools) -> Ints:
     """For each cell of a grid the nearest covered one, by their places in the flat grid."""
     # takes long to import
     from scipy import ndimage
@@ -385,7 +383,7 @@ def irradiance(
     return found
 
 
-def seen_of(columns: npt.NDArray[np.int32], of_cell: npt.NDArray[np.int64], texels: int) -> tuple[Tensor, Tensor]:
+def seen_of(columns: npt.NDArray[np.int32], of_cell: Ints, texels: int) -> tuple[Tensor, Tensor]:
     """Return the sparse matrices of `irradiance` from what rays met, as `gather` has it."""
     count, rays = columns.shape
     row = np.repeat(np.arange(count), rays)

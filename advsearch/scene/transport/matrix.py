@@ -24,10 +24,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from advsearch.scene.assets import Floats, Ints
 from advsearch.scene.mitsuba_backend.transport import Vertices
 
-Ints = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float32]
 Smooth = Callable[[Tensor], Tensor]
 """From a noisy picture (H, W, 3) to one without noise."""
 MOST_MEANS = 6e4

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.assets import Doubles, Floats, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
@@ -27,8 +26,6 @@ from advsearch.scene.mitsuba_backend.files.xml import read_scene, trusted
 from advsearch.scene.mitsuba_backend.meshes import plain
 from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
-
-Doubles = npt.NDArray[np.float64]
 
 SHAPES = frozenset(
     """

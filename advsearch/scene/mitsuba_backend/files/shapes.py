@@ -6,16 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.assets import Doubles, Floats, Ints, Mesh
 from advsearch.scene.mitsuba_backend.meshes import FACES, NORMALS, POSITIONS, TEXCOORDS, loadable
 from advsearch.scene.mitsuba_backend.variant import fewer_warnings, mi
 from advsearch.scene.parts import HazePart
 
-Doubles = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
 """Vertices, faces, normals and texture coordinates of a mesh, and its attributes, (V or F, n) by their names."""
 
@@ -157,7 +154,7 @@ def _solid(kind: str, shape: Mapping[str, object]) -> Buffers:
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
 
 
-def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, npt.NDArray[np.int64]]:
+def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, Ints]:
     """The points (N, 2) of a grid of texture coordinates, and its triangles (F, 3)."""
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     first = (np.arange(len(v) - 1)[:, None] * len(u) + np.arange(len(u) - 1)).reshape(-1)
@@ -203,7 +200,7 @@ _OF_BALL = {"type", "id", "radius", "center", "to_world", "bsdf", "interior"}
 _OF_MEDIUM = {"type", "id", "sigma_t", "albedo", "scale", "phase"}
 
 
-def haze_in(named: Plugins, matrix: npt.NDArray[np.float64]) -> tuple[HazePart, frozenset[str]] | None:
+def haze_in(named: Plugins, matrix: Doubles) -> tuple[HazePart, frozenset[str]] | None:
     """Return the haze of a scene and the names of the plugins that it is made of; None where there is none.
 
     That is one grey medium in a ball that the camera stands in: Mitsuba's `prbvolpath` sees nothing of it up to the
@@ -247,7 +244,7 @@ def _reference(given: object) -> str | None:
     return str(given["id"]) if isinstance(given, Mapping) and given.get("type") == "ref" else None
 
 
-def _numbers(given: object) -> npt.NDArray[np.float64] | None:
+def _numbers(given: object) -> Doubles | None:
     """Return a number, or the three of a colour; None of anything else."""
     if isinstance(given, Mapping):
         given = (

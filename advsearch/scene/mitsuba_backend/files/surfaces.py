@@ -6,14 +6,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from advsearch.scene.assets import Floats
+from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, plugins_in
-
-Doubles = npt.NDArray[np.float64]
 
 COLORS = {
     "diffuse": "reflectance",

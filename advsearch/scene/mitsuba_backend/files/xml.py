@@ -17,11 +17,11 @@ from pathlib import Path
 from xml.parsers import expat
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import note_opened
+from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
 from advsearch.scene.environments import import_environment, read_light
@@ -211,7 +211,7 @@ class _Reader:
             raise self.wrong(one, f"expected three numbers, got {shown(text)}")
         return found * 3 if len(found) == 1 else found
 
-    def transform(self, one: _Element) -> npt.NDArray[np.float64]:
+    def transform(self, one: _Element) -> Doubles:
         """The product of its steps (4, 4), the first applied first."""
         matrix = np.eye(4)
         for step in one.inner:
@@ -222,7 +222,7 @@ class _Reader:
             raise self.wrong(one, "expected a transform that can be undone, of finite numbers")
         return matrix
 
-    def step(self, one: _Element) -> npt.NDArray[np.float64]:
+    def step(self, one: _Element) -> Doubles:
         """One step of a transform (4, 4)."""
         matrix = np.eye(4)
         if one.tag == "matrix":
@@ -326,11 +326,11 @@ def _free(taken: Mapping[str, object], wanted: str) -> str:
     return name
 
 
-def _unit(vector: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _unit(vector: Doubles) -> Doubles:
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))
 
 
-def _turn(axis: tuple[float, float, float], angle: float) -> npt.NDArray[np.float64]:
+def _turn(axis: tuple[float, float, float], angle: float) -> Doubles:
     """The rotation (3, 3) about an axis by an angle in radians."""
     x, y, z = _unit(np.array(axis))
     across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -429,7 +429,7 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
     return checked(scene)
 
 
-def _texture(file: Path, notes: list[str]) -> npt.NDArray[np.float32]:
+def _texture(file: Path, notes: list[str]) -> Floats:
     """The linear values (H, W, 3) of an .hdr or .exr picture, averaged down as other textures are."""
     picture = read_light(file, "texture")
     notes.extend(f"{file.name}: {note}" for note in picture.notes)
