@@ -72,8 +72,10 @@ def read_header(path: Path, data: bytes) -> Header:
         if isinstance(entry, list):
             level.extend(entry)
         elif isinstance(entry, dict):
-            held = entry.get("extensions")
-            found.update(held if isinstance(held, dict) else ())
+            held = entry.get("extensions") or {}
+            if not isinstance(held, dict) or not all(isinstance(held.get(name) or {}, dict) for name in READ):
+                raise damaged(path, "glTF whose extensions are objects", shown(json.dumps(held)))
+            found.update(held)
             level.extend(value for key, value in entry.items() if key != "extras")
     header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *found})})
     check_header(path, header)
