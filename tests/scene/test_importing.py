@@ -1105,6 +1105,12 @@ GLTF_CHANGES: dict[str, tuple[list[Any], Any, str]] = {
     "null meshes": (["meshes"], None, r"glTF whose meshes is a valid list, got 'null'"),
     "integer as list": (["scene"], [0], r"glTF whose scene is a valid integer, got '\[0\]'"),
     "text as integer": (["accessors", 0, "count"], "8", r"glTF whose accessors\[0\]\.count is a valid integer"),
+    "extensions as text": (["nodes", 0, "extensions"], "all", r"glTF whose extensions are objects, got '\"all\"'"),
+    "extension as number": (
+        ["extensions"],
+        {"KHR_lights_punctual": 2},
+        r"glTF whose extensions are objects, got",
+    ),
     "negative index": (
         ["meshes", 0, "primitives", 0, "indices"],
         -1,

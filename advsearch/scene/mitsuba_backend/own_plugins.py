@@ -13,7 +13,7 @@ import torch
 from advsearch.scene.cameras.model import NUMBERS, CameraModel
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
-RBIntegrator, mis_weight = mi.ad.integrators.common.RBIntegrator, mi.ad.integrators.common.mis_weight
+common = mi.ad.integrators.common
 
 PHASE = 1.0 / (4.0 * math.pi)
 """Isotropic phase function, per steradian."""
@@ -23,7 +23,7 @@ MOST_SCATTERINGS = 8
 density 0 is no haze. Where the haze's optical radius is 1.2, what is cut off is below 1 % of the light."""
 
 
-class HazePath(RBIntegrator):  # type: ignore[misc]
+class HazePath(common.RBIntegrator):  # type: ignore[misc]
     """The integrator `advsearch_haze`: a path tracer for a uniform haze in a ball around the scene, with its adjoint.
 
         L(x, w) = e^(-s l) L_o + integral_0^l s a e^(-s t) L_i(x + t w) dt,      L_i = mean over the sphere of L
@@ -111,7 +111,7 @@ class HazePath(RBIntegrator):  # type: ignore[misc]
             if dr.hint(self.hide_emitters, mode="scalar"):
                 shining = at_surface & ~(first & ~si.is_valid())
             seen = mi.DirectionSample3f(scene, si, last)
-            share = mis_weight(last_pdf, scene.pdf_emitter_direction(last, seen, shining & ~last_delta))
+            share = common.mis_weight(last_pdf, scene.pdf_emitter_direction(last, seen, shining & ~last_delta))
             with dr.resume_grad(when=not primal):
                 Le = β * share * seen.emitter.eval(si, shining)
 
@@ -133,7 +133,7 @@ class HazePath(RBIntegrator):  # type: ignore[misc]
                 value, pdf = bsdf.eval_pdf(context, si, si.to_local(to_light.d), lit & at_surface)
                 value = dr.select(scattered, PHASE, value)
                 pdf = dr.select(scattered, PHASE, pdf)
-                share = dr.select(to_light.delta, 1.0, mis_weight(to_light.pdf, pdf))
+                share = dr.select(to_light.delta, 1.0, common.mis_weight(to_light.pdf, pdf))
                 Lr_dir = dr.select(lit, β * share * value * emitted * dr.exp(-extinction * hazy), 0.0)
 
             # ---- the direction to go on -----------------------------------------------------------------------------

@@ -293,11 +293,11 @@ class MitsubaScene:
                     own = self.parameters[key]
                     held[key] = type(own)(own)
                     value = inputs[name] if name in inputs else as_torch(own)
-                    tracked[name] = mi.TensorXf(value.detach().to(torch.float32).contiguous())  # type: ignore[call-overload]
+                    tracked[name] = mi.TensorXf(value.detach().to(torch.float32).contiguous())
                     dr.enable_grad(tracked[name])
                     self.parameters[key] = one.write(tracked[name]) if one.write else tracked[name]
                 self.parameters.update()
-                spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)  # type: ignore[call-overload]
+                spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)
                 mi.set_log_level(mi.LogLevel.Error)  # it warns at every call of a film that samples beyond its border
                 integrator = self._integrators.get((method, self._depth)) or self._integrator(method)
                 integrator.render_backward(
@@ -334,7 +334,7 @@ class MitsubaScene:
                 self._scene,
                 self._sensor,
                 self.parameters,
-                mesh_key=names,
+                names=names,
                 vertices=[inputs[f"{name}.vertices"] for name in names],
                 normals=[inputs[f"{name}.normals"] for name in names],
                 cotangent=cotangent,

@@ -28,26 +28,14 @@ from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
 
 SHAPES = frozenset(
-    """
-    rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve
-    ellipsoids ellipsoidsmesh merge
-    """.split()
+    "rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve "
+    "ellipsoids ellipsoidsmesh merge".split()
 )
-LIGHTS = frozenset(
-    """
-    constant envmap point spot directional projector sunsky timed_sunsky area directionalarea
-    """.split()
-)
-SENSORS = frozenset(
-    """
-    perspective thinlens orthographic radiancemeter irradiancemeter distant batch
-    """.split()
-)
+LIGHTS = frozenset("constant envmap point spot directional projector sunsky timed_sunsky area directionalarea".split())
+SENSORS = frozenset("perspective thinlens orthographic radiancemeter irradiancemeter distant batch".split())
 CAMERAS = frozenset(("perspective", "thinlens"))
 INTEGRATORS = frozenset(
-    """
-    path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes
-    """.split()
+    "path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes".split()
 )
 NOTHING = {"type": "null"}
 """The surface of what only bounds a medium."""

@@ -115,16 +115,16 @@ def material_adjoint(
     sensor: Any,
     parameters: Any,
     *,
-    mesh_key: str | Sequence[str],
-    vertices: Any,
-    normals: Any,
+    names: Sequence[str],
+    vertices: Sequence[Tensor],
+    normals: Sequence[Tensor],
     cotangent: Tensor,
     seed: int,
     spp: int,
     boundary_spp: int = 4,
     max_depth: int = 6,
     shadow_spp: int = 0,
-) -> Any:
+) -> tuple[list[Tensor], list[Tensor]]:
     """Return the gradient of `sum(cotangent * radiance)` with respect to vertex places and vertex normals.
 
     The scene is only read. Nothing is recorded with `dr.freeze`. The first call for a depth makes a path tracer.
@@ -133,9 +133,9 @@ def material_adjoint(
         scene: Mitsuba's scene, loaded with `optimize=False`.
         sensor: a perspective camera of it; a thin lens is taken for a pinhole.
         parameters: `mi.traverse(scene)`.
-        mesh_key: name of the moving mesh; a list for several that move.
-        vertices: (V, 3) float32, world units, as the scene has them; a list if `mesh_key` is one.
-        normals: (V, 3) float32, as the scene has them; a list if `mesh_key` is one.
+        names: of the moving meshes.
+        vertices: of each, (V, 3) float32, world units, as the scene has them.
+        normals: of each, (V, 3) float32, as the scene has them.
         cotangent: (H, W, 3) float32, derivative of the loss by the radiance of box-filtered pixels.
         seed: number of the noise, at least 0.
         spp: samples a pixel of the interior term.
@@ -144,13 +144,10 @@ def material_adjoint(
         shadow_spp: samples of the edges that cast shadows, in multiples of the number of pixels; 0 leaves them out.
 
     Returns:
-        The gradients by the vertices and by the normals, (V, 3) float32 each; two lists if `mesh_key` is one.
+        The gradients by the vertices and by the normals of each mesh, (V, 3) float32.
     """
-    single = isinstance(mesh_key, str)
-    keys: list[str] = [mesh_key] if isinstance(mesh_key, str) else list(mesh_key)
-    places, bent = ([vertices], [normals]) if single else (vertices, normals)
-    meshes = [moving_mesh(scene, parameters, *one) for one in zip(keys, places, bent, strict=True)]
-    still = still_meshes(scene, parameters, keys)
+    meshes = [moving_mesh(scene, parameters, *one) for one in zip(names, vertices, normals, strict=True)]
+    still = still_meshes(scene, parameters, names)
     view = FilmView(scene, read_camera(sensor), meshes, still, as_array(padded(cotangent)), max_depth)
     total = mi.Float(0)
     if spp > 0:
@@ -160,8 +157,7 @@ def material_adjoint(
         total += shadow_terms(view, mesh, stream_of(seed, _SHADOWS, number), shadow_spp)
     if dr.grad_enabled(total):
         dr.backward(total)
-    found = [(gradient_of(mesh.positions), gradient_of(mesh.normals)) for mesh in meshes]
-    return found[0] if single else tuple(list(one) for one in zip(*found, strict=True))
+    return [gradient_of(mesh.positions) for mesh in meshes], [gradient_of(mesh.normals) for mesh in meshes]
 
 
 # ---- inside the outlines --------------------------------------------------------------------------------------------
