@@ -22,10 +22,10 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene import library
+from advsearch.scene import library, surface_parts
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing import objects, unwrap
+from advsearch.scene.importing import objects
 from advsearch.scene.importing.objects import guess_up, import_object
 from advsearch.scene.importing.pictures import area_average, display_image
 from advsearch.scene.importing.texture import filtered, sampled
@@ -475,7 +475,7 @@ def test_unwrap_of_a_curved_object_does_not_overlap(
 ) -> None:
     if piece < 1500:  # it is taken for a large mesh, which is unwrapped in pieces
         for name, value in {"_PIECE": piece, "_MANY": 1, "_LARGE": 1}.items():
-            monkeypatch.setattr(unwrap, name, value)
+            monkeypatch.setattr(surface_parts, name, value)
     torus = trimesh.creation.torus(1.0, 0.4, major_sections=24, minor_sections=12)
     asset = import_object(exported(tmp_path, "ring.stl", torus))
     check_sound(asset)
@@ -1048,10 +1048,10 @@ def test_faces_of_vertices_that_are_not_there(tmp_path: Path, index: str) -> Non
 
 
 def test_a_heap_of_faces_is_laid_out_in_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.scene.importing.unwrap._MOST_PATCHES", 8)
+    monkeypatch.setattr("advsearch.scene.surface_parts._MOST_PATCHES", 8)
     corners = np.random.default_rng(0).random((33, 3, 3))
     heap = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(99).reshape(-1, 3), process=False)
-    monkeypatch.setattr("advsearch.scene.importing.unwrap._MANY", 8)
+    monkeypatch.setattr("advsearch.scene.surface_parts._MANY", 8)
     asset = import_object(exported(tmp_path, "heap.stl", heap))
     check_sound(asset)
     assert overlap(asset.mesh) == 0 and len(asset.mesh.faces) == 33

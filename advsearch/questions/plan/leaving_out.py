@@ -25,7 +25,7 @@ from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import predicting, why_not
-from advsearch.scene.transport.renderer import SPP
+from advsearch.scene.transport.matrix import SPP
 
 ALL = "everything above"
 """Name of the row in which all items are put back together."""

@@ -18,8 +18,8 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.geometry import Soup, connected, unit_vectors
 from advsearch.scene.importing.parts import FLAT, NEUTRAL, ImportedSurface, texels_of
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
-from advsearch.scene.importing.unwrap import unwrapped
 from advsearch.scene.raster import doubled_areas, looked_up, pixels_in
+from advsearch.scene.surface_parts import unwrapped
 
 PLAIN_SIZE = 8
 """Width and height, in texels, of the base colour map of an object of one colour."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from advsearch.scene.cameras.model import NUMBERS, CameraModel
+from advsearch.scene.camera_model import NUMBERS, CameraModel
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 common = mi.ad.integrators.common

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.scene.cameras.model import NUMBERS
+from advsearch.scene.camera_model import NUMBERS
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world

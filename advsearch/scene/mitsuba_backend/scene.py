@@ -326,7 +326,7 @@ class MitsubaScene:
         """
         with one_at_a_time:
             # few scenes search a material
-            from advsearch.scene.mitsuba_backend.material_form.adjoint import material_adjoint
+            from advsearch.scene.mitsuba_backend.material_adjoint import material_adjoint
 
             self._set(inputs)
             names = list(meshes)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.scene.assets import Floats
-from advsearch.scene.cameras.model import CameraModel
+from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.texel_rays import (
     ANGLES,

@@ -19,7 +19,7 @@ from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
 from advsearch.scene.transport.lights import NOISE
-from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
+from advsearch.scene.transport.matrix import MOST_BYTES, PredictingRenderer
 
 MOST_RAYS = 1 << 21
 """Rays of cameras of one launch."""

@@ -26,7 +26,7 @@ from advsearch.scene.environments import real_harmonics
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import PluginPart
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.renderer import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
+from advsearch.scene.transport.matrix import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
 
 ENVIRONMENT = "environment.padded"
 LAMPS = (".intensity", ".radiance")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.library import load_environment, load_object
-from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS, material_adjoint
+from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS, material_adjoint
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 SIZE = 48

@@ -20,11 +20,11 @@ from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
 from advsearch.scene.importing.texture import textured
-from advsearch.scene.mitsuba_backend.files.shapes import MESHES, ShapeMesh, haze_in, mesh_of
-from advsearch.scene.mitsuba_backend.files.surfaces import ShapeSurface, constant, surface_of
-from advsearch.scene.mitsuba_backend.files.xml import read_scene, trusted
 from advsearch.scene.mitsuba_backend.meshes import plain
+from advsearch.scene.mitsuba_backend.shape_surfaces import ShapeSurface, constant, surface_of
+from advsearch.scene.mitsuba_backend.shapes import MESHES, ShapeMesh, haze_in, mesh_of
 from advsearch.scene.mitsuba_backend.variant import Plugin
+from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
 
 SHAPES = frozenset(

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.material_form.view import (
+from advsearch.scene.mitsuba_backend.material_view import (
     _PATHS,
     Camera,
     FilmView,

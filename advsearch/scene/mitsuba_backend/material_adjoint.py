@@ -33,8 +33,8 @@ from typing import Any
 
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.material_form.edges import outline_terms, shadow_terms
-from advsearch.scene.mitsuba_backend.material_form.view import (
+from advsearch.scene.mitsuba_backend.material_edges import outline_terms, shadow_terms
+from advsearch.scene.mitsuba_backend.material_view import (
     _OUTLINES,
     _SHADOWS,
     Camera,
