@@ -56,7 +56,11 @@ def read_light(path: Path, what: str = "environment") -> LightPicture:
         return LightPicture(pixels.shape[:2], lambda top, end: linear(pixels[top:end]) * scale, tuple(notes))
     planes, notes = read_exr(path, data)
     _check_values(path, planes)
-    return LightPicture(planes[0].shape, lambda top, end: _stacked(planes, top, end), tuple(notes))
+
+    def stacked(top: int, end: int) -> Floats:
+        return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
+
+    return LightPicture(planes[0].shape, stacked, tuple(notes))
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
@@ -85,11 +89,6 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     return EnvironmentAsset(safe_name(file), radiance, source=str(file), warnings=tuple(notes), photographed=True)
 
 
-def _stacked(planes: Planes, top: int, end: int) -> Floats:
-    """Return some rows of three planes (H, W) as (n, W, 3) float32."""
-    return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
-
-
 def _check_values(file: Path, planes: Planes) -> None:
     """Refuse texels that are not light."""
     kinds: tuple[tuple[str, Callable[[Plane], Bools], str], ...] = (
@@ -109,12 +108,7 @@ def _check_values(file: Path, planes: Planes) -> None:
 
 
 def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
-    """Average a map down to at most `LARGEST`, and repeat its texels up to at least `SMALLEST`.
-
-    Args:
-        band: returns the map's rows from the first to before the second of its arguments, (n, W, 3) float32.
-        size: the map's rows and columns.
-    """
+    """Average a map down to at most `LARGEST`, and repeat its texels up to at least `SMALLEST`; see `LightPicture`."""
     height, width = size
     scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)
     if scale == 1.0:

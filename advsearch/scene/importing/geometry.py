@@ -171,7 +171,8 @@ def _wound(soup: Soup) -> tuple[Soup, list[str]]:
     if twisted:
         notes.append("has a one-sided surface (a Moebius strip), so some faces show their backs")
     soup = soup.reversed(turn)
-    inside_out = _inside_out(soup, shell, _closed(soup.faces, shell))
+    paired = np.bincount(shell[neighbours(soup.faces)[0] // 3], minlength=int(shell.max()) + 1) * 2
+    inside_out = _inside_out(soup, shell, np.equal(paired, 3 * np.bincount(shell)))
     if inside_out.any():
         notes.append(f"{int(inside_out[shell].sum())} faces were inside out and have been turned over")
     return soup.reversed(inside_out[shell]), notes
@@ -212,23 +213,17 @@ def _agreement(area: Doubles, left: Ints, right: Ints, same_way: Bools) -> tuple
     return turn, shell.astype(np.int64), bool((kept == turned).any())
 
 
-def _closed(faces: Ints, shell: Ints) -> Bools:
-    """Return, for each shell, whether all its edges belong to exactly two faces of it."""
-    left, _, _ = neighbours(faces)
-    paired = np.bincount(shell[left // 3], minlength=int(shell.max()) + 1) * 2
-    return np.equal(paired, 3 * np.bincount(shell))
-
-
 def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
     """Return, for each shell, whether it must be turned over.
 
-    A closed shell must when its signed volume is negative, unless it lies within another closed shell (then it is the
-    wall of a hollow) and the file's normals do not object. An open sheet must when the file's normals point away from
-    its front.
+    A closed shell, all of whose edges belong to exactly two faces of it, must when its signed volume is negative,
+    unless it lies within another closed shell (then it is the wall of a hollow) and the file's normals do not object.
+    An open sheet must when the file's normals point away from its front.
     """
     count, vectors = len(closed), soup.face_vectors()
     corners = soup.points[soup.faces]
-    middle = _per_shell(corners.mean(axis=1), shell) / np.bincount(shell)[:, None]
+    sums = [np.bincount(shell, weights=one) for one in corners.mean(axis=1).T]
+    middle = np.stack(sums, axis=1) / np.bincount(shell)[:, None]
     volume = np.bincount(shell, weights=((corners[:, 0] - middle[shell]) * vectors).sum(axis=1), minlength=count)
     toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
     agreement = np.bincount(shell, weights=toward, minlength=count)  # with the file's normals; 0 where it has none
@@ -241,11 +236,6 @@ def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
         around = closed & (low < low[number]).all(axis=1) & (high > high[number]).all(axis=1)
         negative[number] = not around.any() or (agreement[number] > 0.0 if mostly else agreement[number] < 0.0)
     return np.where(closed, negative ^ mostly, agreement < 0.0)
-
-
-def _per_shell(values: Doubles, shell: Ints) -> Doubles:
-    """Sum (F, 3) values over the faces of each shell."""
-    return np.stack([np.bincount(shell, weights=values[:, k]) for k in range(3)], axis=1)
 
 
 # --- normals ----------------------------------------

@@ -288,7 +288,9 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     for material, group in groups.items():
         surface, fit = surfaces.surface(material, [part.uvs for part in group.values() if part.uvs is not None])
         for key, part in group.items():
-            finished[key] = replace(part, surface=surface, uvs=None if part.uvs is None else _upwards(fit(part.uvs)))
+            finished[key] = replace(
+                part, surface=surface, uvs=None if part.uvs is None else fit(part.uvs) * [1.0, -1.0] + [0.0, 1.0]
+            )
     parts = [
         replace(placed(finished[mesh, number], pose), node=node)
         for node, pose in drawn
@@ -365,11 +367,6 @@ def _moved(uvs: Doubles, use: TextureUse | None) -> Doubles:
     sine, cosine = np.sin(given.rotation), np.cos(given.rotation)
     u, v = (uvs * given.scale).T
     return np.stack([cosine * u + sine * v, cosine * v - sine * u], axis=1) + given.offset
-
-
-def _upwards(uvs: Doubles) -> Doubles:
-    """Return texture coordinates with v = 0 at the bottom."""
-    return uvs * [1.0, -1.0] + [0.0, 1.0]
 
 
 def poses(header: Header) -> Iterator[tuple[int, Doubles]]:

@@ -217,7 +217,9 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         InputError: the geometry has NaN, infinite, or coincident vertices only.
     """
     seen = visible(parts)
-    cleared, parts = _cleared(parts, seen), seen
+    clear = ", ".join(dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in seen))
+    cleared = [f"all light passes through {clear} (opacity 0): left out; give it an opacity to see it"] if clear else []
+    parts = seen
     soup, axis = _upright(parts, file, up)
     soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
@@ -241,14 +243,6 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         normal_map=maps.normals,
         emission=_let_out(maps.emission, opacity),
     )
-
-
-def _cleared(parts: list[ImportedPart], kept: list[ImportedPart]) -> list[str]:
-    """Return a warning that names the materials of what was left out."""
-    names = dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in kept)
-    if not names:
-        return []
-    return [f"all light passes through {', '.join(names)} (opacity 0): left out; give it an opacity to see it"]
 
 
 def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path) -> Mesh:

@@ -221,9 +221,12 @@ def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surf
         surfaces: the surface of each part.
 
     Returns:
-        Maps (N, N, ...). Texels outside every chart repeat the nearest one inside, so that filtering finds no seam.
+        Maps (N, N, ...) with room for the texels that the object shows. Texels outside every chart repeat the nearest
+        one inside, so that filtering finds no seam.
     """
-    size = _baked_size(_texels(soup, surfaces))
+    size, texels = BAKED_SIZE, _texels(soup, surfaces)
+    while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
+        size *= 2
     corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
     face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
     through = any(int((_plain(one) if one.texture is None else one.texture).shape[-1]) == 4 for one in surfaces)
@@ -241,8 +244,8 @@ def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surf
         color = _looked_up(surface, at)
         image[rows[here], columns[here], : color.shape[1]] = _tinted(color, factor[here])
         if normals is not None and surface.normal_map is not None and np.isfinite(at).all():
-            texels = sampled(surface.normal_map, at)
-            normals[rows[here], columns[here]] = turned(texels, soup, uvs, face[here], weights[here])
+            bumps = sampled(surface.normal_map, at)
+            normals[rows[here], columns[here]] = turned(bumps, soup, uvs, face[here], weights[here])
         if emission is not None and surface.emission is not None and np.isfinite(at).all():
             emission[rows[here], columns[here]] = sampled(surface.emission, at)
     inside[rows, columns] = True
@@ -267,14 +270,6 @@ def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     for number, area in enumerate(np.bincount(soup.part, areas)):
         texels += float(area) * max((one.shape[0] * one.shape[1] for one in surfaces[number].pictures), default=0)
     return texels
-
-
-def _baked_size(texels: float) -> int:
-    """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
-    size = BAKED_SIZE
-    while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
-        size *= 2
-    return size
 
 
 def _mean(texture: Floats) -> Floats:

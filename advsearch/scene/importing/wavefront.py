@@ -95,7 +95,8 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         uvs = Looked(tables["vt"], mapped).at(chosen)
         if uvs is not None:
             uvs = replace(uvs, values=uvs.values * painted.scale + painted.offset)
-            if painted.clamped and _beyond(uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]):
+            used = uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]
+            if painted.clamped and len(used) and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND):
                 reader.note(
                     f"{path.name} has textures that are not to repeat beyond their edges (-clamp); here they do"
                 )
@@ -111,13 +112,7 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
 
 @dataclass(frozen=True)
 class _Said:
-    """Statements with the rows that they are in.
-
-    Attributes:
-        libraries: what stands after ``mtllib``.
-        materials: names after ``usemtl``.
-        smoothing: words after ``s``.
-    """
+    """What stands after ``mtllib``, names after ``usemtl`` and words after ``s``, with the rows that they are in."""
 
     libraries: list[str]
     materials: list[tuple[int, str]]
@@ -200,11 +195,6 @@ def _tinted(
     if surface.color[:3].min() < 0.999 and tint.min() < 1.0:
         reader.note(f"{reader.source}: colours of vertices are multiplied by the Kd of their material")
     return surface, tint
-
-
-def _beyond(uvs: Doubles) -> bool:
-    """Whether texture coordinates (N, 2) leave the texture by more than `BEYOND`."""
-    return bool(len(uvs)) and not (uvs.min() >= -BEYOND and uvs.max() <= 1.0 + BEYOND)
 
 
 Bytes = npt.NDArray[np.uint8]

@@ -99,7 +99,8 @@ class TriMesh:
 
     def point(self, ends: Tensor, part: Tensor) -> Any:
         """Points on edges, attached; ends (n, 2) vertices, part (n,) in [0, 1] of the way."""
-        a, b = (dr.gather(mi.Point3f, self.positions, _indices(ends[:, side])) for side in (0, 1))
+        sides = (mi.UInt32(ends[:, side].to(torch.int32).contiguous()) for side in (0, 1))
+        a, b = (dr.gather(mi.Point3f, self.positions, side) for side in sides)
         return dr.fma(b - a, as_numbers(part), a)
 
 
@@ -227,10 +228,6 @@ def as_array(tensor: Tensor) -> Any:
 
 def as_numbers(tensor: Tensor) -> Any:
     return mi.Float(tensor.to(torch.float32).contiguous())
-
-
-def _indices(tensor: Tensor) -> Any:
-    return mi.UInt32(tensor.to(torch.int32).contiguous())
 
 
 def as_vectors(kind: Any, tensor: Tensor) -> Any:

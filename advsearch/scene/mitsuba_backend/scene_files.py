@@ -67,11 +67,6 @@ def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
     return plain(scene), notes
 
 
-def shape_ids(tree: Mapping[str, object]) -> list[str]:
-    """The ids of the shapes of a scene."""
-    return [name for name, one in _plugins(tree) if one["type"] in SHAPES]
-
-
 @dataclass(frozen=True)
 class PluginContents:
     """What is in a Mitsuba scene, by id.
@@ -146,7 +141,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     """
     tree, notes = read_tree(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
-    ids = shape_ids(tree)
+    ids = [name for name, one in _plugins(tree) if one["type"] in SHAPES]
     wanted = _meant(wanted, ids)
     if wanted not in ids:
         raise UnknownNameError(f"shape of {where}", wanted, ids)
@@ -262,14 +257,8 @@ def _without(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
 
 
 def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool) -> Iterator[str]:
-    """Sentences about what is not as it is in the file.
-
-    Args:
-        tree: the scene.
-        shape: the object in it.
-        hazy: the camera's medium is the scene's haze.
-        lit: the object keeps its light.
-    """
+    """Sentences about what is not as it is in the file; `hazy`: the camera's medium is the scene's haze, `lit`: the
+    object keeps its light."""
     for name, one in _plugins(tree):
         kind = one["type"]
         if kind in SENSORS - CAMERAS:

@@ -307,7 +307,14 @@ def _through(model: CameraModel, height: int, width: int) -> Floats:
 def _seen(found: Sequence[Any], size: tuple[int, int, int]) -> Seen:
     """What the kernel has found, in memory of torch's own; `size` in cameras, rows and columns."""
     with one_at_a_time:
-        rest, covered, (u, v, weight) = found[:3], found[3], (_by_ray(found[k::3]) for k in (4, 5, 6))
+        rest, covered, (u, v, weight) = (
+            found[:3],
+            found[3],
+            (
+                np.stack([one.numpy() for one in found[k::3]], axis=1).ravel()  # all layers of a ray, ray by ray
+                for k in (4, 5, 6)
+            ),
+        )
         (met,) = np.nonzero(weight)
         return Seen(
             rest=torch.from_numpy(np.stack([one.numpy() for one in rest], axis=-1)).reshape(*size, 3),
@@ -317,11 +324,6 @@ def _seen(found: Sequence[Any], size: tuple[int, int, int]) -> Seen:
             weight=torch.from_numpy(np.abs(weight[met])),
             back=torch.from_numpy(weight[met] < 0.0),
         )
-
-
-def _by_ray(layers: Sequence[Any]) -> Floats:
-    """Arrays (n,) of all layers as one (n x layers,), ray by ray."""
-    return np.stack([one.numpy() for one in layers], axis=1).ravel()
 
 
 def _chosen(number: Any, values: Sequence[float]) -> Any:

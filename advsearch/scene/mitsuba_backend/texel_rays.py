@@ -212,18 +212,12 @@ def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
 # ---- places ---------------------------------------------------------------------------------------------------------
 
 
-def shapes_of(held: Any, grids: Sequence[TexelGrid]) -> list[Any]:
-    """Mitsuba's shapes of grids."""
-    by_name = {one.id(): one for one in held.shapes()}
-    return [by_name[grid.name] for grid in grids]
-
-
 def on_grids(held: Any, grids: Sequence[TexelGrid], hit: Any, way: Any) -> list[Any]:
     """Whether hits of rays in a direction lie on each grid."""
-    front = dr.dot(hit.n, way) < 0.0
+    front, shapes = dr.dot(hit.n, way) < 0.0, {one.id(): one for one in held.shapes()}
     found = []
-    for grid, shape in zip(grids, shapes_of(held, grids), strict=True):
-        on = hit.is_valid() & (hit.shape == mi.ShapePtr(shape))
+    for grid in grids:
+        on = hit.is_valid() & (hit.shape == mi.ShapePtr(shapes[grid.name]))
         found.append(on & (front if grid.side > 0 else ~front) if grid.side else on)
     return found
 

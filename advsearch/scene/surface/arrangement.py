@@ -283,7 +283,9 @@ class Arrangement:
                 if self._photographed is not None:
                     leaving[ground] = arriving[ground] / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
                 leaving[ground] = self._smooth @ leaving[ground]
-                unhidden = self._border(leaving[ground])
+                cells = leaving[ground].reshape(*self.texels.grids[-1].shape, 3)
+                rim = torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]])  # the object hides little of it
+                unhidden = rim.mean(dim=0, keepdim=True).clamp_min(1e-9)
                 seen = unhidden
                 if self._photographed is not None:
                     seen = unhidden * looked_up(padded, below.reshape(-1, 3)).reshape(*BLURRED, 3)
@@ -291,11 +293,6 @@ class Arrangement:
             on_object = torch.cat([one @ arriving[self.texels.of(side)] for side, one in enumerate(self._between)])
             cells = torch.cat([leaving[torch.from_numpy(self.texels.of_cell)], unhidden])
             return Light(on_object, lit_arrays(cells, padded, blurred(shown)))
-
-    def _border(self, ground: Tensor) -> Tensor:
-        """The mean (1, 3) of a ground's light at its border, where the object hides little of it."""
-        cells = ground.reshape(*self.texels.grids[-1].shape, 3)
-        return torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]]).mean(dim=0, keepdim=True).clamp_min(1e-9)
 
     def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """(n, 3) of each texel, the gloss counted as if it were diffuse."""

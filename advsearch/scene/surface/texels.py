@@ -152,7 +152,8 @@ def between(
     place, normal = _surface(fine, vertices, normals)
     rows, columns = np.nonzero(fine.distance <= BORDER)
     at, facing = place[rows, columns], normal[rows, columns]
-    side = math.sqrt(max(_side_squared(charts, vertices), 1e-12))
+    scale = np.ptp(vertices, axis=0).max() / max(float(np.ptp(charts.mesh.vertices, axis=0).max()), 1e-12)
+    side = math.sqrt(max(float(charts.areas()[charts.covered].mean()) * float(scale) ** 2, 1e-12))  # of a texel, there
     tall, wide = charts.covered.shape
     y, x = (rows + 0.5) * tall / shape[0] - 0.5, (columns + 0.5) * wide / shape[1] - 0.5
     number = np.where(charts.covered, np.cumsum(charts.covered.ravel()).reshape(charts.covered.shape) - 1, -1)
@@ -217,13 +218,6 @@ def _surface(charts: Charts, vertices: Floats, normals: Floats) -> tuple[Floats,
     normal = np.einsum("hwk,hwkc->hwc", charts.weights, normals[corners])
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     return place.astype(np.float32), (normal / np.maximum(length, 1e-12)).astype(np.float32)
-
-
-def _side_squared(charts: Charts, vertices: Floats) -> float:
-    """The area of a texel in world space, the mean over those on the surface."""
-    areas, mesh = charts.areas(), charts.mesh
-    scale = np.ptp(vertices, axis=0).max() / max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-12)
-    return float(areas[charts.covered].mean()) * float(scale) ** 2
 
 
 def _nearest(covered: Bools) -> Ints:
@@ -312,18 +306,16 @@ def _hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     index = torch.searchsorted(order, steps).clamp_max(power.numel() - 1)
     row, column = index // columns, index % columns
     number = torch.arange(HOT_RAYS, dtype=torch.float64)
-    down, beside = (_tent((number * step % HOT_RAYS + 0.5) / HOT_RAYS) for step in SPREAD)
+    even = [(number * step % HOT_RAYS + 0.5) / HOT_RAYS for step in SPREAD]
+    down, beside = (
+        torch.where(one < 0.5, (2.0 * one).sqrt() - 1.0, 1.0 - (2.0 - 2.0 * one).sqrt()) for one in even
+    )  # with a tent's density in [-1, 1]
     polar = ((row + down) * (math.pi / (rows - 1))).clamp(0.0, math.pi)
     across = (column + 0.5 + beside) * (2.0 * math.pi / columns)
     ways = torch.stack([polar.sin() * across.sin(), polar.cos(), -polar.sin() * across.cos()], dim=1).float()
     angle = math.pi / (rows - 1) * 2.0 * math.pi / columns
     colour = radiance[row, column] / (radiance[row, column] @ LUMINANCE)[:, None].clamp_min(1e-12)
     return ways, colour * (float(total) * angle / HOT_RAYS)
-
-
-def _tent(even: Tensor) -> Tensor:
-    """Numbers in [-1, 1] with a tent's density, from even ones in [0, 1]."""
-    return torch.where(even < 0.5, (2.0 * even).sqrt() - 1.0, 1.0 - (2.0 - 2.0 * even).sqrt())
 
 
 def _pooled(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
