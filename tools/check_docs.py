@@ -46,7 +46,7 @@ from advsearch.runs.results.render import RenderResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene import environments, exposure, library
 from advsearch.scene.description import FRAME_FILL
-from advsearch.scene.importing.images import TEXTURE_LIMIT
+from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import settings

@@ -102,14 +102,14 @@ FAULTS = (
     ),
     Fault(
         "exporting: normals are flipped",
-        "advsearch/scene/exporting/gltf.py",
+        "advsearch/scene/glb.py",
         "_y_up(_unit(mesh.normals))",
         "_y_up(_unit(-mesh.normals))",
         ("tests/api/test_export_scene.py",),
     ),
     Fault(
         "exporting: degrees for radians",
-        "advsearch/scene/exporting/cycles.py",
+        "advsearch/scene/cycles.py",
         '"fov": math.radians(fov),',
         '"fov": fov,',
         ("tests/scene/test_cycles.py",),

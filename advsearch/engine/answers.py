@@ -22,7 +22,7 @@ from advsearch.models import Model
 from advsearch.report.phrases import seen_text
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
-from advsearch.scene.transport.renderer import linear_inputs
+from advsearch.scene.transport.matrix import linear_inputs
 from advsearch.tasks import Answer, Facts, Task
 from advsearch.tasks.base import Truth
 

@@ -17,11 +17,11 @@ from advsearch.report.marks import marked
 from advsearch.runs import images
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.files import write_bytes
+from advsearch.scene.assets import simpler
 from advsearch.scene.description import OBJECT
-from advsearch.scene.exporting.gltf import PosedMesh, posed, web_glb
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.simpler import simpler
+from advsearch.scene.glb import PosedMesh, posed, web_glb
 from advsearch.tasks import Judgement, Mark
 
 MOST_FACES = 30_000

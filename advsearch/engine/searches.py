@@ -31,7 +31,7 @@ from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason_against, remark
 from advsearch.report.wording import count
-from advsearch.scene.transport.renderer import TransportTooLargeError
+from advsearch.scene.transport.matrix import TransportTooLargeError
 
 MOST_FRAMES = 60
 """Pictures of a search that its animation has, at most."""

@@ -21,7 +21,7 @@ from advsearch.engine.planning import BOUND, measured_bounces
 from advsearch.questions.plan.carry_out import plan_from_config
 from advsearch.questions.plan.leaving_out import ALL, RENDERS, WHAT, measured_gains, resolved_texels
 from advsearch.questions.plan.settings import PlanConfig
-from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
+from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
 
 SIZE = 40

@@ -23,9 +23,8 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Light
-from advsearch.scene.surface.plan import varied, why_not_kept
-from advsearch.scene.surface.renderer import SurfaceRenderer
-from advsearch.scene.transport.renderer import MOST_BYTES
+from advsearch.scene.surface.renderer import SurfaceRenderer, varied, why_not_kept
+from advsearch.scene.transport.matrix import MOST_BYTES
 
 CHECK_SPP = 32
 """Samples a pixel of each of the two traced pictures of a comparison. Of single views of the bundled mug that are off

@@ -33,7 +33,7 @@ from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import CosineRow, Formation, PathLength
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
-from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS
+from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -1,6 +1,6 @@
 """What leaving things out brings on a scene as it is, and the proof that nothing of it changes the answer.
 
-Each item of `advsearch.scene.leaving_out` is put back alone, then all together. The gain is the time of a gradient
+Each item of `advsearch.scene.formation` is put back alone, then all together. The gain is the time of a gradient
 with it over the time without, medians of interleaved repeats, times the same ratio of the picture's variance. The proof
 is that the same seed gives the same picture and the same gradient: what differs is measured against what another seed
 changes. An item that draws other random numbers may change as much as another seed does, but not more.
@@ -21,11 +21,11 @@ from advsearch.engine.gradients import Loss
 from advsearch.engine.transport import WORTH
 from advsearch.questions.plan.answer import GainRow, TexelRow
 from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
+from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import predicting, why_not
-from advsearch.scene.transport.renderer import SPP
+from advsearch.scene.transport.matrix import SPP
 
 ALL = "everything above"
 """Name of the row in which all items are put back together."""

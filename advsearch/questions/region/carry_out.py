@@ -37,7 +37,7 @@ from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
 from advsearch.runs.summary import read_answer
-from advsearch.scene.surface import plan
+from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.settings import split_names
 from advsearch.viewer.pages import write_page
@@ -200,12 +200,12 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
     """What predicts pictures while the box grows, and those of the map, where a camera moves and that pays; fresh
     samples of the box are rendered (docs/surface-light.md)."""
     problem, stages, findings = verifier.problem, verifier.stages, verifier.findings
-    moved = plan.varied(problem.renderer, varied.groups)
+    moved = surface_renderer.varied(problem.renderer, varied.groups)
     if not config.specialise or not moved & CAMERAS or not moved <= FREE:
         return None
     wanted = USUAL * len(varied.names) + config.map**2
     least = pays_from(problem.renderer, findings.spp, COMPARED)
-    reason = plan.why_not_kept(problem.renderer)
+    reason = surface_renderer.why_not_kept(problem.renderer)
     if reason is None and wanted < least:
         reason = f"light on surfaces pays from {least} pictures on"
     if reason is None:

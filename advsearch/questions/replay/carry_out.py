@@ -36,7 +36,7 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import attack_of
-from advsearch.scene.exporting.cycles import BlenderError, Cycles
+from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP
 from advsearch.viewer.pages import write_page
 

@@ -18,8 +18,7 @@ from advsearch.questions.stability.cases_transport import TRACED, mug
 from advsearch.questions.stability.scene import REFERENCE_SPP, ControlSettings, small
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.plan import why_not
-from advsearch.scene.surface.renderer import SurfaceRenderer
+from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
 
 GROUP = CaseGroup("surface light")
 LEVELS = 4.0

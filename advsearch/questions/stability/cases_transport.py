@@ -16,7 +16,7 @@ from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import BasisRenderer
-from advsearch.scene.transport.renderer import LinearRenderer
+from advsearch.scene.transport.matrix import LinearRenderer
 
 GROUP = CaseGroup("transport")
 TRACED = 256

@@ -50,7 +50,7 @@ from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, fi
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import attack_of, read_answer
 from advsearch.scene.description import ENVIRONMENT
-from advsearch.scene.parameters import Parameter
+from advsearch.scene.settings import Parameter
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task

@@ -25,11 +25,11 @@ from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.scene.assets import Material, Mesh
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.exporting.gltf import PosedMesh, glb, posed
 from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.glb import PosedMesh, glb, posed
+from advsearch.scene.grounds import paved
 from advsearch.scene.importing.blender import command, last_line, surroundings
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
-from advsearch.scene.road import paved
 
 LONGEST = 300
 """Seconds that one picture may take, the start included, before `advsearch.files.scaled`."""

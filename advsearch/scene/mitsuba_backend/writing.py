@@ -21,12 +21,10 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.mitsuba_backend.dictionary import GROUND, scene_dict
-from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, matt, own_surface, principled
-from advsearch.scene.mitsuba_backend.parts import translation
-from advsearch.scene.mitsuba_backend.plugins import loadable
+from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, loadable, matt, own_surface, principled
+from advsearch.scene.mitsuba_backend.parts import GROUND, scene_dict, translation
 from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import (
     BallLamp,
     HazePart,
@@ -101,9 +99,9 @@ def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, 
         value = left.pop(f"camera.{name}", None)
         if value is not None:
             matrix = value.shape == (4, 4)
-            scene["camera"][key] = mitsuba().ScalarTransform4f(value) if matrix else float(value[0])
+            scene["camera"][key] = mi.ScalarTransform4f(value) if matrix else float(value[0])
     if "environment.padded" in left:
-        scene["environment"]["bitmap"] = mitsuba().Bitmap(np.ascontiguousarray(left.pop("environment.padded")[:, 1:-1]))
+        scene["environment"]["bitmap"] = mi.Bitmap(np.ascontiguousarray(left.pop("environment.padded")[:, 1:-1]))
     if description.photograph is not None:
         base_color = description.photograph.base.numpy()
         scene[GROUND] = {"type": "ply", "bsdf": matt(left.pop("ground.reflectance", base_color))}
@@ -176,7 +174,7 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
         ball = given.pop("ball", None)
         found = translation(replace(part, **_triples(given))).plugins[part.name]
         if ball is not None:
-            found["to_world"] = mitsuba().ScalarTransform4f(ball)
+            found["to_world"] = mi.ScalarTransform4f(ball)
     elif isinstance(part, PluginPart):
         found = loadable(part.plugin)
     else:
@@ -233,7 +231,6 @@ class _Writer:
 
     def put(self, into: ElementTree.Element, name: str, value: Any, *, top: bool = False, within: str = "") -> None:
         """Put an entry of a dictionary into an element."""
-        mi = mitsuba()
         named = {"name": name}
         if isinstance(value, Mapping):
             self._mapping(into, name, value, top=top, within=within)
@@ -277,7 +274,7 @@ class _Writer:
         elif kind == "ref":
             ElementTree.SubElement(into, "ref", name=name, id=str(value["id"]))
         else:
-            tag = mitsuba().PluginManager.instance().plugin_type(kind).name
+            tag = mi.PluginManager.instance().plugin_type(kind).name
             one = ElementTree.SubElement(into, TAGS.get(tag, tag.lower()), type=kind)
             one.set("id" if top else "name", name)
             inside = name if top else f"{within}-{name}"

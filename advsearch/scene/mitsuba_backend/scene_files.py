@@ -12,48 +12,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.assets import Doubles, Floats, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
-from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
-from advsearch.scene.importing.surfaces import BRIGHTEST, ImportedSurface
 from advsearch.scene.importing.texture import textured
-from advsearch.scene.mitsuba_backend.files.haze import haze_in
-from advsearch.scene.mitsuba_backend.files.shapes import MESHES, ShapeMesh, mesh_of
-from advsearch.scene.mitsuba_backend.files.surfaces import ShapeSurface, constant, surface_of
-from advsearch.scene.mitsuba_backend.files.trusted import trusted
-from advsearch.scene.mitsuba_backend.files.xml import read_scene
-from advsearch.scene.mitsuba_backend.plugins import plain
+from advsearch.scene.mitsuba_backend.meshes import plain
+from advsearch.scene.mitsuba_backend.shape_surfaces import ShapeSurface, constant, surface_of
+from advsearch.scene.mitsuba_backend.shapes import MESHES, ShapeMesh, haze_in, mesh_of
 from advsearch.scene.mitsuba_backend.variant import Plugin
+from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
 
-Doubles = npt.NDArray[np.float64]
-
 SHAPES = frozenset(
-    """
-    rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve
-    ellipsoids ellipsoidsmesh merge
-    """.split()
+    "rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve "
+    "ellipsoids ellipsoidsmesh merge".split()
 )
-LIGHTS = frozenset(
-    """
-    constant envmap point spot directional projector sunsky timed_sunsky area directionalarea
-    """.split()
-)
-SENSORS = frozenset(
-    """
-    perspective thinlens orthographic radiancemeter irradiancemeter distant batch
-    """.split()
-)
+LIGHTS = frozenset("constant envmap point spot directional projector sunsky timed_sunsky area directionalarea".split())
+SENSORS = frozenset("perspective thinlens orthographic radiancemeter irradiancemeter distant batch".split())
 CAMERAS = frozenset(("perspective", "thinlens"))
 INTEGRATORS = frozenset(
-    """
-    path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes
-    """.split()
+    "path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes".split()
 )
 NOTHING = {"type": "null"}
 """The surface of what only bounds a medium."""
@@ -83,11 +65,6 @@ def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
         if name != "type" and not isinstance(one, Mapping)
     ]
     return plain(scene), notes
-
-
-def shape_ids(tree: Mapping[str, object]) -> list[str]:
-    """The ids of the shapes of a scene."""
-    return [name for name, one in _plugins(tree) if one["type"] in SHAPES]
 
 
 @dataclass(frozen=True)
@@ -164,7 +141,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     """
     tree, notes = read_tree(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
-    ids = shape_ids(tree)
+    ids = [name for name, one in _plugins(tree) if one["type"] in SHAPES]
     wanted = _meant(wanted, ids)
     if wanted not in ids:
         raise UnknownNameError(f"shape of {where}", wanted, ids)
@@ -280,14 +257,8 @@ def _without(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
 
 
 def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool) -> Iterator[str]:
-    """Sentences about what is not as it is in the file.
-
-    Args:
-        tree: the scene.
-        shape: the object in it.
-        hazy: the camera's medium is the scene's haze.
-        lit: the object keeps its light.
-    """
+    """Sentences about what is not as it is in the file; `hazy`: the camera's medium is the scene's haze, `lit`: the
+    object keeps its light."""
     for name, one in _plugins(tree):
         kind = one["type"]
         if kind in SENSORS - CAMERAS:

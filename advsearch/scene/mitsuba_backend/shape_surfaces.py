@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from advsearch.scene.assets import Floats
+from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, plugins_in
-
-Doubles = npt.NDArray[np.float64]
 
 COLORS = {
     "diffuse": "reflectance",
@@ -89,11 +86,15 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
 
     surface = without(bsdf)
     color = found or _Color(np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {})
-    notes = [*_unusual(surface)]
+    notes, plugins = [], list(plugins_in(surface))
+    if not any(one["type"] == BASE_COLOR for one in plugins):
+        kinds = sorted({str(one["type"]) for one in plugins} & {"mesh_attribute", "volume"})
+        why = f"its colour is a {kinds[0]}" if kinds else f"a {surface['type']} has none"
+        notes.append(f"it has no base colour that can be searched ({why}): not for texture, patch and material")
     if not (color.linear.min() >= 0.0 and color.linear.max() <= 1.0 + 1e-4):
         notes.append("its base colour is cut to reflectances from 0 to 1")
     picture = color.linear.shape[:2] != (PLAIN_SIZE, PLAIN_SIZE) or bool(np.ptp(color.linear, axis=(0, 1)).any())
-    bound = any(one["type"] in BOUND or ANISOTROPIC & set(one) for one in plugins_in(surface))
+    bound = any(one["type"] in BOUND or ANISOTROPIC & set(one) for one in plugins)
     to_uv = np.eye(3) if color.to_uv is None else uv_matrix(color.to_uv)
     if not _folds(surface, to_uv):
         surface, to_uv = _with_transform(surface, to_uv, BASE_COLOR), np.eye(3)
@@ -101,14 +102,6 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
         surface = _with_transform(surface, np.asarray(np.linalg.inv(to_uv), np.float64), *PLACED)
     base_color = linear_to_srgb(np.clip(color.linear, 0.0, 1.0))
     return ShapeSurface(surface, base_color, picture, to_uv, bound, tuple(notes))
-
-
-def _unusual(surface: Mapping[str, object]) -> Iterator[str]:
-    """Clauses about textures that controls do not reach."""
-    if not any(one["type"] == BASE_COLOR for one in plugins_in(surface)):
-        kinds = sorted({str(one["type"]) for one in plugins_in(surface)} & {"mesh_attribute", "volume"})
-        why = f"its colour is a {kinds[0]}" if kinds else f"a {surface['type']} has none"
-        yield f"it has no base colour that can be searched ({why}): not for texture, patch and material"
 
 
 def _folds(surface: Mapping[str, object], to_uv: Doubles) -> bool:
@@ -172,7 +165,6 @@ def _pixels(value: Mapping[str, object]) -> Floats | None:
         picture = picture[:, :, None] if picture.ndim == 2 else picture
         picture = picture[:, :, :1] if picture.shape[2] == 2 else picture[:, :, :3]
         return np.broadcast_to(picture, (*picture.shape[:2], 3)).astype(np.float32)
-    mi = mitsuba()
     if picture is None and "filename" not in value:
         return None
     try:

@@ -7,19 +7,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.material_form.view import (
+from advsearch.scene.mitsuba_backend.material_view import (
     _PATHS,
     Camera,
     FilmView,
     TriMesh,
     as_numbers,
     as_vectors,
-    both_backends,
     film_places,
     from_vector,
     own_sampler,
     uniform_numbers,
 )
+from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 EDGE_OFFSET = 0.01
 """How far beside an outline we look for what is behind it, in pixels."""
@@ -38,7 +38,6 @@ NEAREST = 1e-3
 
 def outline_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
     """A number whose gradient is the outline term's, for the edges of one mesh."""
-    mi, dr = both_backends()
     found = _sampled_outline(view.camera, mesh, uniform_numbers(stream, spp * view.camera.pixels, 1)[:, 0])
     if found is None:
         return mi.Float(0)
@@ -142,7 +141,6 @@ def _silhouette(places: Tensor, corners: Tensor, eye: Tensor) -> tuple[Tensor, T
 
 def shadow_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
     """A number whose gradient is the shadow term's, for the edges of one mesh."""
-    mi, dr = both_backends()
     found = _sampled_tangents(mesh, uniform_numbers(stream, spp * view.camera.pixels, 4))
     if found is None:
         return mi.Float(0)
@@ -172,7 +170,6 @@ def shadow_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
 
 def _lit_value(view: FilmView, si: Any, d: Any) -> Any:
     """W f J' of lit points that the camera sees, for light from d; elsewhere 0."""
-    mi, dr = both_backends()
     camera = view.camera
     film, depth, to_eye = camera.project(si.p), camera.depth(si.p), camera.eye - si.p
     active = si.is_valid() & (depth > NEAREST) & camera.shows(film)
@@ -187,7 +184,6 @@ def _lit_value(view: FilmView, si: Any, d: Any) -> Any:
 
 def _past_minus_hit(view: FilmView, si: Any, p: Any, beside: Any, stream: int) -> Any:
     """Difference of the radiance that arrives at a lit point just past an edge and just inside it."""
-    mi, dr = both_backends()
 
     def seen(target: Any, active: Any) -> Any:
         ray = towards(target)

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
 from advsearch.files import read_text
-from advsearch.scene.cameras.model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
+from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 MOST_PIXELS = 1 << 16

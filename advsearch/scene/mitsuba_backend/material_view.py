@@ -11,21 +11,12 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.meshes import FACES, POSITIONS
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 ROUGH_COTANGENT = 0.5
 """A cotangent whose neighbours are less correlated than this counts as rough."""
 _OUTLINES, _PATHS, _SHADOWS = 1, 2, 3
 """Streams of random numbers of one seed; the interior has number 0."""
-
-
-def both_backends() -> tuple[Any, Any]:
-    """Mitsuba and Dr.Jit, untyped: what Dr.Jit says of its types is incomplete."""
-    mi = mitsuba()
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit
-
-    return mi, drjit
 
 
 # ---- the scene as we see it -----------------------------------------------------------------------------------------
@@ -48,18 +39,15 @@ class Camera:
 
     def project(self, point: Any) -> Any:
         """Film position in pixels of a point, differentiable."""
-        mi = mitsuba()
         seen = self.to_film @ (self.to_local @ mi.Point3f(point))
         return mi.Point2f(seen.x * self.width, seen.y * self.height)
 
     def depth(self, point: Any) -> Any:
         """Distance along the viewing axis."""
-        _, dr = both_backends()
         return dr.dot(point - self.eye, self.forward)
 
     def ray(self, film: Any) -> Any:
         """The ray through a film position in pixels."""
-        mi, dr = both_backends()
         near = self.to_film.inverse() @ mi.Point3f(film.x / self.width, film.y / self.height, 0.0)
         return mi.Ray3f(self.eye, dr.normalize(self.to_local.inverse() @ mi.Vector3f(near)))
 
@@ -76,7 +64,6 @@ class Camera:
 
 
 def read_camera(sensor: Any) -> Camera:
-    mi, dr = both_backends()
     to_world = sensor.world_transform()
     width, height = (int(side) for side in sensor.film().crop_size())
     forward = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
@@ -112,8 +99,8 @@ class TriMesh:
 
     def point(self, ends: Tensor, part: Tensor) -> Any:
         """Points on edges, attached; ends (n, 2) vertices, part (n,) in [0, 1] of the way."""
-        mi, dr = both_backends()
-        a, b = (dr.gather(mi.Point3f, self.positions, _indices(ends[:, side])) for side in (0, 1))
+        sides = (mi.UInt32(ends[:, side].to(torch.int32).contiguous()) for side in (0, 1))
+        a, b = (dr.gather(mi.Point3f, self.positions, side) for side in sides)
         return dr.fma(b - a, as_numbers(part), a)
 
 
@@ -121,11 +108,10 @@ def _mesh(shape: Any, faces: Any, vertices: Tensor, normals: Tensor) -> TriMesh:
     corners = faces.torch().reshape(-1, 3).to("cpu", torch.int64)
     smooth = bool(shape.has_vertex_normals())
     places = vertices.detach().to("cpu", torch.float64)
-    return TriMesh(mitsuba().ShapePtr(shape), as_array(vertices), as_array(normals), faces, smooth, corners, places)
+    return TriMesh(mi.ShapePtr(shape), as_array(vertices), as_array(normals), faces, smooth, corners, places)
 
 
 def moving_mesh(scene: Any, parameters: Any, key: str, vertices: Tensor, normals: Tensor) -> TriMesh:
-    _, dr = both_backends()
     shape = next(shape for shape in scene.shapes() if shape.id() == key)
     mesh = _mesh(shape, parameters[f"{key}.{FACES}"], vertices, normals)
     dr.enable_grad(mesh.positions, mesh.normals)
@@ -155,7 +141,6 @@ class FilmView:
 
     def weight(self, film: Any, active: Any) -> Any:
         """The cotangent at a film position, bilinear between pixel centres, zero outside; differentiable in it."""
-        mi, dr = both_backends()
         width, height = self.camera.width, self.camera.height
         active = active & self.camera.shows(dr.detach(film))
         at = film + 0.5
@@ -170,7 +155,6 @@ class FilmView:
     def follow(self, hit: Any) -> tuple[Any, Any, Any, Any]:
         """Return a hit's place, triangle normal (times twice the area) and shading normal, attached to the vertices,
         and whether it is on a moving mesh at all; elsewhere they mean nothing."""
-        mi, dr = both_backends()
         place, facet, bent, moves = mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Bool(False)
         u, v = hit.prim_uv
         for mesh in self.meshes:
@@ -188,52 +172,43 @@ class FilmView:
 
     def radiance(self, ray: Any, sampler: Any, depth: int, active: Any) -> Any:
         """One sample of what arrives along a ray, over paths of up to `depth` segments; a constant."""
-        _, dr = both_backends()
         tracer = _path_tracer(max(depth, 1))
         return tracer.sample(dr.ADMode.Primal, self.scene, sampler, ray, None, None, active)[0]
 
 
 @cache
 def _path_tracer(depth: int) -> Any:
-    return mitsuba().load_dict({"type": "prb", "max_depth": depth, "rr_depth": 1000})
+    return mi.load_dict({"type": "prb", "max_depth": depth, "rr_depth": 1000})
 
 
 # ---- random numbers, and the way between torch and Dr.Jit -----------------------------------------------------------
 
 
-@cache
-def _sampler_type() -> Any:
-    mi = mitsuba()
+class _Sampler:
+    """What a path tracer asks of a sampler, over a generator whose state is ours to share."""
 
-    class Sampler:
-        """What a path tracer asks of a sampler, over a generator whose state is ours to share."""
+    DRJIT_STRUCT = {"rng": mi.PCG32}  # noqa: RUF012 (Dr.Jit wants a plain dictionary)
 
-        DRJIT_STRUCT = {"rng": mi.PCG32}  # noqa: RUF012 (Dr.Jit wants a plain dictionary)
+    def __init__(self) -> None:
+        self.rng = mi.PCG32()
 
-        def __init__(self) -> None:
-            self.rng = mi.PCG32()
+    def next_1d(self, active: Any = True) -> Any:
+        return self.rng.next_float32()
 
-        def next_1d(self, active: Any = True) -> Any:
-            return self.rng.next_float32()
-
-        def next_2d(self, active: Any = True) -> Any:
-            return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-
-    return Sampler
+    def next_2d(self, active: Any = True) -> Any:
+        return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
 
 
 def shared_sampler(stream: int, count: int, index: Any) -> Any:
     """One of `count` streams of numbers for every lane; lanes of the same index draw the same numbers."""
-    mi, dr = both_backends()
     base = mi.PCG32(count, mi.UInt64(stream))
-    sampler = _sampler_type()()
+    sampler = _Sampler()
     sampler.rng.state = dr.gather(mi.UInt64, base.state, index)
     sampler.rng.inc = dr.gather(mi.UInt64, base.inc, index)
     return sampler
 
 
 def own_sampler(stream: int, count: int) -> Any:
-    mi, dr = both_backends()
     return shared_sampler(stream, count, dr.arange(mi.UInt32, count))
 
 
@@ -248,15 +223,11 @@ def uniform_numbers(stream: int, count: int, dimensions: int) -> Tensor:
 
 
 def as_array(tensor: Tensor) -> Any:
-    return mitsuba().TensorXf(tensor.detach().to("cpu", torch.float32).contiguous()).array
+    return mi.TensorXf(tensor.detach().to("cpu", torch.float32).contiguous()).array
 
 
 def as_numbers(tensor: Tensor) -> Any:
-    return mitsuba().Float(tensor.to(torch.float32).contiguous())
-
-
-def _indices(tensor: Tensor) -> Any:
-    return mitsuba().UInt32(tensor.to(torch.int32).contiguous())
+    return mi.Float(tensor.to(torch.float32).contiguous())
 
 
 def as_vectors(kind: Any, tensor: Tensor) -> Any:
@@ -270,13 +241,11 @@ def from_vector(value: Any) -> Tensor:
 
 def film_places(camera: Camera, places: Tensor) -> Tensor:
     """(n, 2) float64 film positions of (n, 3) points."""
-    mi = mitsuba()
     film = camera.project(as_vectors(mi.Point3f, places))
     return torch.stack([film.x.torch(), film.y.torch()], dim=1).to("cpu", torch.float64)
 
 
 def gradient_of(value: Any) -> Tensor:
-    _, dr = both_backends()
     found: Tensor = dr.grad(value).torch().reshape(-1, 3).cpu().clone()
     return found
 

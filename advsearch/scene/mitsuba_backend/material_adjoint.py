@@ -33,14 +33,13 @@ from typing import Any
 
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.material_form.edges import outline_terms, shadow_terms
-from advsearch.scene.mitsuba_backend.material_form.view import (
+from advsearch.scene.mitsuba_backend.material_edges import outline_terms, shadow_terms
+from advsearch.scene.mitsuba_backend.material_view import (
     _OUTLINES,
     _SHADOWS,
     Camera,
     FilmView,
     as_array,
-    both_backends,
     gradient_of,
     is_rough,
     moving_mesh,
@@ -50,7 +49,7 @@ from advsearch.scene.mitsuba_backend.material_form.view import (
     still_meshes,
     stream_of,
 )
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 
 @dataclass(frozen=True)
@@ -116,16 +115,16 @@ def material_adjoint(
     sensor: Any,
     parameters: Any,
     *,
-    mesh_key: str | Sequence[str],
-    vertices: Any,
-    normals: Any,
+    names: Sequence[str],
+    vertices: Sequence[Tensor],
+    normals: Sequence[Tensor],
     cotangent: Tensor,
     seed: int,
     spp: int,
     boundary_spp: int = 4,
     max_depth: int = 6,
     shadow_spp: int = 0,
-) -> Any:
+) -> tuple[list[Tensor], list[Tensor]]:
     """Return the gradient of `sum(cotangent * radiance)` with respect to vertex places and vertex normals.
 
     The scene is only read. Nothing is recorded with `dr.freeze`. The first call for a depth makes a path tracer.
@@ -134,9 +133,9 @@ def material_adjoint(
         scene: Mitsuba's scene, loaded with `optimize=False`.
         sensor: a perspective camera of it; a thin lens is taken for a pinhole.
         parameters: `mi.traverse(scene)`.
-        mesh_key: name of the moving mesh; a list for several that move.
-        vertices: (V, 3) float32, world units, as the scene has them; a list if `mesh_key` is one.
-        normals: (V, 3) float32, as the scene has them; a list if `mesh_key` is one.
+        names: of the moving meshes.
+        vertices: of each, (V, 3) float32, world units, as the scene has them.
+        normals: of each, (V, 3) float32, as the scene has them.
         cotangent: (H, W, 3) float32, derivative of the loss by the radiance of box-filtered pixels.
         seed: number of the noise, at least 0.
         spp: samples a pixel of the interior term.
@@ -145,16 +144,12 @@ def material_adjoint(
         shadow_spp: samples of the edges that cast shadows, in multiples of the number of pixels; 0 leaves them out.
 
     Returns:
-        The gradients by the vertices and by the normals, (V, 3) float32 each; two lists if `mesh_key` is one.
+        The gradients by the vertices and by the normals of each mesh, (V, 3) float32.
     """
-    _, dr = both_backends()
-    single = isinstance(mesh_key, str)
-    keys: list[str] = [mesh_key] if isinstance(mesh_key, str) else list(mesh_key)
-    places, bent = ([vertices], [normals]) if single else (vertices, normals)
-    meshes = [moving_mesh(scene, parameters, *one) for one in zip(keys, places, bent, strict=True)]
-    still = still_meshes(scene, parameters, keys)
+    meshes = [moving_mesh(scene, parameters, *one) for one in zip(names, vertices, normals, strict=True)]
+    still = still_meshes(scene, parameters, names)
     view = FilmView(scene, read_camera(sensor), meshes, still, as_array(padded(cotangent)), max_depth)
-    total = mitsuba().Float(0)
+    total = mi.Float(0)
     if spp > 0:
         total += _interior(view, seed, spp, ROUGH_TILE if is_rough(cotangent) else 1)
     for number, mesh in enumerate([*meshes, *still]):
@@ -162,8 +157,7 @@ def material_adjoint(
         total += shadow_terms(view, mesh, stream_of(seed, _SHADOWS, number), shadow_spp)
     if dr.grad_enabled(total):
         dr.backward(total)
-    found = [(gradient_of(mesh.positions), gradient_of(mesh.normals)) for mesh in meshes]
-    return found[0] if single else tuple(list(one) for one in zip(*found, strict=True))
+    return [gradient_of(mesh.positions) for mesh in meshes], [gradient_of(mesh.normals) for mesh in meshes]
 
 
 # ---- inside the outlines --------------------------------------------------------------------------------------------
@@ -171,7 +165,6 @@ def material_adjoint(
 
 def _interior(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     """A number whose gradient is the interior term's."""
-    mi, dr = both_backends()
     with dr.suspend_grad():
         film, hit, sampler = _first_hits(view, seed, spp, tile)
         if dr.width(film) == 0:
@@ -194,7 +187,6 @@ def _first_hits(view: FilmView, seed: int, spp: int, tile: int) -> tuple[Any, An
 
     The film is cut into cells between pixel centres, `spp` samples in each, stratified.
     """
-    mi, dr = both_backends()
     columns, rows = view.camera.width + 1, view.camera.height + 1
     lane = dr.arange(mi.UInt32, columns * rows * spp)
     cell, sample = lane // spp, lane % spp
@@ -217,7 +209,6 @@ def _first_hits(view: FilmView, seed: int, spp: int, tile: int) -> tuple[Any, An
 
 def _contributions(view: FilmView, film: Any, si: Any, sampler: Any, place: Any, facet: Any, bent: Any) -> Any:
     """Sum of W L J / J over all samples, attached to the given places and normals."""
-    mi, dr = both_backends()
     camera = view.camera
     spread = dr.dot(facet, place - camera.eye) / camera.depth(place) ** 3
     seen = dr.replace_grad(film, camera.project(place))
@@ -228,7 +219,6 @@ def _contributions(view: FilmView, film: Any, si: Any, sampler: Any, place: Any,
 
 def _relative(value: Any) -> Any:
     """1 with the relative gradient of a value; without gradient where the value is all but zero."""
-    _, dr = both_backends()
     fixed = dr.detach(value)
     usable = dr.abs(fixed) > 1e-20
     return dr.replace_grad(dr.full(type(fixed), 1.0), dr.select(usable, value / dr.select(usable, fixed, 1.0), 1.0))
@@ -236,7 +226,6 @@ def _relative(value: Any) -> Any:
 
 def _attached(camera: Camera, si: Any, place: Any, facet: Any, bent: Any) -> Any:
     """Mitsuba's surface interaction, moving with the surface and turning with its normals."""
-    mi, dr = both_backends()
 
     def turned(fixed: Any, normal: Any) -> Any:
         """A normal with the gradient of ours, which may point the other way."""
@@ -254,7 +243,6 @@ def _attached(camera: Camera, si: Any, place: Any, facet: Any, bent: Any) -> Any
 
 def _reflected(view: FilmView, at: Any, si: Any, sampler: Any) -> Any:
     """One sample of the light reflected towards the camera, from directions fixed in the world."""
-    mi, dr = both_backends()
     context, bsdf = mi.BSDFContext(), si.bsdf()
     with dr.suspend_grad():
         active = mi.Bool(view.max_depth > 1)
@@ -277,7 +265,6 @@ def _reflected(view: FilmView, at: Any, si: Any, sampler: Any) -> Any:
 
 def _attached_light(view: FilmView, at: Any, ds: Any, light: Any, lit: Any) -> tuple[Any, Any]:
     """A light sample seen from a moving point. What is infinitely far away does not change."""
-    mi, dr = both_backends()
     near = lit & ~mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
     surface = near & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
     moved = dr.copy(ds)
@@ -290,8 +277,6 @@ def _attached_light(view: FilmView, at: Any, ds: Any, light: Any, lit: Any) -> t
 
 def _arriving(view: FilmView, si: Any, direction: Any, pdf: Any, smooth: Any, sampler: Any, active: Any) -> Any:
     """Radiance from a sampled direction; what shines there itself is weighted against light sampling."""
-    mi = mitsuba()
-
     ray = si.spawn_ray(direction)
     everything = view.radiance(ray, sampler, view.max_depth - 1, active)
     there = view.scene.ray_intersect(ray, active)
@@ -302,6 +287,5 @@ def _arriving(view: FilmView, si: Any, direction: Any, pdf: Any, smooth: Any, sa
 
 def _mis(own: Any, other: Any) -> Any:
     """Power heuristic."""
-    _, dr = both_backends()
     weight = dr.fma(own, own, other * other)
     return dr.select(weight > 0.0, own * own / weight, 0.0)

@@ -20,11 +20,9 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.scene.assembly import MovingMesh
-from advsearch.scene.assets import Floats, Material, Mesh
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
-
-Doubles = npt.NDArray[np.float64]
 
 FLOAT, WHOLE, SHORT = 5126, 5125, 5123
 """Types of numbers in glTF: float32, uint32 and uint16."""

@@ -34,11 +34,7 @@ LINEAR = ("fx", "fy", "cx", "cy", "skew")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 NUMBERS = (*LINEAR, *COEFFICIENTS)
 """What the numbers of a model are, in their order."""
-OF_KIND: Mapping[str, tuple[str, ...]] = {
-    BROWN_CONRADY: COEFFICIENTS,
-    FISHEYE: COEFFICIENTS[:4],
-    EQUIRECTANGULAR: (),
-}
+OF_KIND: Mapping[str, tuple[str, ...]] = {BROWN_CONRADY: COEFFICIENTS, FISHEYE: COEFFICIENTS[:4], EQUIRECTANGULAR: ()}
 """The coefficients that each kind of model has."""
 
 STEPS = 60
