@@ -14,8 +14,19 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Candidate, Failures, admit, best, contenders, with_last
 from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
-from advsearch.attacks.evaluation import Evaluate, Evaluation, Phase, Query, most_at_once, usable
-from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable
+from advsearch.attacks.evaluation import (
+    NO_COUNTS,
+    Counts,
+    Evaluate,
+    Evaluation,
+    Phase,
+    Policy,
+    Proposal,
+    Query,
+    affordable,
+    most_at_once,
+    usable,
+)
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.verification import Ending
 from advsearch.errors import InputError

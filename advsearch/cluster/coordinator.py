@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.cluster.executor import Disconnected, Done, Dropped, Ended, Event, Joined, Left, Pool, Work, Workforce
+from advsearch.cluster import Disconnected, Done, Dropped, Ended, Event, Joined, Left, Pool, Work, Workforce
 from advsearch.cluster.worker import Carried, Failure, Files, MachineInfo, Ready, carry_out_batch, machine_name, prepare
 from advsearch.errors import ClusterError
 

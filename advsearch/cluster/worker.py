@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
-from advsearch.cluster.executor import Call, Work
+from advsearch.cluster import Call, Work
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 

@@ -18,16 +18,15 @@ from advsearch import seeds
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
 from advsearch.attacks.policies import POLICIES
-from advsearch.cluster.executor import Executor, Work
-from advsearch.cluster.opening import executor_of
+from advsearch.cluster import Executor, Work
+from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.config.attack import OVER_NUMBERS, OVER_ONE, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
-from advsearch.engine import run_settings
-from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
+from advsearch.engine.judging import Described, Looked, Metrics, check_truth, facts_of, load_metrics, shown
 from advsearch.engine.loading import (
     SCENE,
     Controls,
@@ -36,9 +35,10 @@ from advsearch.engine.loading import (
     lent,
     make_renderer,
 )
-from advsearch.engine.metrics import Metrics, load_metrics
 from advsearch.engine.naming import (
     AnyModel,
+    check_run_settings,
+    given_to,
     load_models,
     scene_of,
     several,
@@ -140,9 +140,9 @@ def controls_given(
 ) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
     """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
     budget."""
-    run_settings.check(config)
+    check_run_settings(config)
     without_budget = config.model_copy(update={"epsilon": None})
-    return run_settings.given_to(config, searched), run_settings.given_to(without_budget, drawn)
+    return given_to(config, searched), given_to(without_budget, drawn)
 
 
 def task_and_objective(

@@ -20,8 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Objective, get_objective
-from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.attacks.own_objective import More, nothing_more
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, More, nothing_more
 from advsearch.controls import Space
 from advsearch.controls.base import BoundControl
 from advsearch.errors import InputError, UnknownNameError

@@ -10,20 +10,25 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
+from advsearch.attacks.candidates import Bracket
 from advsearch.attacks.domain import Distribution
-from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
-from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.driving import answer_along
-from advsearch.engine.failures import described_failures, write_failures
+from advsearch.engine.attack_result import (
+    AttackResult,
+    KeptPicture,
+    answer_along,
+    trial_to_show,
+    write_artifacts,
+    write_object,
+    write_pictures,
+)
 from advsearch.engine.journal import Journal
 from advsearch.engine.objective import domain_of, print_terms
-from advsearch.engine.pictures import KeptPicture, trial_to_show, write_artifacts, write_object, write_pictures
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages
-from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
-from advsearch.engine.searches import UNPRINTED
+from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
+from advsearch.engine.stages import UNPRINTED
 from advsearch.engine.transport import remark
+from advsearch.engine.verifier import described_failures, write_failures
 from advsearch.report.wording import number_text
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import (

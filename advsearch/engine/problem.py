@@ -18,8 +18,7 @@ from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.described import Value
-from advsearch.engine.answers import Described, KnownTruths, Looked
-from advsearch.engine.metrics import Metrics, judgements, mean_metrics
+from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics
 from advsearch.engine.objective import Asked, domain_of
 from advsearch.models import Model
 from advsearch.runs.results.base import GroupDerivative, PlannedGradient

@@ -1,18 +1,33 @@
-"""What an attack knows so far, and how long each stage took."""
+"""What is known of a run so far, and kept of it: findings and stages of an attack, judgements as rows, measurements."""
 
 from __future__ import annotations
 
+import json
+import math
 import time
-from dataclasses import dataclass, field
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
+from pydantic import TypeAdapter
 from torch import Tensor
 
-from advsearch.attacks import SampleCount, SearchResult, Verification
-from advsearch.attacks.smallest import Bracket
+from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, count_right
+from advsearch.attacks.candidates import Bracket
+from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.engine.transport import Predictor
+from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
-from advsearch.tasks import Judgement
+from advsearch.report.wording import count
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.attack import ControlGroup, VerifiedRate
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Fields, Result
+from advsearch.runs.store import Row
+from advsearch.runs.summary import NAME, read_result
+from advsearch.tasks import Answer, Judgement
+from advsearch.tasks.base import mean
+from advsearch.viewer.pages import write_page
 
 KEPT = 4
 """Pictures of each group of trials that are kept."""
@@ -114,3 +129,235 @@ class Stages:
     def total(self) -> float:
         """Seconds since the first stage began."""
         return time.perf_counter() - self.started
+
+
+LOST = "(no answer)"
+"""The answer to a picture that nobody could make; what the row keeps beside it says why."""
+
+
+def no_answer(why: str) -> Judgement:
+    """Return what stands for the answer to a picture that nobody could make: neither right nor a success, and why."""
+    return Judgement(math.nan, math.nan, right=False, answer=Answer(LOST, None, None), payload={"lost": why})
+
+
+def lost_remarks(lost: int) -> list[str]:
+    """Return what a reader has to know of so many pictures that nobody could make."""
+    if not lost:
+        return []
+    has, it = ("has", "it") if lost == 1 else ("have", "them")
+    return [f"{count(lost, 'picture')} {has} no answer, which counts as not right: every worker that took {it} died."]
+
+
+def trial_row(
+    kind: str,
+    number: int,
+    seed: int | None,
+    spp: int,
+    trial: Judgement,
+    values: Mapping[str, Value] | None = None,
+    *,
+    sought: bool = True,
+    **more: Any,
+) -> Row:
+    """Return what the store keeps of a trial.
+
+    Args:
+        kind: of the rows.
+        number: among these.
+        seed: of its render; None of a picture that was predicted.
+        spp: samples a pixel.
+        trial: what came out.
+        values: that describe it.
+        sought: whether a search sought some answer there, so that there is a success.
+        **more: of the row.
+    """
+    return Row(
+        kind=kind,
+        step=number,
+        seed=seed,
+        spp=spp,
+        objective=_number(trial.objective),
+        success=trial.success if sought else None,
+        values=values or {},
+        **{"renders": 1, **_said(trial), **more},
+    )
+
+
+def judged(row: Row, judgement: Judgement) -> Row:
+    """Return the row with what a task said of its picture."""
+    return replace(row, **_said(judgement))
+
+
+def _said(judgement: Judgement) -> dict[str, Any]:
+    answer = judgement.answer
+    return {
+        "score": _number(judgement.score),
+        "correct": judgement.right,
+        "margin": _number(judgement.margin),
+        "label": None if judgement.not_a_number else answer.label,
+        "label_index": answer.index,
+        "probability": answer.probability,
+        "payload": judgement.payload,
+        "metrics": judgement.metrics or {},
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
+
+
+def judgement_of(row: Row) -> Judgement:
+    """Return what was said of a trial from its row: nothing where it has no label, for the answer was not a number.
+
+    In an old row, only the score says whether it was right.
+    """
+    score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
+    right = score <= 0.0 if row.correct is None else row.correct
+    answer = Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability)
+    return Judgement(score, margin, right, answer, row.payload, row.objective, row.metrics or None)
+
+
+def verified_rate(checked: Verification) -> VerifiedRate:
+    """Return the rate of a success, with how often each such answer was given and the mean score of the trials."""
+    rated = rate_of(checked.adversarial, checked.counting, checked.successes)
+    return rated.model_copy(update={"stopped": checked.stopped})
+
+
+def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:
+    """Return a rate with the answers of its successes and the mean score of those that are a number."""
+    labels = Counter(trial.answer.label for trial in successes)
+    return VerifiedRate(
+        successes=rate.successes,
+        trials=rate.trials,
+        rate=rate.rate,
+        interval=rate.interval,
+        spp=rate.spp,
+        labels=dict(labels.most_common()),
+        margin=mean_number(trial.score for trial in trials),
+        not_a_number=sum(trial.not_a_number for trial in trials),
+    )
+
+
+def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
+    """Return how many trials of the clean scene are right."""
+    counted, nothing = count_right(trials, spp), sum(trial.not_a_number for trial in trials)
+    rate, interval = counted.rate, counted.interval
+    return ControlGroup(
+        correct=counted.successes, trials=counted.trials, rate=rate, interval=interval, not_a_number=nothing
+    )
+
+
+def mean_number(values: Iterable[float]) -> float:
+    """Return the mean of those that are numbers; NaN where none is."""
+    numbers = [value for value in values if not math.isnan(value)]
+    return mean(numbers) if numbers else math.nan
+
+
+Kept = TypeVar("Kept")
+Ending = TypeVar("Ending", bound=Result)
+Kind = TypeVar("Kind", bound=Fields)
+Measured = TypeVar("Measured")
+
+
+class OutOfTime(Exception):
+    """The time that a measurement was given is over."""
+
+
+class Results:
+    """What a run has measured, in its store; measures what is not there, until the time is up.
+
+    Args:
+        run: open; None where nothing is kept.
+        seconds: after which nothing more is measured; one measurement is always made, so that it gets on.
+
+    Attributes:
+        made: how many measurements were made. What is stored is read back before the first.
+    """
+
+    def __init__(self, run: RunDirectory | None, seconds: float | None = None) -> None:
+        self._run = run
+        self._end = math.inf if seconds is None else time.monotonic() + seconds
+        self.made = 0
+
+    def get(self, key: str, measure: Callable[[], Any]) -> Any:
+        """Return a JSON value: the one that is stored under a key, or what `measure` returns, which is stored then.
+
+        Raises:
+            OutOfTime: it is not stored, and the time is over.
+        """
+        stored = self.stored(key)
+        if stored is None:
+            self.check_time()
+            self.made += 1
+            stored = json.loads(json.dumps(measure()))
+            self.put(key, stored)
+        return stored
+
+    def check_time(self) -> None:
+        """Look whether there is time for another measurement.
+
+        Raises:
+            OutOfTime: there is none.
+        """
+        if self.made and time.monotonic() >= self._end:
+            raise OutOfTime
+
+    def value(self, key: str, kind: type[Measured], measure: Callable[[], Measured]) -> Measured:
+        """Return what `measure` returns, or what is stored of this kind (a dataclass, or a list of some); as `get`."""
+        adapter = TypeAdapter(kind)
+        return adapter.validate_python(self.get(key, lambda: adapter.dump_python(measure(), mode="json")))
+
+    def row(self, key: str, kind: type[Kind], measure: Callable[[], Kind]) -> Kind:
+        """Return the fields that `measure` returns, or those of this kind that are stored; otherwise as `get`."""
+        return kind.of(self.get(key, lambda: measure().to_dict()))
+
+    def rows(self, key: str, kind: type[Kind], measure: Callable[[], Sequence[Kind]]) -> list[Kind]:
+        """Return what `row` does, of several at once."""
+        return [kind.of(one) for one in self.get(key, lambda: [one.to_dict() for one in measure()])]
+
+    def put(self, key: str, value: Any) -> None:
+        """Store a JSON value."""
+        if self._run is not None:
+            self._run.store.set_note(key, json.dumps(value))
+
+    def stored(self, key: str) -> Any:
+        """Return what is stored under a key, or None."""
+        return None if self._run is None else self._run.store.noted(key)
+
+
+def kept_rows(
+    run: RunDirectory | None, results: Results, rows: Iterable[Kept], result: Callable[[Sequence[Kept], str], Ending]
+) -> Ending:
+    """Take rows until they end, the time is up or there is an interrupt, and keep what they come to after each.
+
+    The summary never has fewer rows than an earlier sitting left in it: those are read back before anything is
+    measured.
+
+    Args:
+        run: open; None where nothing is kept.
+        results: what the rows are made from.
+        rows: as they come.
+        result: makes the result of the rows so far and of how it ended.
+    """
+    taken: list[Kept] = []
+    ending = INTERRUPTED
+    try:
+        with interruptible():
+            for row in rows:
+                taken.append(row)
+                if results.made and run is not None:
+                    run.write_summary(result(taken, ending))  # what a kill leaves
+            ending = "done"
+    except KeyboardInterrupt:
+        pass
+    except OutOfTime:
+        ending = OUT_OF_TIME
+    answer = result(taken, ending)
+    if run is None:
+        return answer
+    if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
+        before = read_result(run.path)
+        return before if isinstance(before, type(answer)) else answer
+    run.write_summary(answer)
+    write_page(run.path, answer)
+    return answer

@@ -26,8 +26,7 @@ from advsearch.report.marks import contact_sheet, marked
 from advsearch.report.phrases import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
-from advsearch.runs.results.base import Formation
-from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
+from advsearch.runs.results.base import Formation, MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
 from advsearch.scene.surfaces import Surfaces

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
-from advsearch.runs import database, files, images, made_with, store, summary, tracking
+from advsearch.runs import files, images, store, summary, tracking
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 from advsearch.settings import HEADER
 from advsearch.yaml_text import LARGEST
@@ -250,15 +250,15 @@ class RunDirectory:
 
     def _note_sitting(self, config: Config) -> None:
         """Note what this sitting is made with, after those before it; refuse files that are other ones now."""
-        noted = self.store.noted(made_with.NOTE)
+        noted = self.store.noted(summary.MADE_WITH)
         before = noted if isinstance(noted, list) else []
-        now = made_with.made_with(config.plain())
-        if changed := made_with.changed_file([one for one in before if isinstance(one, dict)], config.plain()):
+        now = summary.made_with(config.plain())
+        if changed := summary.changed_file([one for one in before if isinstance(one, dict)], config.plain()):
             raise InputError(
                 f"{self.path}: cannot go on: {changed} is another file now than it was; put that back, or {self.again}"
             )
         if now not in before:
-            self.store.set_note(made_with.NOTE, json.dumps([*before, now]))
+            self.store.set_note(summary.MADE_WITH, json.dumps([*before, now]))
 
     def record(self, *rows: store.Row, told: store.Told | None = None) -> None:
         """Add evaluated configurations to the results; they survive a kill when this returns (see `store`).
@@ -439,7 +439,7 @@ def only_here(path: Path) -> list[str]:
 
 def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
-    if database.is_results_database(path / store.NAME):
+    if files.is_results_database(path / store.NAME):
         return True
 
     try:
@@ -498,12 +498,12 @@ def _clear(path: Path) -> None:
 
 def _never_began(path: Path) -> bool:
     """Whether a run was killed before its settings were written: there is nothing in it to lose."""
-    if (path / CONFIG).exists() or not database.is_results_database(path / store.NAME):
+    if (path / CONFIG).exists() or not files.is_results_database(path / store.NAME):
         return False
     with suppress(AdvsearchError):
         if (path / summary.NAME).exists():
             return False
-        if database.is_bare(path / store.NAME):
+        if files.is_bare(path / store.NAME):
             return True
         with store.Store(path / store.NAME, read_only=True) as results:
             return results.count() == 0

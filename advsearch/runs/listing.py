@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
-from advsearch.runs import database, files, store, summary
+from advsearch.runs import files, store, summary
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.runs.results.base import Result
 from advsearch.settings import read_yaml
@@ -56,7 +56,7 @@ def finished(path: Path) -> bool:
     """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
     if not (path / summary.NAME).is_file() or summary.read_result(path).goes_on:
         return False
-    return not database.is_results_database(path / store.NAME) or not can_resume(path)
+    return not files.is_results_database(path / store.NAME) or not can_resume(path)
 
 
 def can_resume(path: Path) -> bool:

@@ -24,8 +24,15 @@ from numpy.typing import NDArray
 from advsearch.described import Value
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue, parse_json
-from advsearch.runs.database import DAMAGED, check_schema, check_version, connect_to_read, connect_to_write, readable
-from advsearch.runs.files import storage_errors
+from advsearch.runs.files import (
+    DAMAGED,
+    check_schema,
+    check_version,
+    connect_to_read,
+    connect_to_write,
+    readable,
+    storage_errors,
+)
 from advsearch.runs.results.base import plain
 
 NAME = "results.sqlite"

@@ -8,12 +8,11 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any
 
-from advsearch.attacks.policies.adam import Adam
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
-from advsearch.attacks.policies.pgd import PGD
+from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Failures, FoundFailure, most_different
 from advsearch.attacks.domain import Domain, half_widths, wraps
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.surrogate import MOST_OWN, Coordinates, Observed, Surrogate, box_coordinates
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream

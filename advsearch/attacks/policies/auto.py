@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import WhichGradient
-from advsearch.attacks.policies.base import (
+from advsearch.attacks.evaluation import (
     NO_COUNTS,
     Counts,
     Evaluated,
     Policy,
     Proposal,
+    WhichGradient,
     draw_seed,
     one_thread,
     seeded,

@@ -26,11 +26,11 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import (
+from advsearch.attacks.evaluation import (
     NO_COUNTS,
     Counts,
     Evaluated,
+    Evaluation,
     Policy,
     Proposal,
     affordable,

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Distribution, Domain, half_widths, wraps
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Failures, FoundFailure, failure_share, most_different
 from advsearch.attacks.domain import Domain, centre_of_option, wraps
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.errors import InputError
 
 MOST = 50

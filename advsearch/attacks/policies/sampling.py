@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Block, Domain, centre_of_option
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain, centre_of_option
-from advsearch.attacks.policies.base import Evaluated, seeded
+from advsearch.attacks.evaluation import Evaluated, seeded
 
 MOST_SOBOL = 1000
 """More coordinates than this are screened with independent points; Sobol's advantage is long gone."""

@@ -15,10 +15,10 @@ from advsearch import seeds
 from advsearch.config import SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.path import PathControl
-from advsearch.engine import run_settings
-from advsearch.engine.driving import evenly, write_drive
+from advsearch.engine.attack_result import evenly, write_drive
+from advsearch.engine.naming import given_to
+from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.axes import Axis
-from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.report.marks import marked
 from advsearch.runs.directory import RunDirectory
@@ -40,7 +40,7 @@ def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[
     """Return the controls with what travels along the path of the configuration, and the grid with its frames last."""
     travelling = next((one for one in drawn if isinstance(one, PathControl)), None)
     if travelling is None:
-        (added,) = run_settings.given_to(config, {PathControl.kind: {}})
+        (added,) = given_to(config, {PathControl.kind: {}})
         assert isinstance(added, PathControl)
         drawn, travelling = (*drawn, added), added
     name, seconds = f"{travelling.name}.time", travelling.seconds

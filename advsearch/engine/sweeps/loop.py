@@ -17,15 +17,13 @@ from typing import Any
 
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
-from advsearch.cluster.executor import Executor, InProcess
-from advsearch.engine.journal import Journal, finite, other_answers, same
+from advsearch.cluster import Executor, InProcess
+from advsearch.engine.attack_result import save_marked
+from advsearch.engine.journal import Journal, Sent, Shared, answering, finite, lost, other_answers, same
 from advsearch.engine.loading import framed
-from advsearch.engine.pictures import save_marked
-from advsearch.engine.record import Stages
-from advsearch.engine.rows import LOST, judgement_of, lost_remarks
-from advsearch.engine.sharing import Sent, Shared, answering, lost
+from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
+from advsearch.engine.sweeps import KIND, Job, check_all
 from advsearch.engine.sweeps.drives import Drives, time_axis
-from advsearch.engine.sweeps.job import KIND, Job, check_all
 from advsearch.engine.sweeps.points import Picks
 from advsearch.engine.sweeps.predicting import combined
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, SweepResult, Tally, rate

@@ -28,8 +28,8 @@ from advsearch import seeds
 from advsearch.attacks.draws import batches
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.engine.loading import framed, load_scene
-from advsearch.engine.rows import judgement_of
-from advsearch.engine.sweeps.job import Job
+from advsearch.engine.record import judgement_of
+from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.summary import rate
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.progress import Progress

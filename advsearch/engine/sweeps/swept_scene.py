@@ -24,18 +24,15 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, choose_spp, run_trials
-from advsearch.attacks.sample_count import margins_of, most_samples
+from advsearch.attacks.trials import margins_of, most_samples
 from advsearch.described import Value
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, Shared
+from advsearch.engine.judging import judgements
 from advsearch.engine.loading import framed, make_renderer
-from advsearch.engine.metrics import judgements
-from advsearch.engine.record import Stages
-from advsearch.engine.rows import rate_of
-from advsearch.engine.sharing import Shared
-from advsearch.engine.sweeps.job import Job
+from advsearch.engine.record import Stages, rate_of
+from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.points import Picks, Points
-from advsearch.engine.sweeps.predicting import PAYS, SweptPicture, SweptPredictor, WantedPicture
-from advsearch.engine.sweeps.surface_light import SweptSurfaceLight
+from advsearch.engine.sweeps.predicting import PAYS, SweptPicture, SweptPredictor, SweptSurfaceLight, WantedPicture
 from advsearch.engine.transport import CHECK_SPP, Deviation, deviation_under_light
 from advsearch.engine.verifier import ladder_of
 from advsearch.files import scaled
@@ -297,7 +294,7 @@ class Scenes:
         return self.scene
 
     def named(self, name: str) -> SweptScene:
-        """The same by its number as text: see `advsearch.engine.sharing.answering`."""
+        """The same by its number as text: see `advsearch.engine.journal.answering`."""
         return self.open(int(name))
 
     def picture(self, number: int) -> Tensor:
