@@ -137,7 +137,6 @@ class FailureShare:
             evaluated.
         interval: 95 %; covers the share at least as often, however the draws were adapted, at any number of them.
         effective: failures of equal weight that would be worth as much: (sum w)^2 / sum w^2 (Kish 1965).
-        draws: how many there were.
     """
 
     estimate: float | None
@@ -234,7 +233,6 @@ def most_different(at: Tensor, worst: Sequence[float], around: Tensor, apart: Te
         worst: (n,) objectives.
         around: (k,) bool: ranges whose ends are the same place.
         apart: (k,) bool: discrete choices, where different is 1 apart.
-        most: how many to return at most.
     """
     order = sorted(range(len(at)), key=lambda number: -worst[number])
     at = at[order].double()
@@ -287,8 +285,6 @@ class Bracket:
         low: at this scale a search found nothing; 0 where none has failed.
         high: at this scale `u` passes; infinity where nothing passed at all.
         u: (d,) a configuration within `high`; None where nothing passed.
-        searches: how many were run.
-        checks: how often a configuration went through the trials.
         found_by: number of the search that found `u`, or the longer change that it is the end of.
         confirmed: whether `u` has passed again, with new seeds (see `confirmed`).
     """
@@ -308,11 +304,7 @@ class Bracket:
 
 
 def scaled(domain: Domain, scale: float) -> Domain:
-    """Return the domain with every budget multiplied by `scale`, in (0, 1].
-
-    Raises:
-        InputError: a block has bounds and no budget, so that there is nothing to scale.
-    """
+    """Return the domain with every budget multiplied by `scale`, in (0, 1]."""
     names = (block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None)
     bare = [name or "a block" for name in dict.fromkeys(names)]
     if bare:
@@ -342,9 +334,6 @@ def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | No
     optimum, so that the result is within `RATIO` of the closed form.
 
     Args:
-        search: finds the best configuration of a domain.
-        passes: verifies one.
-        domain: the largest budget.
         likely: says where 2 begins, and from where it goes on in growing steps; None to bisect from the whole length.
 
     Returns:
@@ -377,9 +366,6 @@ def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 
     it is tried again with new seeds; where it fails, the change grows by a fortieth.
 
     Args:
-        bracket: as `smallest` returns it.
-        passes: verifies a configuration.
-        domain: the largest budget.
         times: in a row.
         attempts: steps outwards at most; what the last one leads to is returned untried, and not `confirmed`.
     """

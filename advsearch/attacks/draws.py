@@ -47,12 +47,7 @@ class Draws:
 
     Args:
         dimensions: numbers of a point; 0 is fine.
-        sampler: "sobol" or "random".
         seed: root; the streams are called `name`.
-        name: of the streams.
-
-    Raises:
-        InputError: no such sampler, or more dimensions than Sobol points have.
     """
 
     def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
@@ -103,12 +98,7 @@ class Draws:
 
 
 class Seeds:
-    """Seeds of one stream by number, many at once: much faster than `advsearch.seeds.stream` for every one.
-
-    Args:
-        root: the run's root seed.
-        name: of the stream.
-    """
+    """Seeds of one stream by number, many at once: much faster than `advsearch.seeds.stream` for every one."""
 
     def __init__(self, root: int, name: str) -> None:
         self._root, self._name = root, name
@@ -131,9 +121,6 @@ class Product:
     Attributes:
         sizes: number of values of each axis, at least 1; the last runs fastest.
         count: number of points; may be larger than any list could hold.
-
-    Raises:
-        InputError: an axis has no values.
     """
 
     sizes: tuple[int, ...]
@@ -145,11 +132,7 @@ class Product:
         object.__setattr__(self, "count", math.prod(self.sizes))
 
     def digits(self, index: int) -> tuple[int, ...]:
-        """Return the place of a point on every axis.
-
-        Raises:
-            IndexError: the number is under 0 or not under `count`.
-        """
+        """Return the place of a point on every axis."""
         if not 0 <= index < self.count:
             raise IndexError(f"expected a point from 0 to {self.count - 1}, got {index}")
         found = [0] * len(self.sizes)

@@ -153,12 +153,6 @@ def usable(evaluation: Evaluation) -> Evaluation:
     - gradient elements that are NaN or infinite become zero and are added to `non_finite`;
     - an objective that is NaN or infinite becomes -inf ("the worst there is"), its gradient zero and its success
       false.
-
-    Args:
-        evaluation: as it came from the renderer and the model.
-
-    Returns:
-        The same object where nothing was wrong.
     """
     gradient, bad = evaluation.gradient, 0
     if gradient is not None and not math.isfinite(float(gradient.sum(dtype=torch.float64))):

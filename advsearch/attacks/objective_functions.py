@@ -235,9 +235,6 @@ def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, 
     Returns:
         An objective (features (N, F), images, labels) -> (N,), at least 0 but for `h`^2, that looks at the features
         only, whatever their length.
-
-    Raises:
-        InputError: as for `feature_distance`.
     """
     reference = functional.normalize(_reference(features, clean), dim=0)
     away = _away(reference)

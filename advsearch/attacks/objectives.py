@@ -88,9 +88,6 @@ def form_of(function: Callable[..., Any]) -> Form:
     """Return which arguments a function takes.
 
     The names of its first two parameters ask for nothing, nor does a third one in the place of the truth.
-
-    Raises:
-        InputError: it takes others.
     """
     if isinstance(function, type):
         raise InputError(f"objective: expected a name or a function (output, images, truth), got {told(function)}")
@@ -395,7 +392,6 @@ def check_objective(
     """Check, before anything is loaded, that there is such an objective and that it can do what is asked.
 
     Args:
-        objective: a name, or a function.
         task: name of the task whose outputs it will get.
         targeted: whether there is a target.
         minimise: whether a right answer is sought.

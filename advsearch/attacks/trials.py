@@ -67,9 +67,6 @@ def paired_difference(both: int, first: int, second: int, neither: int) -> tuple
         first: in which the first alone happens.
         second: likewise.
         neither: in which none happens.
-
-    Raises:
-        InputError: there is no pair, or less than none.
     """
     n = both + first + second + neither
     if n < 1 or min(both, first, second, neither) < 0:
@@ -100,9 +97,6 @@ def mcnemar(first: int, second: int) -> float:
 
     Returns:
         In (0, 1]; 1 without such pairs.
-
-    Raises:
-        InputError: one is less than 0.
     """
     if min(first, second) < 0:
         raise InputError(f"pairs: expected numbers from 0, got {first} and {second}")
@@ -250,10 +244,6 @@ def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, sought: bool = True,
     counts are numbered together.
 
     Args:
-        evaluate: answers the queries.
-        kind: of the rows.
-        u: (d,) the configuration.
-        sought: as for `Query`.
         keep: the pictures of the first so many of each sample count are wanted.
     """
     made = Counter[int]()
@@ -277,7 +267,6 @@ class Rung:
 
     Attributes:
         name: which configuration, e.g. "clean".
-        spp: samples per pixel.
         mean: mean margin over the seeds.
         half_width: how far the mean may lie on the other side of the true one (Student's t), in 5 % of all cases, after
             all looks together.
@@ -301,7 +290,6 @@ class SampleCount:
         spp: samples per pixel to verify with.
         converged: whether all margins are shown to stay on their sides; if not, it is the last rung of the ladder.
         table: one row per configuration and rung that was measured, in this order.
-        renders: renders spent.
     """
 
     spp: int
@@ -341,13 +329,9 @@ def choose_spp(
     Args:
         margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each renders what it is asked for. The
             first should be the one that is least likely to settle.
-        seed: root seed of the trials.
         ladder: sample counts, rising, at least one. A single one is returned as it is, unmeasured and not converged.
         trials: that will follow under the same conditions. So many renders are one more look, as at the rung that is
             chosen they are those trials; 0 where other trials follow.
-
-    Raises:
-        InputError: ladder out of range.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
         raise InputError(f"verify_spp: expected rising sample counts of at least 1, got {list(ladder)}")

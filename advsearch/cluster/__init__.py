@@ -113,11 +113,7 @@ class Executor(Protocol):
 
 
 class InProcess:
-    """Carries out one batch after the other in this process.
-
-    Args:
-        call: carries out one.
-    """
+    """Carries out one batch after the other in this process."""
 
     facts: Workforce | None = None
 
@@ -193,11 +189,7 @@ class Pool(Protocol):
         """Return what has happened since the last time; wait so long at most where nothing has."""
 
     def reconnect(self) -> None:
-        """Find the scheduler again, or start another.
-
-        Raises:
-            ClusterError: it did not come back.
-        """
+        """Find the scheduler again, or start another."""
 
     def close(self) -> None:
         """Let the workers go, those that were started for this pool for ever."""

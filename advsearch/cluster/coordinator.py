@@ -66,14 +66,7 @@ class Coordinator:
     """An `Executor` over a pool of workers.
 
     Args:
-        pool: the workers.
-        work: what batches are of.
-        key: of the work, by its content.
-        files: that it needs.
-        version: of advsearch.
         machine: this one, where rows of its kind need no mark.
-        tell: told what a person should read.
-        clock: seconds, growing.
     """
 
     def __init__(
@@ -106,11 +99,7 @@ class Coordinator:
         self._counted_at = self._alone_since = self._looked_at = clock()
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
-        """See `Executor.results`.
-
-        Raises:
-            ClusterError: nobody can carry them out, or the scheduler has gone.
-        """
+        """See `Executor.results`."""
         self._let_go()  # what an earlier call has left under way
         self._call += 1
         call, source = self._call, iter(batches)

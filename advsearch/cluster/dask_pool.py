@@ -106,14 +106,7 @@ def local(workers: int) -> Site:
 
 
 class DaskPool:
-    """See `pool.Pool`. Close it.
-
-    Args:
-        place: where the workers are.
-
-    Raises:
-        ClusterError: there is no scheduler, or it could not be started.
-    """
+    """See `pool.Pool`. Close it."""
 
     def __init__(self, place: Site) -> None:
         self.where, self.link = place.where, ""
@@ -362,14 +355,7 @@ def executor_of(
     """Open an executor of a work for the block; None where everything is done in this process.
 
     Args:
-        work: what is to be done.
-        workers: how many processes.
         cluster: a scheduler's address, "local", or a YAML file.
-        tell: told what a person should read.
-
-    Raises:
-        InputError: they make no sense, or Dask is not installed.
-        ClusterError: there is no scheduler.
     """
     if workers is None and cluster is None:
         yield None
@@ -387,11 +373,7 @@ def executor_of(
 
 
 def check_installed() -> None:
-    """Check that Dask is there.
-
-    Raises:
-        InputError: it is not; the message says what to type.
-    """
+    """Check that Dask is there."""
     try:
         import distributed  # noqa: F401
     except ImportError:
@@ -440,10 +422,6 @@ def place_of(workers: int | None, cluster: str | None) -> Site:
     Args:
         workers: how many processes; None for one a core, or as many as there are.
         cluster: a scheduler's address, "local", or a YAML file; None for this machine.
-
-    Raises:
-        InputError: no such form, or a number of workers beside a scheduler that runs.
-        FileFormatError: the file is missing or says something else.
     """
     if cluster is None or cluster == LOCAL:
         check_main()

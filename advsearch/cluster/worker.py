@@ -42,11 +42,7 @@ MachineInfo = dict[str, str]
 
 @cache
 def this_machine() -> MachineInfo:
-    """Return the processor, libLLVM, and versions of packages.
-
-    Raises:
-        EnvironmentSetupError: there is no libLLVM that can be used; the message says what to type.
-    """
+    """Return the processor, libLLVM, and versions of packages."""
     llvm = ".".join(map(str, ensure_llvm().version))
     return {"processor": processor(), "LLVM": llvm, **{name: _version(name) for name in PACKAGES}}
 
@@ -122,11 +118,7 @@ class MissingError(Exception):
 
 
 def read_files(work: Work) -> Files:
-    """Read the files that the settings of a work name.
-
-    Raises:
-        InputError: together they are larger than can be sent.
-    """
+    """Read the files that the settings of a work name."""
     named, contents = {}, {}
     for path in _paths(work):
         files = _contents(path)
@@ -142,12 +134,7 @@ def read_files(work: Work) -> Files:
 
 
 def write_files(work: Work, files: Files, folder: Path) -> Work:
-    """Write files that were sent into folders of their digests, and return the work with the paths that hold here.
-
-    Raises:
-        MissingError: a file was not sent, and is not here.
-        OSError: they cannot be written.
-    """
+    """Write files that were sent into folders of their digests, and return the work with the paths that hold here."""
     for digest, contents in files.contents.items():
         for name, data in contents.items():
             path = folder / digest / name
@@ -218,12 +205,7 @@ _one_at_a_time = threading.Lock()
 
 @dataclass(frozen=True)
 class Ready:
-    """A worker is ready.
-
-    Attributes:
-        machine: what it runs on.
-        seconds: that it took.
-    """
+    """A worker is ready."""
 
     machine: MachineInfo
     seconds: float
@@ -231,12 +213,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class Carried:
-    """A batch was carried out.
-
-    Attributes:
-        value: what came of it.
-        seconds: that it took.
-    """
+    """A batch was carried out."""
 
     value: Any
     seconds: float
@@ -247,7 +224,6 @@ class Failure:
     """Something went wrong.
 
     Attributes:
-        text: what, as a user reads it.
         unfit: whether the worker is at fault and another one may do it.
         forgotten: whether the worker has not got ready, or not any more.
         missing: whether it lacks files.
@@ -265,9 +241,6 @@ def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
     """Get ready for a work.
 
     Args:
-        key: of the work.
-        work: what is to be done.
-        files: that it needs.
         asked: the version of advsearch that asks.
     """
     begun = time.perf_counter()

@@ -73,16 +73,12 @@ class AttackParts:
     """Everything that was asked for, found and loaded.
 
     Attributes:
-        config: the settings.
-        scene: loaded.
         loaded: the model, and what was said of it.
         task: not yet on the model.
         controls: what is searched.
         over: what varies by chance.
         objective: a name, or a function of the caller's.
-        policy: likewise.
         keep: whether the run is kept in a folder.
-        metrics: columns of the rows.
         clean: the matrix of light transport of the clean scene, which attacks may share.
     """
 
@@ -100,11 +96,7 @@ class AttackParts:
 
 
 def parts_of(config: AttackConfig) -> AttackParts:
-    """Find and load everything that a configuration names; nothing is rendered.
-
-    Raises:
-        InputError: anything that whoever asked can put right.
-    """
+    """Find and load everything that a configuration names; nothing is rendered."""
     if len(config.objects) > 1:
         raise one_only("object", config.objects)
     searched, drawn = controls_given(config, config.controls, config.over)
@@ -117,11 +109,7 @@ def parts_of(config: AttackConfig) -> AttackParts:
 
 
 def parts_in(run: Path) -> AttackParts:
-    """Find and load everything that the run of an attack was asked with, as its answer is judged.
-
-    Raises:
-        InputError: only the Python session that asked has what judges it.
-    """
+    """Find and load everything that the run of an attack was asked with, as its answer is judged."""
     if needed := [one for one in only_python_has(run) if not one.startswith(SEARCHED_WITH)]:
         raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its answer")
     return parts_of(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
@@ -163,23 +151,14 @@ def models_as_one(model: AnyModel | Sequence[AnyModel], config: AttackConfig, ta
 
 def check_from_config(config: AttackConfig) -> None:
     """Refuse what a configuration names that is not there, contradicts itself, or could not be judged; nothing is
-    rendered.
-
-    Raises:
-        InputError: as for `parts_of`.
-    """
+    rendered."""
     job = parts_of(config)
     _task(job, shows=False)
     _space(job, framed(job.scene.description, config.resolution or job.loaded[0].input_size))
 
 
 def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
-    """Load what a configuration describes without searching: the problem, and warnings on the way.
-
-    Args:
-        config: what.
-        denoise: another denoiser than the configuration's.
-    """
+    """Load what a configuration describes without searching: the problem, and warnings on the way."""
     job = parts_of(AttackConfig.of(config, denoise=denoise or config.denoise))
     problem = problem_on(job)
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
@@ -189,7 +168,6 @@ def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, li
     """Return the problem that an attack was asked with, and warnings on the way.
 
     Args:
-        parts: as a result has them.
         **changes: settings that are different; of another `model`, its name.
     """
     config = parts.config.model_copy(update=changes)
@@ -202,17 +180,7 @@ def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, li
 
 
 def problem_of(config: AttackConfig, scene: Scene, model: Model, *, differentiated: bool = True) -> Problem:
-    """Return the problem of a configuration on a scene and a model that are there, in place of those that it names.
-
-    Args:
-        config: what is asked for.
-        scene: a loaded one.
-        model: a loaded one.
-        differentiated: whether outlines may be; see `make_renderer`.
-
-    Raises:
-        InputError: as for `parts_of`.
-    """
+    """Return the problem of a configuration on a scene and a model that are there, in place of those that it names."""
     return problem_on(parts_given(config, scene, model), differentiated=differentiated)
 
 
@@ -320,14 +288,7 @@ def judged_alone(config: AttackConfig) -> AttackConfig:
 def executor_for(
     config: SceneConfig, function: str, progress: Progress, *, ahead: bool = True
 ) -> AbstractContextManager[Executor | None]:
-    """Return what carries out a function of a configuration, as its workers and cluster say; None for this process.
-
-    Args:
-        config: its settings are the function's.
-        function: see `Work`, as `ahead`.
-        progress: told what a person should read.
-        ahead: see there.
-    """
+    """Return what carries out a function of a configuration, as its workers and cluster say; None for this process."""
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     work = Work(function, settings, FILES, config.used_threads or 1, ahead=ahead)
     workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))

@@ -215,7 +215,6 @@ class KeptPicture:
         whole: the configuration of the whole space, with the conditions of this picture.
         radiance: (H, W, 3) linear.
         picture: (H, W, 3) sRGB as the model sees it, 8-bit values in [0, 1].
-        judgement: what the task says of the model's answer to it.
         trial: number of the trial that it is of; None where nothing was tried.
     """
 
@@ -264,14 +263,7 @@ def _usual(labels: Sequence[str]) -> str:
 
 
 def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, shown: Mapping[str, KeptPicture]) -> None:
-    """Write the pictures of the clean and the adversarial scene, of their difference, of trials and of the search.
-
-    Args:
-        run: gets them.
-        problem: that was attacked.
-        findings: of the attack.
-        shown: "clean" and "adversarial".
-    """
+    """Write the pictures of the clean and the adversarial scene, of their difference, of trials and of the search."""
     gain = problem.renderer.formation.gain
     for name, one in shown.items():
         run.save_image(name, one.picture)
@@ -311,13 +303,7 @@ def write_artifacts(run: RunDirectory, artifacts: dict[str, Tensor]) -> None:
 
 
 def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
-    """Keep the object, and the meshes beside it that controls move or paint, to turn in a browser.
-
-    Args:
-        run: gets them as a file of binary glTF, before and after.
-        problem: that was attacked.
-        u: (d,) of the answer.
-    """
+    """Keep the object, and the meshes beside it that controls move or paint, to turn in a browser."""
     scene, assembly = problem.space.scene, problem.renderer.scene.assembly
     if scene is None:
         return
@@ -360,12 +346,6 @@ def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory
     """Look at an answer, and at the clean scene, at evenly spaced times of the path that varies by chance.
 
     What varies beside it is as the scene comes.
-
-    Args:
-        problem: that was attacked.
-        u: (d,) of the answer; None where nothing was searched.
-        spp: samples a pixel.
-        run: gets ``drive-clean`` and, of the answer, ``drive``, as `write_drive` writes them; None keeps no pictures.
 
     Returns:
         How many frames are right; None where no path varies.

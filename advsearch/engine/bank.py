@@ -80,9 +80,7 @@ class Bank(Predictor):
     """The matrices of a run whose searches look at conditions that vary by chance.
 
     Attributes:
-        problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        answers: what is asked for light, as far as the next comparison.
         grown: the comparisons, by index of the evaluation, after which the bank went on growing.
         gaps: by how much the objective was larger in the bank than under unseen conditions, by comparison.
     """

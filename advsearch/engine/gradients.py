@@ -50,7 +50,6 @@ class Probe:
     """A direction along which a derivative is measured.
 
     Attributes:
-        group: the group of coordinates.
         name: `control.parameter`, with the coordinate's number if the group has several and they are probed singly.
         direction: (d,) largest element 1; zero outside the group.
         step: half-width of a difference along the direction.
@@ -86,10 +85,8 @@ class Estimate:
     """What one estimator says along a probe.
 
     Attributes:
-        estimator: its name.
         value: mean over seeds.
         noise: standard deviation of one estimate.
-        repeats: how many there were.
         seconds: median time of one gradient of the group.
         factor: step of its differences as a multiple of the plan's.
     """
@@ -380,7 +377,6 @@ class Agreement:
     """How good an estimate is beside a reference, see `agreement`; the numbers are relative to the derivative's size.
 
     Attributes:
-        status: in a word.
         error: distance of the estimates' mean from the reference.
         doubt: how much of it noise explains: `CONFIDENCE` standard errors of both.
         noise: standard deviation of one estimate.

@@ -55,7 +55,6 @@ class Shared:
     """Answers queries of a problem: several at once by workers, where there are some, and all others here.
 
     Attributes:
-        problem: what is asked.
         executor: of `answering`; None where there are no workers.
         name: of the problem, where workers hold several.
     """
@@ -98,11 +97,7 @@ class Shared:
 
 
 def answering(named: Callable[[str], Answering]) -> Call:
-    """Return what answers queries that were sent: what a worker does.
-
-    Args:
-        named: returns what answers the queries to a name; it keeps what it has loaded.
-    """
+    """Return what answers queries that were sent: what a worker does."""
 
     def call(sent: Sequence[Sent]) -> list[Evaluation]:
         found = list[Evaluation]()
@@ -116,11 +111,7 @@ def answering(named: Callable[[str], Answering]) -> Call:
 
 
 def lost(query: Query, why: str) -> Evaluation:
-    """Return what stands for an answer that nobody could give.
-
-    Raises:
-        ClusterError: nothing can stand for it.
-    """
+    """Return what stands for an answer that nobody could give."""
     if query.wanted != "judgement":
         what = "a picture" if query.wanted == "picture" else "the light of a condition"
         raise ClusterError(f"{what}: {why}; `advsearch resume RUN workers=null` makes it here")
@@ -142,16 +133,7 @@ NEAR, LEAST = 1e-3, 1e-4
 def check_made_of(
     run: RunDirectory, models: Sequence[Model], functions: Mapping[str, Callable[..., Any] | None] | None = None
 ) -> None:
-    """Note what networks and functions are, or refuse to go on with others than a run began with.
-
-    Args:
-        run: open.
-        models: by the name that they have in the run.
-        functions: of the run, by setting; None where there is none.
-
-    Raises:
-        InputError: weights, or the code of a function, are other ones now.
-    """
+    """Note what networks and functions are, or refuse to go on with others than a run began with."""
     several = [one.module.models if isinstance(one.module, Ensemble) else (one,) for one in models]
     networks = [one for some in several for one in some]
     now: dict[str, Any] = {f"model {one.name}": {"weights": weights_digest(one)} for one in networks}
@@ -291,9 +273,7 @@ class Journal:
     """What a run has asked and was answered. Without a run directory it is kept in memory.
 
     Attributes:
-        run: the open run directory, or None.
         traced: answers what nothing predicts.
-        problem: whose questions they are; it describes configurations.
         rows: what was written, where there is no run directory.
         lost: queries that nobody could answer.
         machines: on which answers were made that are not like this one.
@@ -324,12 +304,8 @@ class Journal:
         """Answer queries in their order: from the journal, or else by asking, and then they are in it.
 
         Args:
-            queries: of one kind.
             evaluate: answers what is not in the journal; None for `traced`.
             passed: told of every query of a search that is read back.
-
-        Raises:
-            InputError: an evaluation of a search is another one than it was.
         """
         stored = [self._read(query) for query in queries]
         evaluate = self.traced if evaluate is None else evaluate
@@ -389,11 +365,7 @@ class Journal:
         """Write answers in one transaction, a row each; what a search was told goes beside it.
 
         Args:
-            answered: queries with their answers; of a search one at a time.
             numbered: whether the place of a row in the store is the query's number, in whatever order they come.
-
-        Returns:
-            The rows.
         """
         rows, told = list[Row](), None
         for query, answer in answered:
@@ -455,10 +427,6 @@ class Journal:
 
         An evaluation that is read back never ends the search before the one after which it was ended; if the store has
         renders of the ranking, that is the last one before these.
-
-        Args:
-            kind: of search.
-            seconds: allowed; None for no limit.
         """
         if seconds is None:
             return None

@@ -45,11 +45,7 @@ MAIN = "__main__"
 
 
 def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
-    """Return metrics as a file names them: "package.module:function"; one that cannot be named, by its bare name.
-
-    Raises:
-        InputError: one is no function, or its name is that of a column that rows have already.
-    """
+    """Return metrics as a file names them: "package.module:function"; one that cannot be named, by its bare name."""
     if not isinstance(metrics, Mapping) or not all(isinstance(name, str) for name in metrics):
         raise InputError(f'metrics: expected a mapping from names to functions, as {{"f": f}}, got {metrics!r:.80}')
     for name, function in metrics.items():
@@ -76,11 +72,7 @@ def only_here(settings: Mapping[str, str]) -> list[str]:
 
 
 def check_shared(settings: Mapping[str, str]) -> None:
-    """Refuse metrics that workers could not import.
-
-    Raises:
-        InputError: there is one.
-    """
+    """Refuse metrics that workers could not import."""
     notebook = not hasattr(sys.modules[MAIN], "__file__")
     for name, text in settings.items():
         if ":" not in text or (notebook and text.startswith(f"{MAIN}:")):
@@ -94,11 +86,7 @@ def load_metrics(settings: Mapping[str, str], given: Mapping[str, str | Metric] 
     """Return the functions that settings name.
 
     Args:
-        settings: "package.module:function" by name of the column.
         given: functions that are there already, in their place.
-
-    Raises:
-        InputError: one cannot be imported, or must not be (`registry.only_named_code`).
     """
     return {
         name: one if callable(one := (given or {}).get(name)) else _imported(name, text)
@@ -133,14 +121,8 @@ def judgements(
     """Return what a task and metrics say of pictures: the one place where a run judges.
 
     Args:
-        task: on its model.
-        output: of the model.
         pictures: (N, H, W, 3) sRGB in [0, 1].
         truths: one of each picture, or one for all.
-        metrics: by name.
-
-    Raises:
-        InputError: a metric returns something else than numbers.
     """
     with torch.no_grad():
         if len(truths) == 1:
@@ -156,14 +138,8 @@ def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Outp
     """Return the judgement of a picture with what metrics say of it.
 
     Args:
-        judgement: of the task.
-        metrics: by name.
         image: (H, W, 3) sRGB in [0, 1].
-        output: of the model, of one picture.
         truth: as the task has it; a metric gets it as an objective does, of one picture.
-
-    Raises:
-        InputError: a metric returns something else than numbers.
     """
     if not metrics:
         return judgement
@@ -222,9 +198,6 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described, lo
     """Return what a scene gives a task to judge by.
 
     Args:
-        scene: with the object.
-        name: the object's, for messages.
-        label: what was said to be right.
         describe: says the configuration; what it does not say has the value that the scene was given.
         look: says what is seen in the configuration; None where there is none.
     """
@@ -242,11 +215,7 @@ def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig
     """Return the task after it has seen what its model answers to clean pictures, where it asks for that (`looks`).
 
     Args:
-        task, model, config: as for `check_truth`.
         scenes: at least one; the next is shown where those before leave open how answers are to be read.
-
-    Raises:
-        InputError: no scene shows it, so it has to be said.
     """
     if not task.looks:
         return task
@@ -260,13 +229,6 @@ def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig
 
 def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:
     """Refuse a scene of which the task cannot say what is right, before anything is prepared.
-
-    Args:
-        task: on the model.
-        model: whose answers it judges.
-        scene: with the object.
-        facts: of the scene.
-        config: says how it is rendered.
 
     Raises:
         InputError: what `Task.check` raises; where no label was given, with the model's first answers to a clean
@@ -284,7 +246,6 @@ def one_label_for_several(models: Sequence[Model], label: str | None, objects: M
     """Return a sentence if a label that was given for several objects is not what some of them are called.
 
     Args:
-        models: whose classes.
         label: what was given for all objects; None where each has its own.
         objects: by name, the label that each has of its own, or None.
     """
@@ -340,9 +301,6 @@ class KnownTruths:
     """What is true of configurations.
 
     Attributes:
-        task: says what is true.
-        space: of the configurations.
-        renderer: of the scene.
         facts: what the scene gives the task to judge by, from what describes the configuration and what looks at it.
     """
 

@@ -31,7 +31,6 @@ def scene_of(config: SceneConfig, name: str | None = None, environment: str | No
     """Load the scene that a configuration describes.
 
     Args:
-        config: what.
         name: of one of its objects; None for the only one, in the configuration's environment.
         environment: of that object; None for the default.
     """
@@ -41,11 +40,7 @@ def scene_of(config: SceneConfig, name: str | None = None, environment: str | No
 
 
 def scene_settings(config: SceneConfig) -> Given:
-    """Return the parameters that a scene is loaded with: those of `set`, and the exposure.
-
-    Raises:
-        InputError: both say what the exposure is.
-    """
+    """Return the parameters that a scene is loaded with: those of `set`, and the exposure."""
     given: dict[str, Any] = dict(config.set_)
     if config.exposure:
         if "camera.exposure" in given:
@@ -55,13 +50,7 @@ def scene_settings(config: SceneConfig) -> Given:
 
 
 def code_of(models: Iterable[str], kinds: Iterable[str], metrics: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the Python code that is imported for what is named: "package.module:attribute".
-
-    Args:
-        models: as `load_model` takes them.
-        kinds: of the controls.
-        metrics: as settings name them.
-    """
+    """Return the Python code that is imported for what is named: "package.module:attribute"."""
     code = [*(named_code(name) for name in models), *metrics]
     code += [name for name in kinds if CONTROLS.names_class(name)]
     return tuple(dict.fromkeys(name for name in code if name))
@@ -71,7 +60,6 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
     """Load models; their warnings become sentences of the run.
 
     Args:
-        models: as `load_model` takes them.
         task: what their outputs are for; several tasks are for one model each, which are put together as one.
         config: has the names of their classes, the texts that these are put into, and the processor threads that
             everything takes from here on.
@@ -140,22 +128,14 @@ OF_SCENE = ("set", "environment", "up", "camera", "exposure", "object")
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:
-    """Refuse settings of a scene that is loaded already.
-
-    Raises:
-        InputError: there are some.
-    """
+    """Refuse settings of a scene that is loaded already."""
     clash = [name for name in OF_SCENE if settings.get(name) is not None]
     if clash:
         raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
 
 
 def check_not_spread(settings: Mapping[str, object]) -> None:
-    """Refuse to share work on what is loaded already.
-
-    Raises:
-        InputError: `workers` or `cluster` is among the settings.
-    """
+    """Refuse to share work on what is loaded already."""
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
             raise InputError(
@@ -170,15 +150,7 @@ A configuration without such a setting counts as one that does not say it."""
 
 
 def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
-    """Return control instances, with what they take of the configuration where they say nothing themselves.
-
-    Args:
-        config: of the run.
-        controls: in any form; instances stay as they are.
-
-    Raises:
-        InputError: an instance takes a setting that is given here.
-    """
+    """Return control instances, with what they take of the configuration where they say nothing themselves."""
     asked = controls_by_name(controls)
     as_controls(controls)  # refuses what is none
     for one in (one if isinstance(one, Control) else lent(CONTROL, name) for name, one in asked.items()):
@@ -206,12 +178,7 @@ def settings_alone(config: SceneConfig, asked: str, given: Mapping[str, object])
 
 
 def check_run_settings(config: SceneConfig) -> None:
-    """Refuse a setting that none of the controls takes; those that vary by chance have no epsilon.
-
-    Raises:
-        UnknownNameError: an epsilon for a control that is not searched.
-        InputError: no control takes it, or not the one that it names.
-    """
+    """Refuse a setting that none of the controls takes; those that vary by chance have no epsilon."""
     for setting in RUN_SETTINGS:
         value = getattr(config, setting, None)
         if value is None:

@@ -37,7 +37,6 @@ def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **m
     """Return where a search over some controls may look: the budgets of all their groups, in the order of u.
 
     Args:
-        controls: of a space, or some of them.
         start: (d,) float32; by default the controls' own, which leaves the scene as it is.
         **more: other fields of `Domain`: `gradient_cost`, `partial_gradients`.
     """
@@ -59,12 +58,7 @@ def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **m
 
 
 class Named(Mapping[str, Tensor]):
-    """Tensors by name, of N configurations: each (N, ...).
-
-    Args:
-        what: a name stands for, for messages.
-        each: of each configuration.
-    """
+    """Tensors by name, of N configurations: each (N, ...)."""
 
     def __init__(self, what: str, each: Sequence[Mapping[str, Tensor]]) -> None:
         self._what, self._each = what, each
@@ -88,7 +82,6 @@ class Asked:
     """Gives what is asked for at N configurations, which differ in nothing that is searched.
 
     Args:
-        space: the controls behind the whole of u.
         searched: the controls that are searched, which come first there.
         wholes: the configurations, (d,) each, of the whole space.
 
@@ -108,9 +101,6 @@ class Asked:
                 searched colours of the control that has some, or (N, h, w, 4) with 1 where they are searched and 0
                 elsewhere; "textures", the same by control, where several have some; "inputs", the scene inputs by
                 name; "configuration", the numbers by parameter.
-
-        Raises:
-            InputError: there is not exactly one texture.
         """
         self.used = True
         if name == "inputs":
@@ -181,11 +171,7 @@ def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def print_terms(space: Space, u: Tensor) -> PrintTerms:
-    """Return both terms of a configuration (d,), without their weight.
-
-    Raises:
-        InputError: nothing that can be printed is searched.
-    """
+    """Return both terms of a configuration (d,), without their weight."""
     with torch.no_grad():
         rough, off = _terms(space, u)
     return PrintTerms(variation=float(rough), off_print=float(off))
@@ -229,16 +215,8 @@ def objective_for(
     """Return what is maximised, and what there is to say about it; one of features is shown the clean picture first.
 
     Args:
-        wanted: its name, or the user's own function.
-        task: on the model.
-        model: that is attacked.
-        renderer: of the whole space.
-        seed: of the clean picture.
         ensemble: how the objectives of several models are put together; None for the mean, or the least of those of
             several tasks, whose units differ.
-
-    Raises:
-        InputError: an objective of features, of several models.
     """
     kind = OBJECTIVE_KINDS.get(wanted) if isinstance(wanted, str) else None
     of_features = kind is not None and kind.needs_features
@@ -262,10 +240,6 @@ def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
 
     With "worst" the model that is hardest to mislead is the one that counts, so that the maximum is over 0 only where
     every model is misled. The mean may be large because of one model; its gradient reaches all of them.
-
-    Args:
-        objectives: of each model, with its own truth.
-        way: "mean" or "worst".
     """
 
     def objective(

@@ -77,16 +77,7 @@ def summarise(
     stages: Stages,
     warnings: Sequence[str],
 ) -> AttackResult:
-    """Put the result together and, if there is a run directory, write its files.
-
-    Args:
-        config: the settings.
-        objective: its name; None for the task's own.
-        findings: of the attack.
-        journal: of the run.
-        stages: how long each took.
-        warnings: on the way.
-    """
+    """Put the result together and, if there is a run directory, write its files."""
     problem, search = journal.problem, findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)

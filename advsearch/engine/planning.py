@@ -105,16 +105,8 @@ def measured_plan(
 
     Args:
         renderer: its plan is the one to improve; it is not changed.
-        loss: what will be differentiated.
-        u: (d,) where.
-        seed: root of the noise.
-        spp: samples a pixel.
-        repeats: gradients of each estimator, at least 2.
-        every: see `contested`.
         counted: take the renders that an estimator needs for its time (an adjoint for `ADJOINT_RENDERS`), so that the
             choice is the same on a busy machine.
-        tick: called after each gradient.
-        keep: asked for each gradient, by a name.
     """
     plan = renderer.plan
     taken = partial(gradients, renderer, loss, u, seed=seed, spp=spp, keep=keep, tick=tick)
@@ -317,12 +309,7 @@ def measured_bounces(
     """Return the shortest paths whose pictures agree with those of the full length to within a bound.
 
     Args:
-        renderer: at the full length.
-        configurations: where to look, each (d,).
         seed: root of the noise, which is the same for all lengths.
-        spp: samples a pixel of each of two halves; few are enough.
-        bound: in 8-bit levels, see `PathCut.levels`.
-        tick: called after each picture.
 
     Returns:
         The depth, with what was measured: from the full length downwards, to the first that misses the bound.
@@ -402,13 +389,7 @@ def most_pictures(problem: Problem) -> int:
 
 
 def bounces_of(problem: Problem, seed: int, tick: Callable[[], None] = lambda: None) -> PathLength:
-    """Measure the bounces that a problem's search needs, over its clean configuration and random ones of its space.
-
-    Args:
-        problem: whose scene and space.
-        seed: root of the noise and of the draws.
-        tick: called after each picture.
-    """
+    """Measure the bounces that a problem's search needs, over its clean configuration and random ones of its space."""
     drawn = [
         problem.domain.sample(torch.Generator().manual_seed(seeds.stream(seed, "bounces", number)))[0]
         for number in range(DRAWS)

@@ -35,9 +35,7 @@ class Prepared(NamedTuple):
     """What is measured before a search, and holds for its queries.
 
     Attributes:
-        spp: samples a pixel.
         search_depth: longest light path in segments; None for the scene's.
-        plan: how derivatives are obtained.
     """
 
     spp: int
@@ -59,12 +57,10 @@ class Problem:
     Attributes:
         renderer: `render(u, seed, spp)` of the whole space.
         space: the controls behind the whole of u: those that are searched, then those that vary by chance.
-        model: the network under test.
         task: judges the model's output; says what counts as success.
         facts: what the scene gives it to judge by, from what describes the configuration and what looks at it.
         objective: what is maximised.
         spp: samples a pixel while searching.
-        seed: root of every stream.
         searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
             their whole range for every picture.
         steps: renders of a search.
@@ -156,7 +152,6 @@ class Problem:
         """Return the configuration of the whole space: u, and the conditions of one draw.
 
         Args:
-            u: (d,) of the searched controls.
             draw: seed of the conditions; None for those that leave the scene as it is.
         """
         if self.conditions is None:
@@ -170,9 +165,7 @@ class Problem:
         """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
 
         Args:
-            u: (d,) of the searched controls.
             seed: of the noise, and of the conditions where there are any.
-            spp: samples a pixel.
             drawn: whether the conditions are drawn; otherwise the scene has those it comes with.
         """
         with torch.no_grad():
@@ -210,7 +203,6 @@ class Problem:
         """Say a configuration of the searched controls in named values with units, under the conditions of a draw.
 
         Args:
-            u: (d,) of the searched controls.
             draw: seed of the conditions; None for those that the scene comes with.
         """
         return self.space.describe(self.whole(u, draw), self.space.controls[: self.searched])
@@ -334,8 +326,6 @@ class Problem:
         Args:
             render: from u to the pictures (N, H, W, 3), with a graph.
             wholes: the configuration of the whole space of each.
-            u: (d,) of the searched controls.
-            gradient: whether the derivative is wanted.
 
         Returns:
             An evaluation without derivative and the model's output for each picture, and the derivative (d,) of the sum
@@ -378,8 +368,6 @@ class Problem:
         Args:
             render: from some of the conditions and u to their pictures (N, H, W, 3), with a graph.
             wholes: the configuration of the whole space under each.
-            u: (d,) of the searched controls.
-            gradient: whether the derivative is wanted.
             at_once: pictures that the model is asked about at once.
         """
         found, total = [], None
@@ -396,7 +384,6 @@ class Problem:
 
         Args:
             found: evaluations under each, and the model's outputs.
-            u: (d,) of the searched controls.
             gradient: of the mean, where the evaluations have none.
         """
         each, count = [one for one, _ in found], len(found)

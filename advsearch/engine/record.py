@@ -51,11 +51,9 @@ class Findings:
             the run's answer instead.
         failures: verification of the first of the different failures that the policy answers with.
         average: trials of configurations drawn from the whole space.
-        smallest: the least epsilon, where it was asked for.
         pictures: of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on
             only those that it made itself.
         frames: some pictures of the search, (H, W, 3) 8-bit values in [0, 1], numpy, for the animation.
-        interrupted: somebody pressed Ctrl-C.
         transport: what predicted the pictures of the searches, if anything did.
         rendered_because: why nothing did, in words.
         surface_refused: why matrices did and not light on surfaces, where that was tried.
@@ -87,11 +85,7 @@ class Findings:
 
     @property
     def spp(self) -> int:
-        """Samples a pixel of the verification.
-
-        Raises:
-            RuntimeError: it has not been chosen yet.
-        """
+        """Samples a pixel of the verification."""
         if self.sample_count is None:
             raise RuntimeError("the sample count of the verification has not been chosen yet")
         return self.sample_count.spp
@@ -101,7 +95,6 @@ class Stages:
     """Tells a watcher which stage runs, and keeps the time of each.
 
     Attributes:
-        progress: the watcher.
         seconds: time of each stage by name, in seconds.
         started: when the first began, by `time.perf_counter`.
     """
@@ -162,14 +155,8 @@ def trial_row(
     """Return what the store keeps of a trial.
 
     Args:
-        kind: of the rows.
-        number: among these.
         seed: of its render; None of a picture that was predicted.
-        spp: samples a pixel.
-        trial: what came out.
-        values: that describe it.
         sought: whether a search sought some answer there, so that there is a success.
-        **more: of the row.
     """
     return Row(
         kind=kind,
@@ -267,7 +254,6 @@ class Results:
     """What a run has measured, in its store; measures what is not there, until the time is up.
 
     Args:
-        run: open; None where nothing is kept.
         seconds: after which nothing more is measured; one measurement is always made, so that it gets on.
 
     Attributes:
@@ -280,11 +266,7 @@ class Results:
         self.made = 0
 
     def get(self, key: str, measure: Callable[[], Any]) -> Any:
-        """Return a JSON value: the one that is stored under a key, or what `measure` returns, which is stored then.
-
-        Raises:
-            OutOfTime: it is not stored, and the time is over.
-        """
+        """Return the JSON value that is stored under a key, or what `measure` returns, which is stored then, in time."""
         stored = self.stored(key)
         if stored is None:
             self.check_time()
@@ -294,11 +276,7 @@ class Results:
         return stored
 
     def check_time(self) -> None:
-        """Look whether there is time for another measurement.
-
-        Raises:
-            OutOfTime: there is none.
-        """
+        """Raise `OutOfTime` where there is no time for another measurement."""
         if self.made and time.monotonic() >= self._end:
             raise OutOfTime
 
@@ -332,12 +310,6 @@ def kept_rows(
 
     The summary never has fewer rows than an earlier sitting left in it: those are read back before anything is
     measured.
-
-    Args:
-        run: open; None where nothing is kept.
-        results: what the rows are made from.
-        rows: as they come.
-        result: makes the result of the rows so far and of how it ended.
     """
     taken: list[Kept] = []
     ending = INTERRUPTED

@@ -70,10 +70,6 @@ class Searches:
     """The searches of one run.
 
     Attributes:
-        journal: of the run.
-        config: how long it searches, and what for.
-        policy: what proposes.
-        stages: told which stage runs.
         findings: gets the searches, their pictures and what predicts them.
         clean: the matrix that other attacks share.
     """
@@ -286,9 +282,6 @@ class Attack:
 
     Attributes:
         journal: of the run; its problem is what is attacked.
-        config: its settings.
-        policy: what proposes.
-        stages: told which stage runs.
         findings: filled by `carry_out`.
         clean: the matrix of light transport that attacks with other budgets share.
     """
@@ -428,11 +421,7 @@ class Attack:
 
     def _check_look(self, start: Tensor) -> None:
         """Note what was seen, or refuse to go on with a model or an objective that says something else of the same
-        pictures than it did. One that says something else each time can't be told by it.
-
-        Raises:
-            InputError: it does.
-        """
+        pictures than it did. One that says something else each time can't be told by it."""
         now = [_values(one) for one in self.findings.first_look]
         before = self.journal.note(LOOK)
         if before is None:

@@ -73,7 +73,6 @@ class SurfaceLight(Predictor):
     """The light on surfaces of a run whose searches look through many cameras.
 
     Attributes:
-        problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
         at: (d,) the configuration whose light is found; None for the start.
         places: which numbers of u move; None for those of cameras and environments.
@@ -352,13 +351,6 @@ def levels_off(renderer: Renderer, pictures: Sequence[Tensor], u: Tensor, seed: 
 
     They are compared with two that are traced without the denoiser, which leaves its own marks in all that it is given.
     The mean product of the differences to both is the squared error without their noise, which a square would count.
-
-    Args:
-        renderer: the one that traces.
-        pictures: to be compared.
-        u: (d,) the configuration.
-        seed: of the noise.
-        spp: samples a pixel of each of the two.
     """
     undenoised = renderer.like(denoiser="none")
     with torch.no_grad():

@@ -201,12 +201,7 @@ class Predictor(ABC):
 
 @dataclass(frozen=True, eq=False)
 class ExpansionPoint:
-    """Where a picture was linearised, and the matrix that was made there.
-
-    Attributes:
-        u: the configuration.
-        renderer: the matrix.
-    """
+    """Where a picture was linearised, and the matrix that was made there."""
 
     u: Tensor
     renderer: PredictingRenderer
@@ -214,11 +209,7 @@ class ExpansionPoint:
 
 @dataclass
 class CleanMatrix:
-    """The matrix of the clean configuration, for attacks that differ in nothing but their budget of change.
-
-    Attributes:
-        made: None until the first of them needs it.
-    """
+    """The matrix of the clean configuration, for attacks that differ in nothing but their budget of change."""
 
     made: ExpansionPoint | None = None
 
@@ -228,13 +219,10 @@ class Transport(Predictor):
     """The matrices of a run's searches where nothing varies by chance.
 
     Attributes:
-        problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
         renewals: by kind of search, the evaluations at which the matrix was made anew, or, where there is none that
             could be, from which on pictures are traced.
-        deviations: what the comparisons found, in order.
         clean: where every search begins; made here if it is not there yet.
-        seconds: spent on making matrices and on comparing.
     """
 
     exact: ClassVar[bool] = True

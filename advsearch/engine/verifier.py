@@ -64,9 +64,7 @@ class Verifier:
     """Makes the trials of one run: sample count, control group, answers, and configurations one at a time.
 
     Attributes:
-        journal: of the run.
         ladder: samples a pixel to choose from; a single count is taken as it is.
-        stages: told which stage runs.
         findings: gets the sample count, the control group's trials, pictures and the count of renders.
         looks: trials of each group; of several numbers, those after which the verdict may stand.
     """
@@ -336,8 +334,6 @@ class RetrialCondition:
 
     Attributes:
         name: in tables and in the kinds of rows.
-        problem: renders, asks and judges.
-        spp: samples a pixel.
         source: conditions with equal sources are shown the same picture before it is changed.
         change: what happens to a picture (H, W, 3) sRGB in [0, 1] before the model sees it, by the seed of its trial.
         light: conditions with equal lights get their pictures from one linear radiance: their scenes are the same, only
@@ -358,9 +354,6 @@ class Retrials:
     Trial k has the same seed for the clean scene, for every answer and under every condition.
 
     Args:
-        conditions: at least one.
-        run: keeps the rows.
-        progress: told of every trial.
         trials: of each answer under each condition.
         seed: root of these trials, which nothing else uses.
         executor: of workers that hold the problems by the names of their conditions; None makes pictures here.
@@ -405,8 +398,6 @@ class Retrials:
 
         Args:
             kind: what it is called among the rows; "KIND under CONDITION" is theirs.
-            u: (d,) the configuration.
-            condition: one of those.
         """
         return verify(
             partial(self._answers, kind, condition),
@@ -472,12 +463,7 @@ class Retrials:
 
 
 def kept_answer(folder: Path, problem: Problem) -> torch.Tensor:
-    """Return the configuration (d,) that a run answers with, of its problem loaded again.
-
-    Raises:
-        InputError: the scene is another one now.
-        FileFormatError: there is none.
-    """
+    """Return the configuration (d,) that a run answers with, of its problem loaded again."""
     u = torch.from_numpy(read_answer(folder))
     if u.shape != problem.domain.start.shape:
         raise InputError(

@@ -57,7 +57,6 @@ class Answered:
         values: what the picture shows: object, environment, model, and parameters in their units.
         units: of the parameters.
         answer: in words.
-        correct: whether it is right.
         time: when it was stored, seconds since 1970.
         margin: of the task; over 0 where the answer is wrong.
     """
@@ -79,16 +78,7 @@ def figure_value(value: float | str) -> str:
 
 
 def rows_of(part: str, folder: Path, summary: AttackSummary | SweepSummary) -> list[Answered]:
-    """Return the answers that a sweep has stored, without the trials of its worst, or the trials of an attack.
-
-    Args:
-        part: of the recipe.
-        folder: of the run.
-        summary: of it.
-
-    Raises:
-        FileFormatError: the rows cannot be read.
-    """
+    """Return the answers that a sweep has stored, without the trials of its worst, or the trials of an attack."""
     return answered(part, folder, summary, ("sweep",) if isinstance(summary, SweepSummary) else tuple(TRIALS))
 
 
@@ -163,14 +153,7 @@ RowValues = Mapping[str, tuple[float | str, str]]
 
 
 def observed(rows: Sequence[tuple[RowValues, bool]]) -> Observations:
-    """Return rows as a table of what varies among them; what only some of them have is left out.
-
-    Args:
-        rows: what each shows, and whether the model was right.
-
-    Raises:
-        InputError: there are no rows, or nothing varies.
-    """
+    """Return rows as a table of what varies among them; what only some of them have is left out."""
     if not rows:
         raise InputError("runs: expected sweeps with rows, got none")
     shared = [name for name in rows[0][0] if all(name in shown for shown, _ in rows)]
@@ -349,10 +332,6 @@ def find_rules(choosing: Observations, counting: Observations, seed: int) -> Fou
     Args:
         choosing: rows that rules are chosen on.
         counting: other rows, with the same factors, that they are counted on.
-        seed: of the trees.
-
-    Raises:
-        InputError: scikit-learn is missing.
     """
     rules: list[CountedRule] = []
     for number in range(MOST_RULES):
@@ -467,11 +446,7 @@ PACKAGES = {"sklearn": "scikit-learn"}
 
 
 def import_library(name: str) -> Any:
-    """Return a module of such a library, such as ``sklearn.tree``.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Return a module of such a library, such as ``sklearn.tree``."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -77,10 +77,6 @@ class RunDirectory:
 
     Used in a `with` block it is closed at the end; when the block raises before there is any result, the directory of a
     new run is removed again, so that bad input leaves nothing behind.
-
-    Attributes:
-        path: the directory.
-        store: its open results.
     """
 
     def __init__(self, path: Path, held: files.RunLock) -> None:
@@ -103,7 +99,6 @@ class RunDirectory:
         Raises:
             RunExistsError: there is something already.
             InputError: another process works on this run.
-            StorageError: the directory cannot be made or written.
         """
         path = _numbered(default) if run is None else run_path(run)
         check_free(path, overwrite=overwrite)
@@ -140,11 +135,7 @@ class RunDirectory:
         """Open the directory of the run that `config` describes: a new one, or the one to go on with.
 
         Args:
-            config: what the run is carried out with.
             resumed: the run to go on with, as for `find_run`; None for a new one.
-
-        Raises:
-            InputError: as for `create`, and for `resume`.
         """
         log: str | None = getattr(config, "log", None)
         tracking.check_tracker(log)
@@ -170,13 +161,10 @@ class RunDirectory:
         """Open and lock the directory of a run that is there, to go on with it.
 
         Args:
-            run: its name or path, as for `find_run`.
             config: what the rest of the run will be carried out with; None if nothing will be.
 
         Raises:
-            UnknownNameError: there is no such run.
             InputError: another process works on it, or `config` would give other numbers than the run began with.
-            FileFormatError: its results cannot be read.
         """
         path = find_run(run)
         _check_links(path)
@@ -264,11 +252,7 @@ class RunDirectory:
         """Add evaluated configurations to the results; they survive a kill when this returns (see `store`).
 
         Args:
-            rows: of them.
             told: what the last of them told its search beside its row.
-
-        Raises:
-            StorageError: the disk is full or cannot be written; none of these rows is kept.
         """
         self.store.append(rows, told)
         if self._tracker is not None:
@@ -278,29 +262,16 @@ class RunDirectory:
         """Write ``<folder>/<name>.png`` and return its path.
 
         Args:
-            name: without suffix.
             image: (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch.
-            folder: ``"images"`` or ``"artifacts"``.
-
-        Raises:
-            StorageError: it could not be written.
         """
         return images.write_png(self.path / folder / f"{name}.png", image)
 
     def save_exr(self, name: str, image: Any, folder: str = IMAGES) -> Path:
-        """Write ``<folder>/<name>.exr`` with the float32 values as given (linear, by convention) and return its path.
-
-        Raises:
-            StorageError: it could not be written.
-        """
+        """Write ``<folder>/<name>.exr`` with float32 values as given (linear, by convention) and return its path."""
         return images.write_exr(self.path / folder / f"{name}.exr", image)
 
     def save_animation(self, name: str, frames: Sequence[Any]) -> Path:
-        """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path.
-
-        Raises:
-            StorageError: it could not be written.
-        """
+        """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path."""
         return images.write_animation(self.path / IMAGES / f"{name}.gif", frames)
 
     def replacing(self, name: str) -> AbstractContextManager[Path]:
@@ -308,11 +279,7 @@ class RunDirectory:
         return replacing(self.path / name)
 
     def write_summary(self, result: Result) -> Path:
-        """Write `summary.json` and return its path.
-
-        Raises:
-            StorageError: it could not be written.
-        """
+        """Write `summary.json` and return its path."""
         return summary.write_summary(self.path, result)
 
     def close(self) -> None:
@@ -355,12 +322,6 @@ def begun(config: Config) -> Iterator[Path | None]:
 
     Yields its path, closed again: what the block does goes on with it. Where the block raises before anything was
     evaluated, nothing is left of it. It is None for a run that takes the place of another one, which stays until then.
-
-    Args:
-        config: what the run is carried out with.
-
-    Raises:
-        InputError: as for `RunDirectory.create`.
     """
     place, overwrite = config.place
     if overwrite and place is not None and is_run(run_path(place)):
@@ -391,11 +352,7 @@ def default_name(object_name: str, controls: Iterable[str]) -> str:
 
 
 def _check_links(path: Path) -> None:
-    """Check that what a run writes to is its own: a folder that somebody else made may link to any file.
-
-    Raises:
-        FileFormatError: there is a link.
-    """
+    """Check that what a run writes to is its own: a folder that somebody else made may link to any file."""
     links = [name for name in (*CONTENTS, files.NAME) if name != CONFIG and (path / name).is_symlink()]
     if links:
         raise FileFormatError(f"{path / links[0]}: expected a file or a folder of this run, got a link; remove it")
@@ -415,11 +372,7 @@ def typed_name(path: str | Path) -> str:
 
 
 def find_run(run: str | Path) -> Path:
-    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml).
-
-    Raises:
-        UnknownNameError: there is none; the message lists the runs here.
-    """
+    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml)."""
     for path in (Path(run).expanduser(), run_path(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):

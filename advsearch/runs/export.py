@@ -48,16 +48,8 @@ def write_rows(store: Store, format: str, out: Path | None, stream: IO[bytes], k
     """Write the rows and return how many there were.
 
     Args:
-        store: of the run.
-        format: one of `FORMATS`.
         out: the file, written whole or not at all; None writes to the stream.
-        stream: standard output, say.
         kind: only rows of this kind.
-
-    Raises:
-        UnknownNameError: the format or the kind is unknown.
-        InputError: Parquet is asked for and pyarrow is not installed.
-        StorageError: the file cannot be written.
     """
     if format not in FORMATS:
         raise UnknownNameError("format", format, FORMATS)
@@ -108,11 +100,7 @@ def to_pandas(rows: Iterable[Row]) -> Any:
 
 
 def table_to_pandas(rows: Sequence[JsonObject]) -> Any:
-    """Return a table of a result as a `pandas.DataFrame`: a column for each value, named ``average.accuracy``.
-
-    Raises:
-        InputError: pandas is not installed.
-    """
+    """Return a table of a result as a `pandas.DataFrame`: a column for each value, named ``average.accuracy``."""
     pandas, flat = _pandas(), [dict(_leaves(row)) for row in rows]
     return pandas.DataFrame(flat, columns=list(dict.fromkeys(name for row in flat for name in row)))
 
@@ -235,10 +223,6 @@ def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callabl
         rows: yields the rows from the first, as often as it is called.
         out: the folder; made, or empty.
         picture: the PNG of a row by its number, None where none was kept.
-
-    Raises:
-        InputError: the folder is there and not empty, or there are no rows.
-        StorageError: it cannot be written.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
@@ -311,7 +295,6 @@ class Imported:
     """One line of such a folder.
 
     Attributes:
-        row: as a sweep stores it.
         picture: the file of its picture; None where there is none.
     """
 

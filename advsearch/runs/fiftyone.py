@@ -50,8 +50,6 @@ class Pictured:
 
     Attributes:
         name: of the sample's files; what has the same picture has the same name.
-        row: what is known of it.
-        picture: its file.
         layers: the EXR with ground truth beside it; None where there is none.
         size: (height, width) of the picture that the model saw, pixels, in which boxes are told; None if not known.
     """
@@ -74,12 +72,6 @@ def write_fiftyone(samples: Callable[[], Iterable[Pictured]], out: Path, name: s
     Args:
         samples: yields them from the first, as often as it is called.
         out: the folder; made, or empty.
-        name: of the dataset.
-        label: of the object.
-
-    Raises:
-        InputError: the folder is there and not empty, or there are no samples.
-        StorageError: it cannot be written.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")

@@ -46,11 +46,7 @@ _SQLITE_ADVICE = {
 
 @contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn the errors of the operating system and of SQLite inside the block into a `StorageError` that names `path`.
-
-    Raises:
-        StorageError: something in the block could not be read or written.
-    """
+    """Turn errors of the operating system and of SQLite inside the block into a `StorageError` that names `path`."""
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
@@ -73,11 +69,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     When the block raises, or the process is killed, `path` is as it was before. Missing folders are made.
 
     Args:
-        path: the file to write or to replace.
         durable: wait until the file is on the disk and survives a power cut; some 10 ms.
-
-    Raises:
-        StorageError: the file could not be written.
     """
     part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
     try:
@@ -95,22 +87,14 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> Path:
-    """Write `data` to `path`, whole or not at all, and return the path; `durable` as for `replacing`.
-
-    Raises:
-        StorageError: the file could not be written.
-    """
+    """Write `data` to `path`, whole or not at all, and return the path; `durable` as for `replacing`."""
     with replacing(path, durable=durable) as part:
         part.write_bytes(data)
     return path
 
 
 def write_text(path: Path, text: str, *, durable: bool = True) -> Path:
-    """Write `text` in UTF-8 to `path`, whole or not at all, and return the path; `durable` as for `replacing`.
-
-    Raises:
-        StorageError: the file could not be written.
-    """
+    """Write `text` in UTF-8 to `path`, whole or not at all, and return the path; `durable` as for `replacing`."""
     return write_bytes(path, text.encode("utf-8"), durable=durable)
 
 
@@ -140,7 +124,6 @@ class RunLock:
 
     Raises:
         InputError: another process works on this run; the message names it.
-        StorageError: the lock file cannot be written, or the file system has no locks.
     """
 
     def __init__(self, folder: Path) -> None:

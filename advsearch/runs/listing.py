@@ -19,12 +19,9 @@ class Listed:
     """One run.
 
     Attributes:
-        name: of its folder.
-        path: of its folder.
         command: that made it.
         object: what the model should recognise; empty where a command has none.
         controls: what could change.
-        rows: evaluated configurations in its store.
         state: ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending.
         answer: what came out, in a few words.
         kinds: how many rows there are of each kind.
@@ -69,7 +66,6 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
     """Return the run in a folder; what cannot be read is shown as far as it can.
 
     Args:
-        path: of the folder.
         counts: whether rows are counted, which takes a second for a million.
     """
     config: dict[str, object] = {}

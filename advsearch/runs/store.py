@@ -136,12 +136,7 @@ class Store:
     """The open `results.sqlite` of a run. Close it, or use it in a `with` block.
 
     Args:
-        path: the file; made when it is not there, unless `read_only`.
         read_only: open for reading beside a process that writes.
-
-    Raises:
-        FileFormatError: the file is missing (`read_only`), is not a results.sqlite, or is of a newer advsearch.
-        StorageError: it cannot be written.
     """
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
@@ -176,7 +171,6 @@ class Store:
         """Yield the rows, or those of one kind, in the order in which they were written.
 
         Args:
-            kind: of the rows; None for all.
             after: the id behind which to begin.
         """
         where, given = ("id > ?", (after,)) if kind is None else ("id > ? AND kind = ?", (after, kind))
@@ -202,13 +196,7 @@ class Store:
         return (row, _told(found, self.path)) if row and found else None
 
     def pictures(self, kind: str, after: int, until: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield the number and the picture of what the rows of a kind with these ids have told, while the run goes on.
-
-        Args:
-            kind: of search.
-            after: the id behind which to begin.
-            until: the last id.
-        """
+        """Yield number and picture of what the rows of a kind with ids over `after` have told, while the run goes on."""
         with readable(self.path):
             cursor = self._db.execute(
                 "SELECT number, u, non_finite, cost, NULL, picture, height FROM told JOIN evaluations ON row = id "
@@ -279,11 +267,7 @@ class Store:
         return None if found is None else str(found[0])
 
     def noted(self, key: str) -> Any:
-        """Return the JSON value that was noted under `key`, or None.
-
-        Raises:
-            FileFormatError: what was noted is no JSON.
-        """
+        """Return the JSON value that was noted under `key`, or None."""
         text = self.note(key)
         try:
             return None if text is None else parse_json(text)
@@ -291,11 +275,7 @@ class Store:
             raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {DAMAGED}") from None
 
     def set_note(self, key: str, value: str) -> None:
-        """Keep a text under `key`, in place of what was there.
-
-        Raises:
-            StorageError: the disk is full or can't be written.
-        """
+        """Keep a text under `key`, in place of what was there."""
         with storage_errors(self.path), self._db:
             self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
 

@@ -42,11 +42,7 @@ def to_json(result: Result) -> str:
 
 
 def write_summary(folder: Path, result: Result) -> Path:
-    """Write ``summary.json`` into the run directory, whole or not at all, and return its path.
-
-    Raises:
-        StorageError: it could not be written.
-    """
+    """Write ``summary.json`` into the run directory, whole or not at all, and return its path."""
     return write_text(folder / NAME, to_json(result) + "\n")
 
 
@@ -106,11 +102,7 @@ Python, which ends in errors of any kind."""
 
 
 def write_answer(run: Path, u: NDArray[np.float32]) -> Path:
-    """Keep a configuration (d,) of the unit box, whole or not at all, and return where.
-
-    Raises:
-        StorageError: it could not be written.
-    """
+    """Keep a configuration (d,) of the unit box, whole or not at all, and return where."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(u, dtype=np.float32), allow_pickle=False)
     return write_bytes(run / FOLDER / ANSWER, buffer.getvalue())
@@ -163,11 +155,7 @@ NOT_READ_AGAIN = ("recipe", "suite")
 
 
 def made_with(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return versions by package, and the SHA-256 of each file that settings name, by its name in them.
-
-    Args:
-        settings: of a run, as in its run.yaml.
-    """
+    """Return versions by package, and the SHA-256 of each file that settings name, by its name in them."""
     facts = {"python": platform.python_version()}
     for name in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
@@ -179,10 +167,6 @@ def changed_file(before: Sequence[Mapping[str, object]], settings: Mapping[str, 
     """Return the name of a file that is another one now than in every sitting before; None where all are the same.
 
     A file may have been moved, so that its name alone tells it.
-
-    Args:
-        before: what each sitting was `made_with`.
-        settings: of the run, as in its run.yaml.
     """
     again = {name: value for name, value in settings.items() if name not in NOT_READ_AGAIN}
     for path, digest in file_digests(again).items():

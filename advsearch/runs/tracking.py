@@ -54,12 +54,7 @@ class Backend(Protocol):
 
 
 def check_tracker(name: str | None) -> None:
-    """Check that a tracker can be told, before anything is done.
-
-    Raises:
-        UnknownNameError: there is none of that name.
-        InputError: its package is not installed.
-    """
+    """Check that a tracker can be told, before anything is done."""
     if name is None:
         return
     if name not in PACKAGES:
@@ -75,13 +70,7 @@ def _package(name: str) -> Any:
 
 
 class Tracker:
-    """Tells rows to a tracker from a thread of its own.
-
-    Args:
-        name: of the tracker.
-        folder: of the run.
-        settings: of the run, by name.
-    """
+    """Tells rows to a tracker from a thread of its own."""
 
     def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
         self._name = name

@@ -62,7 +62,6 @@ class ArchiveState:
         spanned: (k,) positions in u of the parameters that span the archive.
         half: (d,) half of each number's range.
         archive: that of ribs; never written to again.
-        generation: how many generations were drawn.
         points: (n, d) float32, this generation's configurations.
         values: objectives of the first of them.
         wrong: whether each of these was a success.

@@ -65,7 +65,6 @@ class Plan:
     """What the renders are for.
 
     Attributes:
-        steps: renders in all.
         screen: renders of the screen.
         until: renders after which the ascent begins; `steps` if there is none.
         gradient: what the ascent asks for.
@@ -92,7 +91,6 @@ class AutoState:
     Attributes:
         seen: where the box coordinates, which are screened, have been, the norm balls at their start.
         screen: (m, k) where the screen looks after the start.
-        spent: renders so far.
         ascent: of PGD, once it has begun.
         climbing: whether the latest proposal was the ascent's.
         last: the objective of the ascent's latest evaluation.

@@ -45,7 +45,6 @@ class Runner:
 
     Attributes:
         policy, domain: what searches where.
-        state: the policy's.
         left: renders left of its share of this round.
         best: the largest objective it has met.
         over: whether it has nothing more to propose.
@@ -64,9 +63,6 @@ class Race:
     """Where a race stands.
 
     Attributes:
-        runners: all searches.
-        steps: renders in all.
-        rounds: how many there are.
         field: numbers of those that are in this round, the best first.
         round: number of this one, from 0.
         spent: renders that the evaluations so far took.
@@ -278,7 +274,6 @@ class ChoicesState:
     """Where the search stands.
 
     Attributes:
-        domain: the whole one.
         numbers: (k,) positions in u of what is no choice.
         choices: (c,) positions in u of the choices.
         combinations: (n, c) the choices' elements of u, one row for each search in the race.

@@ -177,7 +177,6 @@ class CMAESState:
         scale: (d,) length of the unit of pycma's coordinates: u = P(origin + scale * x).
         wraps: (d,) where leaving the bounds costs nothing.
         strategy: pycma's, as it is after the latest `ask`; never written to again.
-        generation: how many generations were asked for.
         points: (n, d) this generation's coordinates x.
         values: objectives of the first of them.
         outside: for each of these its squared distance from the domain, a mean over elements, in x.

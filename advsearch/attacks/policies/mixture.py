@@ -105,7 +105,6 @@ class MixtureState:
     """Where the search stands.
 
     Attributes:
-        generation: number of this one.
         learnt: the mixtures of the generations in the window, this one's last; None of an even one.
         points: (n, d) this generation's draws in shares of each range.
         seen: (m, d) the draws that were evaluated, the latest `WINDOW` of them.

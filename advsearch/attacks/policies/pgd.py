@@ -42,7 +42,6 @@ def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tup
     - In a domain that is `exact` or `drawn` nothing is an outlier.
 
     Args:
-        domain: whose blocks count.
         gradient: (d,) float32, finite.
         lengths: of the gradients before, the latest last.
     """
@@ -160,7 +159,6 @@ class PGDState:
         step_size: in units of each block's radius, before it falls.
         flat: evaluations in a row whose gradient was zero.
         idle: windows in a row that added nothing; counted without noise only.
-        count: evaluations so far.
         lengths: of the latest gradients, as `clipped` wants them.
         counts: outliers cut and steps taken back so far.
     """
@@ -341,8 +339,6 @@ class AdamState:
         u: (d,) what to propose next.
         mean: (d,) decaying mean of the gradients.
         square: (d,) decaying mean of their squares.
-        taken: gradients so far.
-        count: evaluations so far.
         flat: evaluations in a row whose gradient was zero.
         best: the largest objective so far.
         peak: (d,) where it was met.

@@ -67,7 +67,6 @@ class SobolState:
     Attributes:
         points: (n, k) of the unit cube, n a power of two; drawn from number `begin` of the sequence on.
         begin: number of the first of them.
-        done: points proposed so far.
     """
 
     domain: Domain
@@ -125,7 +124,6 @@ def draw(size: int, seed: int, begin: int, count: int) -> Tensor:
 
     Args:
         size: dimensions, at most `MOST`.
-        seed: of the scrambling.
         begin, count: which points; the first call takes a power of two, which is what keeps the points balanced.
     """
     from scipy.stats import qmc  # takes most of a second, and few runs need it

@@ -190,7 +190,6 @@ class Observed:
     """What was evaluated, and the process behind it.
 
     Attributes:
-        space: of the points.
         points: (n, k) in the unit box.
         values: the n objectives there; what could not be evaluated is not finite.
         scales: of the process, fitted to the first `fitted` points.

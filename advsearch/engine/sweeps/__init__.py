@@ -39,9 +39,6 @@ class NamedScene:
     """One of the scenes.
 
     Attributes:
-        object: as it is called.
-        environment: likewise.
-        scene: loaded.
         held: controls that stay where `u` has them; with the answer of a run, or as they are without it.
         u: (d,) of these; None leaves the scene as it is.
         answer: what the place is called beside the same one without the answer; empty where there is no such.
@@ -69,14 +66,8 @@ class Job:
     """Everything that was asked for, found and loaded.
 
     Attributes:
-        config: what was asked for.
-        places: the scenes.
-        models: the networks, loaded.
-        tasks: what judges the output of each.
         controls: what is drawn by chance.
-        axes: of the grid.
         aovs: layers of ground truth that are kept of every picture of the first model (`scene.surfaces.AOVS`).
-        warnings: on the way.
         metrics: numbers of every picture that rows have beside what the task says.
     """
 
@@ -162,11 +153,7 @@ class Job:
         return {size: self.space(place, size) for size in dict.fromkeys(self.sizes)}
 
     def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
-        """The controls, those of the grid as choices, bound to a scene.
-
-        Raises:
-            InputError: the scene cannot take one of them.
-        """
+        """The controls, those of the grid as choices, bound to a scene."""
         description = framed(place.scene.description, size)
         controls = (*place.held, *on_grid(self.controls, self.axes, description))
         if not controls:
@@ -193,9 +180,6 @@ class Job:
         """What is true of a configuration, as the task of a model needs it.
 
         Args:
-            place: the scene.
-            model: number of the model.
-            values: the configuration as it is described.
             look: says what is seen in it; None where no configuration is meant.
         """
         return self.tasks[model].truth(self._facts(place, values, look))
@@ -204,21 +188,13 @@ class Job:
         return facts_of(place.scene, place.object, self.config.label, lambda: values, look)
 
     def check_truths(self, place: NamedScene) -> None:
-        """Refuse a scene of which a task cannot say what is right.
-
-        Raises:
-            InputError: a model has no such class, say, or the object has no label.
-        """
+        """Refuse a scene of which a task cannot say what is right."""
         for task, model in zip(self.tasks, self.models, strict=True):
             check_truth(task, model, place.scene, self._facts(place, {}), self.config)
 
 
 def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
-    """Refuse to vary what the scenes were asked to have.
-
-    Raises:
-        InputError: a parameter is fixed and in the grid, or several environments meet a control that chooses one.
-    """
+    """Refuse to vary what the scenes were asked to have."""
     given = {name for place in places for name in place.scene.description.given}
     drawn = {control.name: control for control in controls}
     varied = {
@@ -251,9 +227,6 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     Returns:
         The points of the first scene, and what the table shows of the draws: shares of the range where scenes, or
         pictures of different shapes, have different ones.
-
-    Raises:
-        InputError: a scene cannot take a control, or a label does not fit a model.
     """
     bound = []
     for place in job.places:

@@ -33,10 +33,7 @@ class Axis:
     """One parameter and its values.
 
     Attributes:
-        control: the kind of the control.
         instance: the name of its instance; the kind unless said otherwise.
-        parameter: what it declares.
-        values: at least one, all different.
     """
 
     control: str
@@ -70,10 +67,6 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
         grid: name to values: ``"FIRST:LAST:COUNT"``, or a list. A name is KIND.PARAMETER, INSTANCE.PARAMETER of one of
             `controls`, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
         controls: what is drawn by chance.
-
-    Raises:
-        UnknownNameError: no such control or parameter.
-        InputError: values that cannot be an axis, two axes for one parameter, or one that is drawn as well.
     """
     instances = {control.name: control for control in controls}
     found: dict[str, Axis] = {}
@@ -139,11 +132,7 @@ def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, .
 
     Args:
         where: what errors name: ``"`grid` pose.yaw"``.
-        parameter: says what is allowed.
         given: the text, a value, or a list of values.
-
-    Raises:
-        InputError: no such form, a value outside the parameter's range, or one that comes twice.
     """
     values: Sequence[Any]
     if isinstance(given, str) and ":" in given and not parameter.options:

@@ -54,12 +54,7 @@ def time_axis(axes: Sequence[Axis]) -> int | None:
 
 
 class Drives:
-    """The frames of every drive of a sweep.
-
-    Args:
-        job: what was swept.
-        rows: all that are stored.
-    """
+    """The frames of every drive of a sweep."""
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
         place = time_axis(job.axes)

@@ -76,9 +76,7 @@ class Sweep:
     """One sweep, from its first configuration or from where it was stopped.
 
     Args:
-        job: what is swept.
         run: open directory to keep it in, with the rows that are there already; None keeps it in memory.
-        progress: told how far it is.
         executor: answers batches of queries; None does it here.
     """
 
@@ -221,11 +219,7 @@ class Sweep:
         return f"about {size}" if self.job.config.keep_pictures == "all" else f"at most about {size}"
 
     def _check_answers(self) -> None:
-        """Look again at the first picture that is stored, where there is more to come here.
-
-        Raises:
-            InputError: a model says something else of it now than it did.
-        """
+        """Look again at the first picture that is stored, where there is more to come here."""
         row = None if self.run is None else next(self.run.store.rows(KIND), None)
         if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
             return

@@ -67,8 +67,6 @@ class Drawn:
     """A drawn number, as the table shows it.
 
     Attributes:
-        name: ``camera.elevation``.
-        unit: of the values.
         column: of `Picks.shares`.
         parts: what each part of [0, 1] stands for: a pair of ends, or a value of a list.
         settled: whether these are its values in every scene.
@@ -108,19 +106,14 @@ class Points:
     """The configurations of one scene.
 
     Args:
-        space: the controls.
         domain: their budgets; the start is the scene as it is.
-        axes: of the grid, all of them in the space.
         samples: pictures at each point of the grid.
-        sampler: of the draws.
-        seed: root.
         scenes: number of scenes after which the draws come again, so that what is compared has the same; 0 for never.
         among: how many scenes the sweep has.
 
     Attributes:
         parts: into how many the range of a drawn parameter is cut.
         grid: sizes of the axes and the number of points.
-        count: pictures of the scene.
         drawn: what the table shows of the draws.
         drawn_numbers: how many numbers a draw has, and which of them the table shows; the same for all scenes.
     """
@@ -373,8 +366,6 @@ def _by_description(
     """What the control itself says, one configuration after the other.
 
     Args:
-        describe: from a configuration of the whole space.
-        axes: those of the control, with their numbers.
         keep: whether these axes are all that the description depends on, so that it can be kept for the next time.
     """
     kept: dict[tuple[int, ...], dict[str, Value]] = {}

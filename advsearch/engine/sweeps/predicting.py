@@ -49,8 +49,6 @@ class Groups:
     """How the pictures of a scene fall into groups.
 
     Attributes:
-        grid: of the scene.
-        samples: draws at each point of the grid.
         within: of every axis of the grid, whether the pictures of a group may differ in it.
         drawn: whether they may differ in what is drawn.
         frames: number of the axis of the frames of a drive, which have one draw; None without.
@@ -149,11 +147,6 @@ class SweptPredictor(ABC):
     """Predicts pictures of one scene at one size.
 
     Args:
-        renderer: the one that traces paths.
-        points: the configurations.
-        axes: of the grid.
-        spp: samples a pixel of a rendered picture.
-        seed: of what predicts, and of comparisons.
         score: what a comparison says in logits.
         specialise: whether anything may be left out.
         before: pictures of the scenes before.
@@ -356,9 +349,6 @@ def pays_from(renderer: Renderer, spp: int, checks: int, arrangements: float = 1
     """Return how many pictures under one light have to be wanted for it to pay.
 
     Args:
-        renderer: the one that traces.
-        spp: samples a pixel of a rendered picture.
-        checks: pictures that are compared.
         arrangements: what texels see is found so many times for each light.
     """
     height, width = renderer.formation.resolution

@@ -52,8 +52,6 @@ class Count:
     """Right answers among configurations, for every value of one axis.
 
     Attributes:
-        name: of the axis.
-        unit: of its values.
         values: what each place stands for: a number, a name, or a pair of ends.
         seen: configurations of each value.
         correct: those that the model got right.
@@ -140,13 +138,10 @@ class Tally:
 
     Args:
         outer: name and values of the axes outside the scene: object, environment, model.
-        axes: of the grid.
         drawn: what the table shows of the draws.
         pairs: configurations without an answer, each of which comes again with it, so many numbers later; 0 for none.
 
     Attributes:
-        seen: configurations.
-        correct: those that the model got right.
         not_finite: those whose margin was not a number; they count as not right.
         worst: the number of the configuration with the largest margin, with what was seen there; the first of equals.
         answers: how often each wrong answer was given.
@@ -176,11 +171,9 @@ class Tally:
         """Count one configuration.
 
         Args:
-            index: its number.
             outer: its places on the outer axes.
             picks: the pictures it belongs to.
             place: its place among them.
-            trial: what was seen.
         """
         right = trial.right
         if pairs := len(self._verdicts[0]):
@@ -316,14 +309,7 @@ def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bo
     """Read a folder that 3DB wrote into a run, and return its folder.
 
     Args:
-        folder: with `details.log`, `class_maps.json` and `images/`.
         run: the run's name or folder; None for ``runs/NAME-3db-NNN``.
-        overwrite: replace the run that is there.
-
-    Raises:
-        FileFormatError: the folder lacks a file, or one is damaged.
-        RunExistsError: there is a run already.
-        StorageError: the run cannot be written.
     """
     counts = _Counts()
     with RunDirectory.create(run, overwrite=overwrite, default=default_name(folder.resolve().name, ["3db"])) as kept:
@@ -415,11 +401,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def read_picture(path: Path) -> object:
-    """Return the picture (H, W, 3) in [0, 1] in a file.
-
-    Raises:
-        FileFormatError: it is none, or has more than `MOST_PIXELS`.
-    """
+    """Return the picture (H, W, 3) in [0, 1] in a file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)

@@ -59,14 +59,10 @@ class PartCounts:
     """Counts of n parts over pictures: of the answers, and of the wrong ones shared out by chance.
 
     Args:
-        parts: n.
         pictures: how many there will be.
         failures: of them, those whose answer is wrong.
-        seed: of the chance.
 
     Attributes:
-        pictures: as given.
-        failures: as given.
         seen: (n,) pictures in which each part holds.
         wrong: (n,) of them, those whose answer is wrong.
         chance: (SHARINGS, n) the same for wrong answers that were shared out.
@@ -84,7 +80,6 @@ class PartCounts:
 
         Args:
             parts: numbers of those that hold in it, each once.
-            failed: whether its answer is wrong.
         """
         self.seen[parts] += 1
         self.wrong[parts] += failed
@@ -126,8 +121,6 @@ def association(tally: PartCounts, some: slice, least: int) -> Association:
     """Compare the answers where each of some parts holds with those where it does not.
 
     Args:
-        tally: of all pictures.
-        some: the parts.
         least: a part is compared that holds in so many pictures and does not in as many.
     """
     seen, wrong, pictures, failures = tally.seen[some], tally.wrong[some], tally.pictures, tally.failures
@@ -201,7 +194,6 @@ class SurfaceCounts:
     """How often each part of an object's surface was seen, and how often the answers were wrong then.
 
     Args:
-        parts: of the object.
         tallies: for each model, of as many parts.
     """
 
@@ -212,7 +204,6 @@ class SurfaceCounts:
         """Count a picture.
 
         Args:
-            shown: what it shows.
             wrong: by the number of the model, whether its answer is wrong.
         """
         there = shown.seen(OBJECT)
@@ -281,15 +272,7 @@ class SurfaceCounts:
 def map_surface(
     job: Job, rows: Iterable[Row], opened: Callable[[int], SweptScene], run: RunDirectory, progress: Progress
 ) -> SurfaceMap:
-    """Count over the surface of each object, write the counts and their figure, and return what the summary says.
-
-    Args:
-        job: what was swept.
-        rows: all that it has stored, in whatever order.
-        opened: gives a scene by its number.
-        run: gets the files.
-        progress: told of each row.
-    """
+    """Count over the surface of each object, write the counts and their figure, and return what the summary says."""
     per_scene, models = opened(0).points[job.sizes[0]].count, len(job.models)
     wrong: npt.NDArray[np.int8] = np.full((len(job.places), per_scene, models), UNKNOWN, np.int8)
     for row in rows:

@@ -112,16 +112,10 @@ class SweptLight(SweptPredictor):
 class SweptScene:
     """One scene, ready to be rendered and shown to the models: what a `Problem` is to an attack.
 
-    Args:
-        job: what is swept.
-        number: of the scene.
-
     Attributes:
-        job, number: likewise.
         points: its configurations for each size of picture, on which what a control frames may depend.
         renderers: likewise.
         light: what predicts pictures of these that differ in little.
-        prepared: nothing.
     """
 
     prepared: Any = None
@@ -162,11 +156,7 @@ class SweptScene:
 
     def answers(self, queries: Sequence[Query]) -> list[Evaluation]:
         """Answer queries of neighbouring rows: a picture is made once for each size, and a model sees all of its own at
-        once.
-
-        Args:
-            queries: by `Job.queries`, or some of these.
-        """
+        once."""
         begun, before, job = time.perf_counter(), self.not_finite, self.job
         models = len(job.models)
         made = {size: self._made(size, queries) for size in self.points}
@@ -226,8 +216,6 @@ class SweptScene:
         """What is true of a configuration (d,), as the task of one model needs it.
 
         Args:
-            model: number of it.
-            u: the configuration.
             listed: values of the grid as they were given, in the place of what single precision makes of them.
         """
         job, size = self.job, self.job.sizes[model]
@@ -246,7 +234,6 @@ class SweptScene:
         """What is seen in the pixels of pictures, one after the other.
 
         Args:
-            picks: n of them.
             size: (height, width) of the pictures; None for those that the first model is shown.
             fineness: parts of each side of a pixel.
         """
@@ -276,11 +263,7 @@ class SweptScene:
 
 
 class Scenes:
-    """The scenes of a sweep in this process, of which the last one is held.
-
-    Args:
-        job: what is swept.
-    """
+    """The scenes of a sweep in this process, of which the last one is held."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -326,14 +309,6 @@ def check_worst(
     """Render a configuration again, and say how often the model is wrong.
 
     Trials that the run has stored already are not made again.
-
-    Args:
-        view: its scene.
-        job: says how many trials.
-        model: number of the model.
-        u: (d,).
-        run: gets a row for every trial, and has those of a run that was stopped.
-        stages: told how far it is.
 
     Returns:
         As `verified` in the summary; None without trials.
