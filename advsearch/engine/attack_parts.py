@@ -27,22 +27,8 @@ from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.judging import Described, Looked, Metrics, check_truth, facts_of, load_metrics, shown
-from advsearch.engine.loading import (
-    SCENE,
-    Controls,
-    Scene,
-    framed,
-    lent,
-    make_renderer,
-)
-from advsearch.engine.naming import (
-    AnyModel,
-    check_run_settings,
-    given_to,
-    load_models,
-    scene_of,
-    several,
-)
+from advsearch.engine.loading import SCENE, Controls, Scene, framed, lent, make_renderer
+from advsearch.engine.naming import AnyModel, check_run_settings, given_to, load_models, scene_of, several
 from advsearch.engine.objective import AnyObjective, objective_for, print_terms, task_for
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import CleanMatrix, reason_against

@@ -35,10 +35,7 @@ from advsearch.runs import images, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.attack import (
-    AnswerAlongDrive,
-    AttackSummary,
-)
+from advsearch.runs.results.attack import AnswerAlongDrive, AttackSummary
 from advsearch.scene.description import OBJECT
 from advsearch.scene.exporting.gltf import PosedMesh, posed, web_glb
 from advsearch.scene.formation import to_8_bit

@@ -205,12 +205,7 @@ def task_for(task: Task, model: Model) -> Task:
 
 
 def objective_for(
-    wanted: AnyObjective,
-    task: Task,
-    model: Model,
-    renderer: Renderer,
-    seed: int,
-    ensemble: Way | None = None,
+    wanted: AnyObjective, task: Task, model: Model, renderer: Renderer, seed: int, ensemble: Way | None = None
 ) -> tuple[Objective, str]:
     """Return what is maximised, and what there is to say about it; one of features is shown the clean picture first.
 

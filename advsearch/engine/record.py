@@ -266,7 +266,7 @@ class Results:
         self.made = 0
 
     def get(self, key: str, measure: Callable[[], Any]) -> Any:
-        """Return the JSON value that is stored under a key, or what `measure` returns, which is stored then, in time."""
+        """Return the JSON value that is stored under a key, or what `measure` returns in time, and store it."""
         stored = self.stored(key)
         if stored is None:
             self.check_time()

@@ -343,10 +343,7 @@ def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) ->
         raise _wrong(folder, number, str(error)) from None
     if not isinstance(told, dict) or not isinstance(told.get("render_args"), dict):
         raise _wrong(folder, number, "a line without render_args")
-    values: dict[str, Value] = {
-        "object": _value(told.get("model")),
-        "environment": _value(told.get("environment")),
-    }
+    values: dict[str, Value] = {"object": _value(told.get("model")), "environment": _value(told.get("environment"))}
     for name, value in told["render_args"].items():
         if isinstance(value, list):
             values |= {f"{name}[{place}]": _value(one) for place, one in enumerate(value)}

@@ -196,7 +196,7 @@ class Store:
         return (row, _told(found, self.path)) if row and found else None
 
     def pictures(self, kind: str, after: int, until: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield number and picture of what the rows of a kind with ids over `after` have told, while the run goes on."""
+        """Yield number and picture of what rows of a kind with ids over `after` have told, while the run goes on."""
         with readable(self.path):
             cursor = self._db.execute(
                 "SELECT number, u, non_finite, cost, NULL, picture, height FROM told JOIN evaluations ON row = id "

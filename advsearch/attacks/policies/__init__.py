@@ -38,10 +38,7 @@ def _own() -> dict[str, type[Policy[Any]]]:
 
 
 POLICIES: Registry[type[Policy[Any]]] = Registry(
-    "advsearch.policies",
-    _own(),
-    "a dataclass over Policy whose name is that of the entry point",
-    _is_policy,
+    "advsearch.policies", _own(), "a dataclass over Policy whose name is that of the entry point", _is_policy
 )
 """Every policy by its word on the command line."""
 

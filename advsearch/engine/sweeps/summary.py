@@ -148,11 +148,7 @@ class Tally:
     """
 
     def __init__(
-        self,
-        outer: Sequence[tuple[str, Sequence[str]]],
-        axes: Sequence[Axis],
-        drawn: Sequence[Drawn],
-        pairs: int = 0,
+        self, outer: Sequence[tuple[str, Sequence[str]]], axes: Sequence[Axis], drawn: Sequence[Drawn], pairs: int = 0
     ) -> None:
         self._verdicts = [bytearray(pairs), bytearray(pairs)]
         self.seen = self.correct = self.not_finite = 0
