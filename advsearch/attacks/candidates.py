@@ -51,7 +51,6 @@ class Candidate:
 
     @property
     def rate(self) -> float:
-        """Fraction of new renders that are a success; of the raw one if there are none."""
         return self.successes / len(self.again) if self.again else float(self.success)
 
 

@@ -141,7 +141,6 @@ class Product:
         return tuple(found)
 
     def index(self, digits: Sequence[int]) -> int:
-        """Return the number of the point at these places; the inverse of `digits`."""
         number = 0
         for size, digit in zip(self.sizes, digits, strict=True):
             number = number * size + digit

@@ -158,7 +158,6 @@ def name_of(function: Callable[..., Any]) -> str:
 
 
 def _values(name: str, values: Any, count: int) -> Tensor:
-    """What a function returned, as (N,)."""
     if not isinstance(values, Tensor):
         raise InputError(
             f"objective {name!r}: expected a torch tensor of shape ({count},), got {type(values).__name__}; "
@@ -249,8 +248,6 @@ class ObjectiveKind:
 
 
 def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
-    """An objective that asks for nothing more."""
-
     def plain(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
         return function(output, images, truth)
 

@@ -104,7 +104,6 @@ def mcnemar(first: int, second: int) -> float:
 
 
 def _wilson(share: float, n: int) -> tuple[float, float]:
-    """Wilson's score interval of a share of n, 95 %."""
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
     middle, half = share + z * z / (2 * n), z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
     return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
@@ -128,7 +127,6 @@ class Trials:
 
     @property
     def rate(self) -> float:
-        """Fraction of trials that succeeded."""
         return self.successes / self.trials
 
     @property
@@ -185,19 +183,16 @@ class ConfidenceSequence:
             raise InputError(f"confidence: expected a number between 0 and 1, got {self.confidence}")
 
     def add(self, value: float) -> None:
-        """Take note of a draw in [0, 1]."""
         if not 0.0 <= value <= 1.0:
             raise InputError(f"draw: expected a number from 0 to 1, got {value}")
         self._counts[value] += 1
 
     @property
     def count(self) -> int:
-        """Draws so far."""
         return sum(self._counts.values())
 
     @property
     def mean(self) -> float:
-        """Their mean; NaN where there is none."""
         return sum(value * count for value, count in self._counts.items()) / self.count if self.count else float("nan")
 
     def is_over(self, mean: float) -> bool:
@@ -412,7 +407,6 @@ def most_samples(configurations: int, ladder: Sequence[int] = LADDER, trials: in
 
 
 def _rung(name: str, spp: int, values: Sequence[float], below: Sequence[float], looks: int, trials: int) -> Rung:
-    """Summarise the margins of one rung and compare them with the rung below."""
     mean, half_width = _mean(values), _quantile(len(values), looks) * _deviation(values) / math.sqrt(len(values))
     if not below:
         return Rung(name, spp, mean, half_width, math.nan, False)
@@ -424,7 +418,6 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _deviation(values: Sequence[float]) -> float:
-    """The standard deviation of what these were drawn from."""
     mean = _mean(values)
     return math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
 

@@ -102,7 +102,6 @@ class Rule:
         return max(share, self.fewest)
 
     def allowed(self, trials: int) -> int:
-        """Return how many of `trials` may fail."""
         return trials - self.needed(trials)
 
     @property
@@ -111,7 +110,6 @@ class Rule:
         return next(n for n in itertools.count(1) if clopper_pearson(self.share(n), n)[0] >= LEAST_RATE)
 
     def share(self, trials: int) -> int:
-        """Return the percentage of so many trials, rounded up."""
         return -(-self.percent * trials // 100)
 
     def succeeded(self, trial: Judgement, clean: Judgement) -> bool:
@@ -196,13 +194,11 @@ class Verification:
 
     @property
     def counting(self) -> tuple[Judgement, ...]:
-        """The trials that the rate is of; all of them where none counts."""
         trials = zip(self.adversarial_trials, self.outcomes, strict=True)
         return tuple(trial for trial, outcome in trials if outcome is not None) or self.adversarial_trials
 
     @property
     def successes(self) -> tuple[Judgement, ...]:
-        """The trials that are a success."""
         return tuple(trial for trial, outcome in zip(self.adversarial_trials, self.outcomes, strict=True) if outcome)
 
 
@@ -292,7 +288,6 @@ def verify(
     u, beside, done, renders = domain.project(u), list(clean), list[Judgement](), 0
 
     def tried(others: Sequence[Judgement]) -> tuple[bool | None, ...]:
-        """What comes of trials, beside the clean ones."""
         return tuple(
             rule.succeeded(trial, clean) if clean.right or not rule.conditional else None
             for trial, clean in zip(others, beside, strict=False)

@@ -89,7 +89,6 @@ class Workforce:
 
     @property
     def told(self) -> dict[str, float | str]:
-        """What is shown beside a bar."""
         counts = {"lost": self.lost, "retried": self.retried}
         return {"workers": self.workers, **{name: count for name, count in counts.items() if count}}
 

@@ -99,7 +99,6 @@ class Coordinator:
         self._counted_at = self._alone_since = self._looked_at = clock()
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
-        """See `Executor.results`."""
         self._let_go()  # what an earlier call has left under way
         self._call += 1
         call, source = self._call, iter(batches)

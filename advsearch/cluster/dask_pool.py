@@ -277,7 +277,6 @@ class DaskPool:
                 logging.getLogger(__name__).debug("%s could not be ended", worker, exc_info=True)
 
     def _told(self, event: tuple[float, Any]) -> None:
-        """The scheduler tells of a worker."""
         _, message = event
         action = message.get("action") if isinstance(message, Mapping) else None
         if action == "add-worker":

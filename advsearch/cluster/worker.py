@@ -109,7 +109,6 @@ class Files:
 
     @property
     def named_only(self) -> Files:
-        """The same without contents."""
         return Files(self.named, {})
 
 
@@ -152,7 +151,6 @@ def write_files(work: Work, files: Files, folder: Path) -> Work:
 
 
 def _here(path: str, digest: str, sent: Path) -> str:
-    """The path that has the file here: the same as there, or that of what was sent."""
     for one in (Path(path), sent):
         if one.is_file() and _digest(_contents(one)) == digest:
             return str(one)

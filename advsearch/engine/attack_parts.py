@@ -236,7 +236,6 @@ def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Desc
 
 
 def _space(job: AttackParts, description: SceneDescription) -> Space:
-    """The searched controls and those that vary by chance, on a framed scene."""
     return make_space((*job.controls, *job.over), description)
 
 

@@ -214,12 +214,10 @@ class Bank(Predictor):
             self.seconds += time.perf_counter() - begun
 
     def _numbers(self, number: int) -> Tensor:
-        """The condition with this number."""
         assert self.problem.conditions is not None
         return stratified(self.problem.conditions, number, seeds.stream(self.problem.seed, "bank"))
 
     def _query(self, number: int) -> Query:
-        """What is asked for the condition with this number: the light at its place."""
         whole = torch.cat([self._place(number), self._numbers(number)])
         return Query(whole, seeds.stream(self.problem.seed, "bank matrix", number), spp=SPP, wanted="light")
 

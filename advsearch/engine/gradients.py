@@ -100,7 +100,6 @@ class Estimate:
 
     @property
     def standard_error(self) -> float:
-        """Of the mean."""
         return self.noise / math.sqrt(max(1, self.repeats))
 
 
@@ -321,7 +320,6 @@ class _Pairs:
     narrow: list[float] = field(default_factory=list)
 
     def extend(self, renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, *, until: int) -> None:
-        """Add seeds until there are so many."""
         for number in range(len(self.wide), until):
             noise = seeds.stream(seed, "reference", number)
             self.wide.append(_difference(renderer, loss, u, self.probe, self.probe.step, noise, spp))
@@ -329,7 +327,6 @@ class _Pairs:
 
     @property
     def both(self) -> tuple[float, float]:
-        """Mean at the larger and at the smaller step."""
         return statistics.fmean(self.wide), statistics.fmean(self.narrow)
 
     @property
@@ -339,12 +336,10 @@ class _Pairs:
 
     @property
     def value(self) -> float:
-        """Mean of the extrapolated ones."""
         return statistics.fmean(self._at_zero)
 
     @property
     def error(self) -> float:
-        """Standard error of `value`."""
         return _error(self._at_zero)
 
     @property

@@ -64,7 +64,6 @@ class Shared:
     name: str = ""
 
     def __call__(self, queries: Sequence[Query]) -> Iterable[Evaluation]:
-        """Answer them: see `advsearch.attacks.evaluation.Evaluate`."""
         if self.executor is None or len(queries) < 2:
             return map(self.problem.evaluate, queries)
         return self._sent(self.executor, queries)
@@ -447,11 +446,9 @@ class Journal:
     # ---- notes ------------------------------------------------------------------------------------------------------
 
     def note(self, key: str) -> Any:
-        """Return the JSON value that was noted, or None."""
         return None if self.run is None else self.run.store.noted(key)
 
     def set_note(self, key: str, value: Any) -> None:
-        """Keep a JSON value."""
         if self.run is not None:
             self.run.store.set_note(key, json.dumps(value))
 

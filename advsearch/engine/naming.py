@@ -249,7 +249,6 @@ def _not_taken(setting: str, name: str, kind: str) -> InputError:
 
 
 def _bounded(kind: str) -> str:
-    """What a control would take an epsilon for, in words; nothing if there is no such thing."""
     choices = CONTROLS[kind].choices if kind in CONTROLS else ()
     bounded = [choice.bounds for choice in choices if choice.run_setting == "epsilon" and choice.bounds]
     return f", or search {bounded[0]} with it" if bounded else ""

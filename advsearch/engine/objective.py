@@ -160,7 +160,6 @@ def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
 
 
 def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Both terms, summed over what is to be printed."""
     found = list(space.printed(u).values())
     if not found:
         raise InputError(

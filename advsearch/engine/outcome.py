@@ -215,7 +215,6 @@ def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
 
 
 def _printability(problem: Problem, findings: Findings) -> Printability:
-    """The terms of the clean scene and of the answer."""
     space, domain, search = problem.searched_space, problem.domain, findings.search
     answer = None if search is None else print_terms(space, domain.project(search.best_u))
     return Printability(clean=print_terms(space, domain.start), answer=answer, cost=_print_cost(problem, findings))
@@ -238,12 +237,10 @@ def _print_cost(problem: Problem, findings: Findings) -> PrintCost | None:
 
 
 def _alone(values: dict[str, T]) -> T | dict[str, T]:
-    """What holds of the only control; by control where there are several."""
     return next(iter(values.values())) if len(values) == 1 else values
 
 
 def _answer(shown: KeptPicture) -> dict[str, Any]:
-    """What the model says of a picture that is kept."""
     return {**vars(shown.judgement.answer), "payload": shown.judgement.payload, "trial": shown.trial}
 
 
@@ -341,7 +338,6 @@ def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
 
 
 def _without_terms(search: SearchResult, problem: Problem, predicted: int) -> int:
-    """Pictures and gradients that a search took beside what was predicted."""
     return search.renders * problem.draws - predicted + max(0, search.gradients - predicted)
 
 
@@ -357,7 +353,6 @@ def _gradients(search: SearchResult) -> SearchGradients:
 
 
 def _average(findings: Findings) -> AverageCase:
-    """How often the model is right over configurations drawn from the whole space."""
     counted = count_right(findings.average, findings.spp)
     scores = [trial.score for trial in findings.average]
     return AverageCase(
@@ -371,7 +366,6 @@ def _average(findings: Findings) -> AverageCase:
 
 
 def _smallest(bracket: Bracket, problem: Problem) -> SmallestEpsilon:
-    """The bracket of the smallest epsilon, in the unit of each control."""
     budgets = {bound.name: float(bound.budget.epsilon or 0.0) for bound in problem.searched_space.controls}
     flips = bracket.u is not None
     return SmallestEpsilon(
@@ -385,7 +379,6 @@ def _smallest(bracket: Bracket, problem: Problem) -> SmallestEpsilon:
 
 
 def _distribution(distribution: Distribution, problem: Problem) -> AnswerDistribution | None:
-    """Mean and spread of a distribution of configurations, where there are few numbers."""
     if distribution.mean.numel() > MOST_NUMBERS:
         return None
     return AnswerDistribution(mean=_described(problem, distribution.mean), deviation=distribution.deviation.tolist())
@@ -402,14 +395,12 @@ def _ending(findings: Findings, problem: Problem) -> Ending:
 
 
 def _verified(verification: Verification | None) -> VerifiedRate | None:
-    """Rates, and what the model answered in the trials that it got wrong."""
     if verification is None:
         return None
     return verified_rate(verification)
 
 
 def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str]:
-    """What a reader has to know beside the numbers."""
     remarks = [told] if (told := remark(findings.rendered_because)) else []
     count = findings.sample_count
     if count is not None and count.table and not count.converged:

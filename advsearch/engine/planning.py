@@ -357,7 +357,6 @@ def _reason(depth: int, full: int, cuts: Mapping[int, PathCut]) -> str:
 
 
 def _missing(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:
-    """The share of the radiance that is missing."""
     full = sum(float(radiance.mean()) for radiance, _ in whole)
     return 1.0 - sum(float(radiance.mean()) for radiance, _ in cut) / full if full > 0.0 else 0.0
 
@@ -369,7 +368,6 @@ def _bias(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Te
 
 
 def _pictures(renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int) -> tuple[Tensor, Tensor]:
-    """Radiance and displayed picture."""
     with torch.no_grad(), renderer.scene.shorter(depth):
         radiance = renderer.radiance(u, seed, spp)
         return radiance, renderer.space.picture(u, renderer.formation.display(radiance))

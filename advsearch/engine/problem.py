@@ -97,12 +97,10 @@ class Problem:
 
     @property
     def plan(self) -> GradientPlan:
-        """How derivatives are obtained."""
         return self.renderer.plan
 
     @plan.setter
     def plan(self, plan: GradientPlan) -> None:
-        """Take a plan: nothing is computed for the conditions, and the domain's cost follows."""
         names = {control.name for control in self.space.controls[self.searched :]} if self._over else set()
         none = {group.name: "none" for group in plan.groups if group.control in names}
         self.renderer.plan = plan.with_estimator(none, BY_CHANCE)
@@ -113,7 +111,6 @@ class Problem:
 
     @property
     def prepared(self) -> Prepared:
-        """What was measured before the search."""
         return Prepared(self.spp, self.search_depth, self.plan)
 
     @prepared.setter
@@ -135,13 +132,11 @@ class Problem:
 
     @property
     def environment(self) -> str:
-        """What lights the clean scene, by name."""
         scene = self.space.scene
         return self.space.environment or (NO_MAP if scene is None else scene.environment_name)
 
     @property
     def rule(self) -> Rule:
-        """When an answer counts as verified."""
         if self.task.minimise:
             return EASIER
         return WORST_CASE if self.conditions is None else OVER_CONDITIONS
@@ -406,7 +401,6 @@ class Problem:
 
     @staticmethod
     def _usual(each: Sequence[Judgement]) -> Judgement:
-        """The most frequent answer, with the means over all."""
         score, margin = (mean(values) for values in ([one.score for one in each], [one.margin for one in each]))
         usual = typical(each)
         return Judgement.of(score, margin, usual.answer, usual.payload)

@@ -85,7 +85,6 @@ class Findings:
 
     @property
     def spp(self) -> int:
-        """Samples a pixel of the verification."""
         if self.sample_count is None:
             raise RuntimeError("the sample count of the verification has not been chosen yet")
         return self.sample_count.spp
@@ -113,14 +112,12 @@ class Stages:
         self.progress.stage(title, total, hint=hint, at_most=at_most)
 
     def end(self) -> None:
-        """End the stage that runs, if one does."""
         if self._name:
             self.seconds[self._name] = self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
             self._name = ""
 
     @property
     def total(self) -> float:
-        """Seconds since the first stage began."""
         return time.perf_counter() - self.started
 
 
@@ -290,16 +287,13 @@ class Results:
         return kind.of(self.get(key, lambda: measure().to_dict()))
 
     def rows(self, key: str, kind: type[Kind], measure: Callable[[], Sequence[Kind]]) -> list[Kind]:
-        """Return what `row` does, of several at once."""
         return [kind.of(one) for one in self.get(key, lambda: [one.to_dict() for one in measure()])]
 
     def put(self, key: str, value: Any) -> None:
-        """Store a JSON value."""
         if self._run is not None:
             self._run.store.set_note(key, json.dumps(value))
 
     def stored(self, key: str) -> Any:
-        """Return what is stored under a key, or None."""
         return None if self._run is None else self._run.store.noted(key)
 
 

@@ -287,7 +287,6 @@ def render(
 
 
 def _configuration(at: Tensor, space: Space) -> Tensor:
-    """A configuration that was given for a space."""
     u = torch.as_tensor(at, dtype=torch.float32)
     if u.shape != space.start.shape:
         raise InputError(
@@ -299,7 +298,6 @@ def _configuration(at: Tensor, space: Space) -> Tensor:
 def _facts(
     description: SceneDescription, label: str | None, look: Callable[[], Surfaces], values: Mapping[str, Value]
 ) -> Facts:
-    """What a view gives a task to judge by."""
     said = {**description.values, **{name: one["value"] for name, one in values.items()}}
     numbers = {name: float(one) for name, one in said.items() if isinstance(one, (int, float))}
     return Facts(description.object_name, label, description.object.label, lambda: numbers, lambda: sight_of(look()))
@@ -334,7 +332,6 @@ def writable(path: str | Path, views: int) -> Path:
 
 
 def _turned(description: SceneDescription, around: int | None) -> Iterator[SceneDescription]:
-    """The scene, or the scene from azimuths all around it."""
     if around is None:
         yield description
         return
@@ -348,5 +345,4 @@ def _turned(description: SceneDescription, around: int | None) -> Iterator[Scene
 
 
 def _turns(control: Control) -> bool:
-    """Whether a control says where the camera stands around the object."""
     return control.kind == "camera" and "azimuth" in control.settings()

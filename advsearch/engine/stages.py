@@ -206,7 +206,6 @@ class Searches:
             yield penalised(answer, self.problem.searched_space, query.u) if printed else answer
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
-        """Begin the stage of a search of at most so many steps, and its ranking."""
         renders = planned_renders(steps, close=self.config.close_looks)
         hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
         if self.findings.transport is not None:
@@ -305,7 +304,6 @@ class Attack:
         self._searches = Searches(self.journal, self.config, self.policy, *kept)
 
     def carry_out(self) -> Findings:
-        """Do everything; what an interrupt leaves undone is missing from the findings."""
         if self.config.smallest:
             scaled(self.problem.domain, 1.0)  # refuses what has no budget before anything is rendered
         try:

@@ -162,7 +162,6 @@ class SurfaceLight(Predictor):
 
     @cached_property
     def _colored(self) -> bool:
-        """Whether the object's base colour is searched."""
         return bool(self._changing(frozenset({COLOR}))[: self.problem.domain.dim].any())
 
     @cached_property
@@ -189,7 +188,6 @@ class SurfaceLight(Predictor):
 
     @property
     def renderer(self) -> SurfaceRenderer:
-        """What predicts pictures."""
         if self._renderer is None:
             self.prepare()
         assert self._renderer is not None
@@ -221,7 +219,6 @@ class SurfaceLight(Predictor):
             yield self.evaluate(query, ahead.get(place))
 
     def _ahead(self, queries: Sequence[Query], place: int) -> dict[int, Tensor]:
-        """The pictures of the next queries, made at once; by the places of these."""
         some = [one.u for one in queries[place : place + self.renderer.at_once]]
         with torch.no_grad():
             pictures = self.renderer.pictures([self._inputs(u) for u in some], self.renderer.there, some)
@@ -286,7 +283,6 @@ class SurfaceLight(Predictor):
 
     @cached_property
     def _moves(self) -> bool:
-        """Whether any number of u moves something."""
         return bool(self._moving.any())
 
     def _pictures(self, wholes: Sequence[Tensor], u: Tensor, key: tuple[int, int] | None = None) -> Tensor:

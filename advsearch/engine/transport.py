@@ -280,12 +280,10 @@ class Transport(Predictor):
 
     @property
     def _pictures(self) -> int:
-        """Pictures that are traced to make a matrix."""
         return self.start.lights if isinstance(self.start, BasisRenderer) else 1
 
     @property
     def start(self) -> PredictingRenderer:
-        """Where every search begins."""
         return self._begin.renderer
 
     @property

@@ -84,7 +84,6 @@ class Verifier:
 
     @property
     def count(self) -> int:
-        """Trials of each group, at most."""
         return self.looks[-1]
 
     def answers(
@@ -219,7 +218,6 @@ class Verifier:
         flags: str = "`trials` or `verify_spp`",
         at_most: bool = False,
     ) -> None:
-        """Begin a stage of so many trials."""
         most = "at most " if at_most else ""
         hint = f"{most}{trials} pictures of {plural(self.findings.spp, 'sample')} a pixel; {flags} shorten it"
         self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
@@ -381,7 +379,6 @@ class Retrials:
         self._pictured = ""
 
     def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
-        """Try the clean scene under one condition, once."""
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
                 partial(self._answers, "clean", condition),
@@ -413,7 +410,6 @@ class Retrials:
         )
 
     def _answers(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Answer the trials of one configuration under one condition."""
         changed = partial(self._changed, kind, condition)
         for answer in self._journals[condition.name].answers(queries, changed):
             self._progress.advance(1)

@@ -234,14 +234,12 @@ class RuleCondition:
     options: frozenset[int] | None = None
 
     def holds(self, found: Observations) -> Mask:
-        """Return for which rows (n,) it holds."""
         column = found.values[:, self.place]
         if self.options is not None:
             return np.isin(column, list(self.options))
         return (column > self.low) & (column <= self.high)
 
     def text(self, factor: Factor) -> str:
-        """Return it in words."""
         unit = f" {factor.unit}" if factor.unit not in ("", "1") else ""
         if self.options is not None:
             return f"{factor.name} {' or '.join(factor.options[one] for one in sorted(self.options))}"
@@ -417,7 +415,6 @@ def _candidates(found: Observations, least: int, seed: int) -> Iterator[RuleCond
 def _nodes(
     tree: object, meaning: Sequence[tuple[int, int | None]], factors: Sequence[Factor]
 ) -> Iterator[RuleConditions]:
-    """The conditions of every node of a tree of scikit-learn."""
     left, right = tree.children_left, tree.children_right  # type: ignore[attr-defined]
     columns, thresholds = tree.feature, tree.threshold  # type: ignore[attr-defined]
     open_nodes: list[tuple[int, dict[int, RuleCondition]]] = [(0, {})]

@@ -193,7 +193,6 @@ class RunDirectory:
         return f"start again with advsearch run {self.path / CONFIG}"
 
     def _check_goes_on(self) -> None:
-        """Refuse a search that an older advsearch has begun: it kept what searches were told elsewhere."""
         if (self.path / OLD_LOG).exists():
             raise InputError(f"{self.path}: cannot go on: it was begun by an older advsearch; {self.again}")
 
@@ -279,7 +278,6 @@ class RunDirectory:
         return replacing(self.path / name)
 
     def write_summary(self, result: Result) -> Path:
-        """Write `summary.json` and return its path."""
         return summary.write_summary(self.path, result)
 
     def close(self) -> None:
@@ -289,7 +287,6 @@ class RunDirectory:
         self._lock.release()
 
     def _told(self) -> None:
-        """Let what is told of the run end."""
         if self._tracker is not None:
             self._tracker.close()
             self._tracker = None
@@ -440,7 +437,6 @@ def _numbered(default: str) -> Path:
 
 
 def _clear(path: Path) -> None:
-    """Remove what a run writes from the directory, and nothing else."""
     for found in list(path.iterdir()):
         if found.name in CONTENTS or found.name.startswith(PART):
             if found.is_dir() and not found.is_symlink():

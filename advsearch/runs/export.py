@@ -146,7 +146,6 @@ def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> 
 
 
 def _flat(record: JsonObject) -> JsonObject:
-    """The record with its payload as a text."""
     payload = record[PAYLOAD]
     return record if payload is None else {**record, PAYLOAD: json.dumps(payload, allow_nan=False, ensure_ascii=False)}
 

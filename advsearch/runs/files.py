@@ -99,7 +99,6 @@ def write_text(path: Path, text: str, *, durable: bool = True) -> Path:
 
 
 def _flush(path: Path) -> None:
-    """Ask the operating system to put a file, or the entries of a folder, on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -350,7 +349,6 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
 
 
 def _migrated_copy(db: sqlite3.Connection) -> sqlite3.Connection:
-    """An older file's contents in memory, as the present version has them; the file stays as it is."""
     copy = sqlite3.connect(":memory:")
     db.backup(copy)
     db.close()
@@ -359,7 +357,6 @@ def _migrated_copy(db: sqlite3.Connection) -> sqlite3.Connection:
 
 
 def _migrate(db: sqlite3.Connection) -> None:
-    """Bring a file up to date."""
     for number, script in enumerate(MIGRATIONS[_version(db) :], start=_version(db) + 1):
         db.executescript(f"BEGIN; {script} PRAGMA user_version = {number}; COMMIT;")
 

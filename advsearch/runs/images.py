@@ -185,5 +185,4 @@ def _picture(array: Any) -> Any:
 
 
 def _floats(image: Any) -> Floats:
-    """Return an array of numpy or torch as float32."""
     return np.asarray(image.detach().cpu() if hasattr(image, "detach") else image, dtype=np.float32)

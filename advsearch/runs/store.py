@@ -229,7 +229,6 @@ class Store:
         return -1 if found is None else int(found)
 
     def count(self, kind: str | None = None) -> int:
-        """Return how many rows there are, or how many of one kind."""
         where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
         with readable(self.path):
             return int(self._db.execute(f"SELECT count(*) FROM evaluations{where}", given).fetchone()[0])
@@ -255,13 +254,11 @@ class Store:
             return cursor.fetchone()
 
     def counts(self) -> dict[str, int]:
-        """Return how many rows there are of each kind."""
         with readable(self.path):
             found = self._db.execute("SELECT kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind").fetchall()
         return {str(kind): count for kind, count in found}
 
     def note(self, key: str) -> str | None:
-        """Return what was noted under `key`, or None."""
         with readable(self.path):
             found = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
         return None if found is None else str(found[0])

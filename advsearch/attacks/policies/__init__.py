@@ -30,7 +30,6 @@ INSIDE = ("choices", "stay")
 
 
 def _own() -> dict[str, type[Policy[Any]]]:
-    """Return the policies of this folder's modules by their names, sorted."""
     modules = [import_module(f"{__name__}.{one.name}") for one in iter_modules(__path__)]
     classes = [entry for module in modules for entry in vars(module).values() if isinstance(entry, type)]
     found = {entry.name: entry for entry in classes if issubclass(entry, Policy) and "name" in vars(entry)}
@@ -73,7 +72,6 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
 
 
 def _nested(spec: Spec, where: str) -> Policy[Any]:
-    """Return the policy that a wrapper is given."""
     if isinstance(spec, Policy):
         return spec
     if isinstance(spec, str):

@@ -110,7 +110,6 @@ class AutoState:
 
     @property
     def box(self) -> Coordinates:
-        """The coordinates that are screened."""
         return self.seen.space
 
 
@@ -236,7 +235,6 @@ def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
 
 
 def _pgd(domain: Domain) -> PGD:
-    """What climbs in a domain."""
     if domain.drawn:
         return PGD(momentum=MOMENTUM_DRAWN)
     return PGD(momentum=MOMENTUM) if domain.exact else PGD()

@@ -177,7 +177,6 @@ class Raced(Policy[Race]):
 
 
 def _begin(race: Race, field: Iterable[int], number: int) -> Race:
-    """Begin a round of what is left of the renders, with equal shares for those that are in."""
     field = tuple(field)
     share = max(1, (race.steps - race.spent) // (race.rounds - number) // len(field))
     runners = [replace(runner, left=0) for runner in race.runners]
@@ -187,7 +186,6 @@ def _begin(race: Race, field: Iterable[int], number: int) -> Race:
 
 
 def _next_round(race: Race) -> Race:
-    """Begin the next round with the best of this one."""
     runners = race.runners
     ranked = sorted(race.field, key=lambda k: runners[k].best, reverse=True)
     able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
@@ -370,13 +368,11 @@ def _without(domain: Domain, numbers: Tensor) -> Domain | None:
 
 
 def _part(evaluation: Evaluation, numbers: Tensor) -> Evaluation:
-    """Return the evaluation with the gradient of the numbers alone."""
     gradient = evaluation.gradient
     return evaluation if gradient is None else replace(evaluation, gradient=gradient[numbers])
 
 
 def _whole(state: ChoicesState, numbers: Tensor, combination: int) -> Tensor:
-    """Return the configuration with these numbers and that combination."""
     u = state.domain.begin.clone()
     u[state.numbers] = numbers[: len(state.numbers)]
     u[state.choices] = state.combinations[combination]

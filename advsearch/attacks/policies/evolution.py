@@ -139,7 +139,6 @@ def utilities(values: Sequence[float]) -> list[float]:
 
 
 def _learn(state: NESState) -> NESState:
-    """Move the distribution after a whole generation."""
     weights = utilities(state.values)
     d = state.domain.dim
     towards, wider = torch.zeros(d), torch.zeros(d)
@@ -303,12 +302,10 @@ def _anew(state: CMAESState, sigma: float) -> CMAESState:
 
 
 def _deviations(state: CMAESState) -> Doubles:
-    """Return (d,) standard deviations in x."""
     return np.asarray(state.strategy.stds, dtype=np.float64)
 
 
 def _distribution(state: CMAESState) -> Distribution:
-    """Return the distribution of this run as it stands."""
     deviation = torch.from_numpy(_deviations(state)).float() * state.scale
     return Distribution(_projected(state, np.asarray(state.strategy.mean))[0], deviation)
 

@@ -89,7 +89,6 @@ class Components:
         return self.weights.log() + each.sum(dim=2)
 
     def draw(self, generator: torch.Generator, ranges: Ranges) -> Tensor:
-        """Return one draw (d,)."""
         k = int(torch.multinomial(self.weights, 1, generator=generator))
         mean, deviation = self.means[k], self.deviations[k]
         low, high = (torch.special.ndtr(end / deviation) for end in ranges.ends(mean))
@@ -282,7 +281,6 @@ def _maximised(mixture: Components, x: Tensor, weights: Tensor, ranges: Ranges, 
 
 
 def _configuration(state: MixtureState, x: Tensor) -> Tensor:
-    """Return the configuration (d,) float32 at shares x of the ranges."""
     domain = state.domain
     return domain.project((domain.lower + x * (domain.upper - domain.lower)).float())
 

@@ -122,7 +122,6 @@ class Window:
     halved: bool = True
 
     def add(self, value: float) -> Window:
-        """Return the window with one more objective."""
         last = self.values[-1] if self.values else self.before
         return replace(self, values=(*self.values, value), improved=self.improved + (value > last))
 
@@ -141,7 +140,6 @@ class Window:
         return best > mean + 2.0 * spread
 
     def next(self, steps: int, best: float, halved: bool) -> Window:
-        """Return the window that follows a checkpoint."""
         shorter = self.length - max(1, round(SHORTEN * steps))
         length = max(FEWEST, round(SHORTEST * steps), shorter)
         return Window(length, (), self.values[-1], 0, best, halved)

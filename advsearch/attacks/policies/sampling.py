@@ -212,7 +212,6 @@ class Grid(Policy[GridState]):
 
 
 def _point(state: GridState, number: int) -> Tensor:
-    """Return the configuration (d,) of a point of the grid."""
     values = []
     for axis in reversed(state.axes):
         number, place = divmod(number, len(axis))

@@ -49,7 +49,6 @@ class Coordinates:
 
     @property
     def count(self) -> int:
-        """Number of coordinates."""
         return len(self.where)
 
     def take(self, u: Tensor) -> Tensor:
@@ -205,11 +204,9 @@ class Observed:
 
     @property
     def finite(self) -> bool:
-        """Whether anything could be evaluated."""
         return any(math.isfinite(value) for value in self.values)
 
     def extended(self, evaluated: Evaluated) -> Observed:
-        """Return it with further configurations and what came of them."""
         points = torch.cat([self.points, *(self.space.take(u)[None] for u, _ in evaluated)])
         return replace(self, points=points, values=(*self.values, *(one.objective for _, one in evaluated)))
 

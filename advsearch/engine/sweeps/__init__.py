@@ -53,7 +53,6 @@ class NamedScene:
 
     @property
     def values(self) -> dict[str, Value]:
-        """What is stored of it with every configuration."""
         named: dict[str, Value] = {
             "object": {"value": self.object, "unit": ""},
             "environment": {"value": self.environment, "unit": ""},
@@ -84,7 +83,6 @@ class Job:
 
     @property
     def samples(self) -> int:
-        """Draws at each point of the grid."""
         return self.config.samples or (SAMPLES if self.controls and not self.axes else 1)
 
     @cached_property
@@ -149,7 +147,6 @@ class Job:
         return found
 
     def spaces(self, place: NamedScene) -> dict[tuple[int, int], Space]:
-        """The controls bound to a scene for each size of picture, the first model's first."""
         return {size: self.space(place, size) for size in dict.fromkeys(self.sizes)}
 
     def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
@@ -188,7 +185,6 @@ class Job:
         return facts_of(place.scene, place.object, self.config.label, lambda: values, look)
 
     def check_truths(self, place: NamedScene) -> None:
-        """Refuse a scene of which a task cannot say what is right."""
         for task, model in zip(self.tasks, self.models, strict=True):
             check_truth(task, model, place.scene, self._facts(place, {}), self.config)
 
@@ -250,7 +246,6 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
 
 
 def _check_draws(place: NamedScene, space: Space) -> None:
-    """Refuse to draw what the scene was asked to have."""
     for group in space.groups:
         if group.setting in place.scene.description.given - {ENVIRONMENT}:
             raise InputError(

@@ -48,12 +48,10 @@ class Axis:
 
     @property
     def is_time(self) -> bool:
-        """Whether its values are the frames of a drive."""
         return (self.control, self.parameter.name) == ("path", "time")
 
     @property
     def unit(self) -> str:
-        """Unit of the values."""
         return "name" if self.parameter.options else self.parameter.unit
 
 
@@ -85,7 +83,6 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
 
 
 def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
-    """Find the parameter of one axis and read its values."""
     head, dot, rest = name.partition(".")
     parameter_name, colon, late = rest.partition(":")
     kind, early_colon, early = head.partition(":")
@@ -151,7 +148,6 @@ def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, .
 
 
 def _spaced(where: str, parameter: Parameter, text: str) -> list[float]:
-    """Read FIRST:LAST:COUNT."""
     expected = f"{where}: expected FIRST:LAST:COUNT such as 0:360:24, or values separated by commas, got {text!r}"
     parts = text.split(":")
     if len(parts) != 3:

@@ -157,7 +157,6 @@ class Sweep:
     # ---- the loop ---------------------------------------------------------------------------------------------------
 
     def _left(self) -> list[range]:
-        """Numbers of the configurations that are not stored."""
         return [range(self.total)] if self.run is None else list(self.run.store.missing(KIND, self.total))
 
     def _go_through(self, left: Sequence[range], tally: Tally) -> Tally:
@@ -191,7 +190,6 @@ class Sweep:
                 first = before + self.per_scene
 
     def _take(self, queries: Sequence[Query], answers: Sequence[Evaluation], worker: str, machine: str | None) -> None:
-        """Store what was answered in one batch."""
         answers = [replace(one, machine=machine) for one in answers]
         if self.run is not None:
             for query, answer in zip(queries, answers, strict=True):
@@ -266,7 +264,6 @@ class Sweep:
         return tally
 
     def rows(self) -> Iterable[Row]:
-        """Return the rows of the sweep that are there."""
         return self.journal.rows if self.run is None else self.run.store.rows(KIND)
 
     def _spend(self, rows: Sequence[Row]) -> None:
@@ -326,7 +323,6 @@ class Sweep:
         return {"verified": checked, "pictured": _claim_of(view.judge(model, u, picture))}
 
     def _query(self, index: int) -> tuple[Query, int]:
-        """What is asked about a configuration by its number, and the number of its model."""
         number, model = divmod(index, self.models)
         return self.job.queries(range(number, number + 1))[model][2], model
 
@@ -343,7 +339,6 @@ class Sweep:
     # ---- the answer -------------------------------------------------------------------------------------------------
 
     def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
-        """Put the summary together and write it."""
         job, seconds = self.job, self.stages.seconds
         view, checked = self._scenes.scene, worst.verified if worst else None
         predicting = self._transport.values() or [[one.summary() for one in (view.light.values() if view else ())]]
@@ -408,14 +403,12 @@ class Sweep:
         }
 
     def _beside(self, tally: Tally) -> BesideAnswer | None:
-        """The clean scene and the answer of a run, where there is one."""
         if not self._pairs:
             return None
         models = [one.name for one in self.job.models]
         return BesideAnswer(answer=self.job.places[-1].answer, pairs=tally.beside(models))
 
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
-        """What a reader has to know beside the numbers."""
         remarks = lost_remarks(self._lost)
         remarks += self.journal.machines.remarks
         if tally.not_finite:

@@ -80,7 +80,6 @@ class Drawn:
 
     @property
     def varied(self) -> VariedValue:
-        """What it was drawn from."""
         ends = [end for part in self.parts if isinstance(part, list) for end in part]
         if ends:
             return VariedValue(unit=self.unit, low=min(ends), high=max(ends))
@@ -206,7 +205,6 @@ class Points:
         return Picks(before + first, digits, shares, parts.tolist())
 
     def digits(self, number: int) -> tuple[int, ...]:
-        """Return the place on every axis of the grid of the picture with this number in the scene."""
         return self.grid.digits(number // self.samples)
 
     def noise(self, number: int) -> int:
@@ -233,7 +231,6 @@ class Points:
         return np.concatenate(each) if each else draws.points(0, 0)
 
     def configurations(self, picks: Picks) -> Tensor:
-        """Return u of the pictures, (n, d) float32."""
         u = np.repeat(self._start[None], len(picks.digits), axis=0)
         for column, number, size in self._places:
             u[:, column] = [(digits[number] + 0.5) / size for digits in picks.digits]
@@ -333,7 +330,6 @@ def _by_column(control: BoundNumbers, part: slice, axes: Sequence[tuple[int, Axi
 
 
 def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Picks], list[tuple[str, Value]]]:
-    """A column of the grid."""
     pairs = [(name, value) for value in listed]
     return lambda u, picks: [pairs[digits[number]] for digits in picks.digits]
 
@@ -341,7 +337,6 @@ def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Pi
 def _drawn(
     control: BoundNumbers, parameter_name: str, name: str, begin: int, size: int
 ) -> list[Callable[[Tensor, Picks], list[tuple[str, Value]]]]:
-    """The columns of a drawn parameter."""
     parameter, spec = _spec(control, parameter_name)
     unit = _unit(parameter)
     if isinstance(spec, OneOf):

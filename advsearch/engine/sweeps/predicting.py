@@ -74,13 +74,11 @@ class Groups:
 
     @property
     def size(self) -> int:
-        """Pictures of a group."""
         free = math.prod(size for size, free in zip(self.grid.sizes, self._free, strict=True) if free)
         return free * self.samples // self._draws
 
     @property
     def count(self) -> int:
-        """How many there are."""
         return self.grid.count * self.samples // self.size
 
     @property
@@ -101,7 +99,6 @@ class Groups:
         return found if self.drawn else found * self.samples + sample
 
     def member(self, number: int, place: int) -> int:
-        """Return the picture at a place in the group of a picture of the scene."""
         point, sample = divmod(number, self.samples)
         if self.drawn:
             place, sample = divmod(place, self.samples)
@@ -213,7 +210,6 @@ class SweptPredictor(ABC):
 
     @property
     def _bytes(self) -> int:
-        """Memory of what is held."""
         return 0
 
     @property
@@ -253,7 +249,6 @@ class SweptPredictor(ABC):
 
     @property
     def _checks(self) -> int:
-        """Comparisons of a group."""
         whole, least = self.checks
         return max(least, -(-whole // self._groups.count))
 
@@ -288,7 +283,6 @@ class SweptPredictor(ABC):
         return made if good else None
 
     def _configuration(self, number: int, place: int) -> Tensor:
-        """u (d,) of the picture at a place in the group of a picture."""
         member = self._groups.member(number, place)
         return self.points.configurations(self.points.picks(member, 1, self.before))[0]
 

@@ -67,7 +67,6 @@ class Count:
         self.seen, self.correct = [0] * len(self.values), [0] * len(self.values)
 
     def add(self, place: int, right: bool) -> None:
-        """Count one configuration."""
         self.seen[place] += 1
         self.correct[place] += right
 
@@ -108,7 +107,6 @@ class Cells:
         self._margin = [[0.0] * wide for _ in range(high)]
 
     def add(self, places: Sequence[int], trial: Judgement) -> None:
-        """Count one configuration by its places on the axes."""
         if not self.shown:
             return
         column, row = places[0], places[1]
@@ -119,7 +117,6 @@ class Cells:
             self._margin[row][column] += trial.margin
 
     def drawn(self) -> SweepMap | None:
-        """Return the axes, and for each cell the counts and the mean margin; rows are values of the second axis."""
         if not self.shown:
             return None
         pairs = [zip(sums, counts, strict=True) for sums, counts in zip(self._margin, self._finite, strict=True)]
@@ -219,7 +216,6 @@ class Tally:
         return found
 
     def table(self) -> list[AxisRow]:
-        """Return accuracy by axis and value; axes with a single value are left out."""
         counts = [*self._outer, *self._grid, *self._drawn]
         return [row for count in counts if len(count.values) > 1 for row in count.rows()]
 

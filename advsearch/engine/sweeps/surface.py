@@ -147,7 +147,6 @@ def _likelihood_ratio(k: Counts, n: Counts, failures: int, pictures: int) -> Dou
 
 
 def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubles, Doubles, Doubles]:
-    """The difference k / n - others / rest, and both ends of its interval."""
     (one, below, above), (two, under, over) = _wilson(k, n), _wilson(others, rest)
     difference = one - two
     low = difference - np.hypot(one - below, over - two)
@@ -156,7 +155,6 @@ def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubl
 
 
 def _wilson(k: Counts, n: Counts) -> tuple[Doubles, Doubles, Doubles]:
-    """The share k / n and both ends of its score interval."""
     z, share = float(ndtri((1.0 + CONFIDENCE) / 2.0)), k / n
     middle, half = share + z * z / (2 * n), z * np.sqrt(share * (1.0 - share) / n + z * z / (4.0 * n * n))
     return share, (middle - half) / (1.0 + z * z / n), (middle + half) / (1.0 + z * z / n)
@@ -219,7 +217,6 @@ class SurfaceCounts:
         return {kind: association(self.tallies[model], some, LEAST) for kind, some in self.parts.kinds.items()}
 
     def table(self, name: str, model: str, tally: PartCounts, kind: str, found: Association) -> SurfaceTable:
-        """Return what the summary says of one kind of part."""
         some = self.parts.kinds[kind]
         return SurfaceTable(
             object=name,
@@ -310,7 +307,6 @@ def _assets(job: Job) -> dict[str, ObjectAsset]:
 
 
 def _told(job: Job, counts: Mapping[str, SurfaceCounts], run: RunDirectory) -> SurfaceMap:
-    """Compare, write the files, and return the tables."""
     assets, models = _assets(job), [model.name for model in job.models]
     tables, panels = [], []
     arrays: dict[str, Any] = {"objects": np.array(list(counts)), "models": np.array(models)}
@@ -349,7 +345,6 @@ def _panel(
 
 
 def _views(asset: ObjectAsset, parts: SurfaceParts) -> list[MapView]:
-    """What cameras from some sides see of the object alone."""
     alone = framed(load_scene(asset, settings={"ground.size": 0.0}).description, SIDE_PIXELS)
     scene, views = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS)), []
     for azimuth, elevation in SIDES:

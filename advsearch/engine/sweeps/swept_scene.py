@@ -148,7 +148,6 @@ class SweptScene:
 
     @property
     def not_finite(self) -> int:
-        """How many values of pictures were not finite, and were set to 0."""
         rendered = sum(renderer.non_finite for renderer in self.renderers.values())
         return rendered + sum(light.not_finite for light in self.light.values())
 
@@ -205,11 +204,9 @@ class SweptScene:
     # ---- single pictures --------------------------------------------------------------------------------------------
 
     def _score(self, model: int, picture: Tensor, u: Tensor) -> float:
-        """The margin of one model on one picture (H, W, 3), in logits."""
         return self.judge(model, u, to_8_bit(picture)).margin
 
     def judge(self, model: int, u: Tensor, picture: Tensor) -> Judgement:
-        """What one model says of the picture (H, W, 3) of one configuration."""
         return self._judged(model, picture[None], [(u, {})])[0]
 
     def truth(self, model: int, u: Tensor, listed: Mapping[str, Value]) -> Truth:
@@ -226,7 +223,6 @@ class SweptScene:
         return job.truth(place, model, values, lambda: renderer.surfaces(u))
 
     def picture(self, model: int, u: Tensor, seed: int, spp: int) -> Tensor:
-        """The picture (H, W, 3) that one model sees of one configuration."""
         with torch.no_grad():
             return to_8_bit(self.renderers[self.job.sizes[model]](u, seed=seed, spp=spp))
 
@@ -281,7 +277,6 @@ class Scenes:
         return self.open(int(name))
 
     def picture(self, number: int) -> Tensor:
-        """Return the picture (H, W, 3) with this number as the first model sees it."""
         sent = self.job.queries(range(number, number + 1))
         return self.named(sent[0][0]).pictures([query for _, _, query in sent])[0]
 
@@ -298,7 +293,6 @@ class OneModel:
     model: int
 
     def evaluate(self, query: Query) -> Evaluation:
-        """Answer one query: a trial."""
         picture = self.view.picture(self.model, query.u, query.seed, query.spp)
         return Evaluation.of(self.view.judge(self.model, query.u, picture))
 

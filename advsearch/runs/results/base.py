@@ -90,7 +90,6 @@ class Result(Fields):
     command: ClassVar[str]
 
     def to_dict(self) -> JsonObject:
-        """Return `schema`, `command` and the fields as JSON values; NaN and infinity are None."""
         return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
 
     def facts(self) -> dict[str, str]:
