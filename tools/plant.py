@@ -306,8 +306,8 @@ FAULTS = (
     Fault(
         "explanations: a rule is counted on the rows that chose it",
         "advsearch/explanations/__init__.py",
-        "rule = _counted(conditions, counting.right[inside], counting.right[~inside])",
-        "rule = _counted(conditions, *(choosing.right[covered(conditions, choosing) == one] for one in (True, False)))",
+        "here, elsewhere = counting.right[inside], counting.right[~inside]",
+        "here, elsewhere = (choosing.right[covered(conditions, choosing) == one] for one in (True, False))",
         ("tests/questions/test_explanations.py",),
     ),
     Fault(

@@ -28,15 +28,9 @@ SAME = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A configuration worth a second look.
-
-    Attributes:
-        u: (d,) the configuration.
-        objective: its raw objective when it was admitted, biased upwards.
-        success: whether that render was a success.
-        again: objectives of its renders since then, in the search and in the ranking; -inf for one that was not finite.
-        successes: how many of these were a success.
-    """
+    """A configuration (d,) worth a second look: the objective (biased upwards) and success of the render that admitted
+    it, the objectives of its renders since then, -inf for one that was not finite, and how many of these were a
+    success."""
 
     u: Tensor
     objective: float
@@ -187,13 +181,8 @@ MOST = 24
 
 @dataclass(frozen=True, eq=False)
 class FoundFailure:
-    """A configuration that a search claims to be a success, and stands for others near it.
-
-    Attributes:
-        u: (d,) float32.
-        objective: that of its one render; biased upwards where it is the largest of many.
-        ranges: by position in u the low and the high end of where the others lie, in u.
-    """
+    """A configuration (d,) that a search claims to be a success, the objective of its one render, biased upwards, and
+    where the others lie that it stands for: both ends in u, by position."""
 
     u: Tensor
     objective: float

@@ -43,12 +43,8 @@ Doubles = NDArray[np.float64]
 
 
 class Draws:
-    """Points of [0, 1)^dimensions by number.
-
-    Args:
-        dimensions: numbers of a point; 0 is fine.
-        seed: root; the streams are called `name`.
-    """
+    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams are called `name`. 0 dimensions
+    are fine."""
 
     def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
         if sampler not in SAMPLERS:
@@ -116,12 +112,7 @@ class Seeds:
 
 @dataclass(frozen=True)
 class Product:
-    """The product of axes with so many values each. No axis at all has one point.
-
-    Attributes:
-        sizes: number of values of each axis, at least 1; the last runs fastest.
-        count: number of points; may be larger than any list could hold.
-    """
+    """The product of axes with so many values each, at least 1; the last runs fastest. No axis at all has one point."""
 
     sizes: tuple[int, ...]
     count: int = field(init=False)

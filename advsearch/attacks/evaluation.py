@@ -197,13 +197,8 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Counts:
-    """What a policy had to do about the evaluations it was told; for the summary of a run.
-
-    Attributes:
-        cut: gradients of which single numbers were outliers and cut (see `pgd.clipped`).
-        shortened: gradients that were outliers as a whole.
-        rejected: steps that were taken back: the search went on from a configuration before them.
-    """
+    """What a policy had to do about evaluations, for the summary of a run: gradients of which single numbers were
+    outliers and cut (`pgd.clipped`), those shortened as a whole, and steps that were taken back (`rejected`)."""
 
     cut: int = 0
     shortened: int = 0

@@ -73,12 +73,8 @@ def nothing_more(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Form:
-    """Which arguments a function takes.
-
-    Attributes:
-        images: whether it takes (output, images, truth); else it takes (output, truth).
-        asked: what it asks for beside them, of `ASKED`.
-    """
+    """Which arguments a function takes: (output, images, truth), or without `images`, and what it asks for beside them,
+    of `ASKED`."""
 
     images: bool = True
     asked: tuple[str, ...] = ()
@@ -258,10 +254,6 @@ def _score_of(task: Task) -> Objective:
     return _plain(lambda output, images, truth: task.score(output, truth))
 
 
-def _pixel_margin_of(task: Segmentation) -> Objective:
-    return _plain(lambda output, images, truth: task.pixel_margin(output, truth))
-
-
 _OWN = {
     kind.name: kind
     for kind in (
@@ -307,7 +299,8 @@ _OWN = {
         ),
         ObjectiveKind(
             "pixel_margin", "the largest wrong logit minus the largest right one, mean over the object's pixels",
-            "logits (log-odds)", task=Segmentation.name, of_task=_pixel_margin_of,
+            "logits (log-odds)", task=Segmentation.name,
+            of_task=lambda task: _plain(lambda output, images, truth: task.pixel_margin(output, truth)),
         ),
     )
 }  # fmt: skip

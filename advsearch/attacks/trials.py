@@ -111,14 +111,8 @@ def _wilson(share: float, n: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Trials:
-    """How often something happened in independent trials.
-
-    Attributes:
-        successes: from 0 to `trials`.
-        trials: at least 1.
-        spp: samples per pixel of every trial.
-        confidence: of the Clopper-Pearson interval; larger than 95 % where trials might have ended at several looks.
-    """
+    """How often something happened in independent trials of so many samples a pixel, and the confidence of the
+    Clopper-Pearson interval, larger than 95 % where trials might have ended at several looks."""
 
     successes: int
     trials: int
@@ -236,11 +230,7 @@ MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
 
 def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, sought: bool = True, keep: int = 0) -> MarginsOf:
     """Return the margins of one configuration under the conditions that the scene comes with; the rows of all sample
-    counts are numbered together.
-
-    Args:
-        keep: the pictures of the first so many of each sample count are wanted.
-    """
+    counts are numbered together, and the first `keep` pictures of each are wanted."""
     made = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
@@ -279,13 +269,8 @@ class Rung:
 
 @dataclass(frozen=True)
 class SampleCount:
-    """The choice, and everything it rests on.
-
-    Attributes:
-        spp: samples per pixel to verify with.
-        converged: whether all margins are shown to stay on their sides; if not, it is the last rung of the ladder.
-        table: one row per configuration and rung that was measured, in this order.
-    """
+    """The choice: samples a pixel, whether all margins are shown to stay on their sides (if not, it is the last rung of
+    the ladder), a row for each configuration and rung that was measured, and the renders spent."""
 
     spp: int
     converged: bool

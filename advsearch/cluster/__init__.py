@@ -40,15 +40,9 @@ class Work:
 
 @dataclass(frozen=True, eq=False)
 class Done:
-    """What came of one batch.
-
-    Attributes:
-        items: the batch, or a part of one that workers died of.
-        value: what the call returned; None where nothing came back.
-        worker: who carried it out; empty in this process.
-        machine: what that is, by its name among `Workforce.machines`; None where it is like this machine.
-        lost: why nothing came back, in words; only of batches of one item.
-    """
+    """What came of one batch, or of a part of one that workers died of; what the call returned; who carried it out,
+    empty in this process; what machine that is, by its name in `Workforce.machines`, None where it is like this one;
+    and why nothing came back, only of batches of one item."""
 
     items: Sequence[Any]
     value: Any

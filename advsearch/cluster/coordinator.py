@@ -63,11 +63,7 @@ class _Worker:
 
 
 class Coordinator:
-    """An `Executor` over a pool of workers.
-
-    Args:
-        machine: this one, where rows of its kind need no mark.
-    """
+    """An `Executor` over a pool of workers. Rows that are made on a machine like `machine` need no mark."""
 
     def __init__(
         self,

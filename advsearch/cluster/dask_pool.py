@@ -32,7 +32,7 @@ from typing import Any
 from advsearch import threads
 from advsearch.cluster import Disconnected, Dropped, Ended, Event, Executor, Joined, Left, Work
 from advsearch.cluster.coordinator import Coordinator
-from advsearch.cluster.worker import Failure, Files, read_files, this_machine, version
+from advsearch.cluster.worker import Failure, read_files, this_machine, version
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from advsearch.settings import read_yaml
 
@@ -65,15 +65,8 @@ CONFIG = {
 
 @dataclass(frozen=True)
 class Site:
-    """Where workers are.
-
-    Attributes:
-        where: in a user's words.
-        address: of a scheduler that runs; empty where a cluster is started.
-        start: makes the cluster; takes keywords of Dask's classes.
-        security: keywords of Dask's `Security`.
-        count: workers to ask a cluster for; None leaves it as it starts.
-    """
+    """Where workers are, in a user's words: the address of a scheduler that runs, or what starts a cluster and with how
+    many workers (None: as it starts); and keywords of Dask's `Security`."""
 
     where: str
     address: str = ""
@@ -212,7 +205,8 @@ class DaskPool:
                         "one with dask scheduler, check address and certificates, and go on with advsearch resume"
                     ) from error
                 await asyncio.sleep(LOOK)
-        self.link = self._dashboard()
+        drawn = importlib.util.find_spec("bokeh") is not None  # what Dask draws its pages with
+        self.link = str(self._client.dashboard_link or "") if drawn else ""
         self._known = set()
         self._client.subscribe_topic("all", self._told)
         await self._look_around()
@@ -234,10 +228,6 @@ class DaskPool:
                     await asyncio.wait_for(one.close(), RESTART)
                 except Exception:  # its other end is not there any more
                     logging.getLogger(__name__).debug("closing %r failed", one, exc_info=True)
-
-    def _dashboard(self) -> str:
-        drawn = importlib.util.find_spec("bokeh") is not None  # what Dask draws its pages with
-        return str(self._client.dashboard_link or "") if drawn else ""
 
     async def _call(self, ticket: int, worker: str, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
         # comes with the extra `dask`
@@ -351,40 +341,31 @@ CLASSES = {
 def executor_of(
     work: Work, *, workers: int | None, cluster: str | None, tell: Callable[[str], None]
 ) -> Iterator[Executor | None]:
-    """Open an executor of a work for the block; None where everything is done in this process.
-
-    Args:
-        cluster: a scheduler's address, "local", or a YAML file.
-    """
+    """Open an executor of a work for the block, on a cluster by its scheduler's address, "local", or a YAML file; None
+    where everything is done in this process."""
     if workers is None and cluster is None:
         yield None
         return
-    check_installed()
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("workers: needs Dask; pip install 'advsearch[dask]', or leave `workers` out") from None
     files = read_files(work)
+    said = [work.function, work.settings, work.threads, sorted(files.named.items())]
+    key = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:32]
     place = place_of(workers, cluster)
     pool = DaskPool(place)
     try:
         if pool.link:
             tell(f"Dask shows its workers at {pool.link}")
-        yield Coordinator(pool, work, work_key(work, files), files, version(), this_machine(), tell)
+        yield Coordinator(pool, work, key, files, version(), this_machine(), tell)
     finally:
         pool.close()
 
 
-def check_installed() -> None:
-    """Check that Dask is there."""
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise InputError("workers: needs Dask; pip install 'advsearch[dask]', or leave `workers` out") from None
-
-
 def check_main() -> None:
-    """Check that workers on this machine can import the script that runs: each does, as `multiprocessing` has it.
-
-    Raises:
-        InputError: a script asks outside of `if __name__ == "__main__":`, so that each worker would ask again.
-    """
+    """Check that workers on this machine can import the script that runs: each does, as `multiprocessing` has it, and
+    would ask again what is asked outside of `if __name__ == "__main__":`."""
     main, name = sys.modules["__main__"], '`if __name__ == "__main__":`'
     spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
@@ -409,19 +390,9 @@ def check_main() -> None:
     )
 
 
-def work_key(work: Work, files: Files) -> str:
-    """Return a name of a work by its content."""
-    said = [work.function, work.settings, work.threads, sorted(files.named.items())]
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:32]
-
-
 def place_of(workers: int | None, cluster: str | None) -> Site:
-    """Return where the workers are.
-
-    Args:
-        workers: how many processes; None for one a core, or as many as there are.
-        cluster: a scheduler's address, "local", or a YAML file; None for this machine.
-    """
+    """Return where so many workers are: of a scheduler's address, "local", or a YAML file; by default on this machine,
+    one a core."""
     if cluster is None or cluster == LOCAL:
         check_main()
         return local(workers or threads.cores())

@@ -92,12 +92,8 @@ LARGEST = 1 << 30
 
 @dataclass(frozen=True)
 class Files:
-    """The files that a work's settings name.
-
-    Attributes:
-        named: of each path in the settings, the digest of its folder's part and its name in it.
-        contents: of each digest, relative path to content; empty where they are not sent.
-    """
+    """The files that a work's settings name: of each path, the digest of its folder's part and its name in it; and of
+    each digest, relative path to content, empty where they are not sent."""
 
     named: Mapping[str, tuple[str, str]]
     contents: Mapping[str, Mapping[str, bytes]]
@@ -219,14 +215,8 @@ class Carried:
 
 @dataclass(frozen=True)
 class Failure:
-    """Something went wrong.
-
-    Attributes:
-        unfit: whether the worker is at fault and another one may do it.
-        forgotten: whether the worker has not got ready, or not any more.
-        missing: whether it lacks files.
-        trace: of what is a bug; empty for an error that a user can put right.
-    """
+    """Something went wrong, as a user reads it: another worker may do it (`unfit`), the worker is not ready (any more),
+    or it lacks files. What is a bug has a trace."""
 
     text: str
     unfit: bool = False
@@ -236,11 +226,7 @@ class Failure:
 
 
 def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
-    """Get ready for a work.
-
-    Args:
-        asked: the version of advsearch that asks.
-    """
+    """Get ready for a work that a version of advsearch asks for."""
     begun = time.perf_counter()
     if version() != asked:
         return Failure(f"it has advsearch {version()}, and {asked} asks; install the same on both", unfit=True)

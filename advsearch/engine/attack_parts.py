@@ -151,11 +151,8 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
 
 
 def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, list[str]]:
-    """Return the problem that an attack was asked with, and warnings on the way.
-
-    Args:
-        **changes: settings that are different; of another `model`, its name.
-    """
+    """Return the problem that an attack was asked with, other settings in `changes` (of another `model`, its name), and
+    warnings on the way."""
     config = parts.config.model_copy(update=changes)
     model = (
         models_as_one(config.model, config, parts.task) if "model" in changes else (parts.loaded[0], [*parts.loaded[1]])

@@ -340,13 +340,8 @@ Frames = list[npt.NDArray[np.float32]]
 
 
 def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None) -> AnswerAlongDrive | None:
-    """Look at an answer, and at the clean scene, at evenly spaced times of the path that varies by chance.
-
-    What varies beside it is as the scene comes.
-
-    Returns:
-        How many frames are right; None where no path varies.
-    """
+    """Look at an answer, and at the clean scene, at evenly spaced times of the path that varies by chance; None where
+    none does. What varies beside it is as the scene comes."""
     found = _path_of(problem)
     if found is None:
         return None

@@ -52,12 +52,8 @@ class Answering(Protocol):
 
 @dataclass
 class Shared:
-    """Answers queries of a problem: several at once by workers, where there are some, and all others here.
-
-    Attributes:
-        executor: of `answering`; None where there are no workers.
-        name: of the problem, where workers hold several.
-    """
+    """Answers queries of a problem: several at once by an executor of `answering`, where there is one, and all others
+    here. Its `name` tells it from others that workers hold."""
 
     problem: Problem
     executor: Executor | None = None
@@ -230,12 +226,7 @@ MACHINES = "machines"
 
 @dataclass
 class Machines:
-    """The other machines of a run.
-
-    Attributes:
-        run: keeps what they are; None keeps it in memory.
-        known: by the name that rows have, what each is.
-    """
+    """The other machines of a run: what each is, by the name that rows have. Without a run it is kept in memory."""
 
     run: RunDirectory | None
     known: dict[str, dict[str, str]] = field(init=False)
@@ -300,12 +291,8 @@ class Journal:
         evaluate: Evaluate | None = None,
         passed: Callable[[Query], None] = lambda query: None,
     ) -> Iterator[Evaluation]:
-        """Answer queries in their order: from the journal, or else by asking, and then they are in it.
-
-        Args:
-            evaluate: answers what is not in the journal; None for `traced`.
-            passed: told of every query of a search that is read back.
-        """
+        """Answer queries in their order: from the journal, or else by `evaluate` (None for `traced`), and then they are
+        in it. `passed` is told of every query of a search that is read back."""
         stored = [self._read(query) for query in queries]
         evaluate = self.traced if evaluate is None else evaluate
         asked = iter(evaluate([query for query, known in zip(queries, stored, strict=True) if known is None]))
@@ -361,11 +348,8 @@ class Journal:
         )
 
     def keep(self, answered: Sequence[tuple[Query, Evaluation]], *, numbered: bool = False) -> list[Row]:
-        """Write answers in one transaction, a row each; what a search was told goes beside it.
-
-        Args:
-            numbered: whether the place of a row in the store is the query's number, in whatever order they come.
-        """
+        """Write answers in one transaction, a row each; what a search was told goes beside it. If `numbered`, the place
+        of a row in the store is the query's number, in whatever order they come."""
         rows, told = list[Row](), None
         for query, answer in answered:
             self.lost += answer.lost

@@ -83,11 +83,7 @@ def check_shared(settings: Mapping[str, str]) -> None:
 
 
 def load_metrics(settings: Mapping[str, str], given: Mapping[str, str | Metric] | None = None) -> Metrics:
-    """Return the functions that settings name.
-
-    Args:
-        given: functions that are there already, in their place.
-    """
+    """Return the functions that settings name; `given` ones are there already, and take their place."""
     return {
         name: one if callable(one := (given or {}).get(name)) else _imported(name, text)
         for name, text in settings.items()
@@ -118,12 +114,8 @@ def _imported(name: str, text: str) -> Metric:
 def judgements(
     task: Task, output: Output, pictures: Tensor, truths: Sequence[Truth], metrics: Metrics = MappingProxyType({})
 ) -> list[Judgement]:
-    """Return what a task and metrics say of pictures: the one place where a run judges.
-
-    Args:
-        pictures: (N, H, W, 3) sRGB in [0, 1].
-        truths: one of each picture, or one for all.
-    """
+    """Return what a task and metrics say of pictures (N, H, W, 3), sRGB in [0, 1]: the one place where a run judges.
+    Each picture has its truth, or one is for all."""
     with torch.no_grad():
         if len(truths) == 1:
             said, truths = task.judge(output, truths[0]), [truths[0]] * len(pictures)
@@ -135,12 +127,8 @@ def judgements(
 
 
 def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth) -> Judgement:
-    """Return the judgement of a picture with what metrics say of it.
-
-    Args:
-        image: (H, W, 3) sRGB in [0, 1].
-        truth: as the task has it; a metric gets it as an objective does, of one picture.
-    """
+    """Return the judgement of a picture (H, W, 3), sRGB in [0, 1], with what metrics say of it. A metric gets the truth
+    as an objective does, of one picture."""
     if not metrics:
         return judgement
     found: dict[str, float | None] = {}
@@ -195,12 +183,8 @@ Looked = Callable[[], Surfaces]
 
 
 def facts_of(scene: Scene, name: str, label: str | None, describe: Described, look: Looked | None = None) -> Facts:
-    """Return what a scene gives a task to judge by.
-
-    Args:
-        describe: says the configuration; what it does not say has the value that the scene was given.
-        look: says what is seen in the configuration; None where there is none.
-    """
+    """Return what a scene gives a task to judge by: what `describe` says of the configuration, and of the rest what the
+    scene was given; and what `look` sees, if anything looks."""
     fixed = {key: value for key, value in scene.description.values.items() if value is not None}
 
     def numbers() -> dict[str, float]:
@@ -212,11 +196,8 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described, lo
 
 
 def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig) -> Task:
-    """Return the task after it has seen what its model answers to clean pictures, where it asks for that (`looks`).
-
-    Args:
-        scenes: at least one; the next is shown where those before leave open how answers are to be read.
-    """
+    """Return the task after it has seen what its model answers to clean pictures, where it asks for that (`looks`). The
+    next scene is shown where those before leave open how answers are to be read."""
     if not task.looks:
         return task
     for scene in scenes:
@@ -228,12 +209,8 @@ def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig
 
 
 def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:
-    """Refuse a scene of which the task cannot say what is right, before anything is prepared.
-
-    Raises:
-        InputError: what `Task.check` raises; where no label was given, with the model's first answers to a clean
-            picture.
-    """
+    """Refuse a scene of which the task cannot say what is right, before anything is prepared; where no label was given,
+    with the model's first answers to a clean picture."""
     try:
         task.check(facts)
     except InputError as error:
@@ -243,12 +220,8 @@ def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: Sc
 
 
 def one_label_for_several(models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]) -> list[str]:
-    """Return a sentence if a label that was given for several objects is not what some of them are called.
-
-    Args:
-        label: what was given for all objects; None where each has its own.
-        objects: by name, the label that each has of its own, or None.
-    """
+    """Return a sentence if a label that was given for all objects (None: each has its own) is not what some of them are
+    called, by the labels of their own."""
     if label is None or len(objects) < 2:
         return []
     others = [f"{name} (its own is {own!r})" for name, own in objects.items() if own and _differs(models, label, own)]
@@ -298,11 +271,7 @@ MOST_NUMBERS, MOST = 64, 512
 
 @dataclass
 class KnownTruths:
-    """What is true of configurations.
-
-    Attributes:
-        facts: what the scene gives the task to judge by, from what describes the configuration and what looks at it.
-    """
+    """What is true of configurations; `facts` come from what describes one and what looks at it."""
 
     task: Task
     space: Space

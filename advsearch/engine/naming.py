@@ -28,12 +28,7 @@ from advsearch.tasks.together import Together
 
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:
-    """Load the scene that a configuration describes.
-
-    Args:
-        name: of one of its objects; None for the only one, in the configuration's environment.
-        environment: of that object; None for the default.
-    """
+    """Load the scene that a configuration describes: its only object in its environment, or a named one."""
     if name is None:
         name, environment = config.object, config.environment
     return load_scene(name, environment, up=config.up, settings=scene_settings(config), camera=config.camera)
@@ -57,13 +52,9 @@ def code_of(models: Iterable[str], kinds: Iterable[str], metrics: Iterable[str] 
 
 
 def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple[tuple[Model, ...], list[str]]:
-    """Load models; their warnings become sentences of the run.
-
-    Args:
-        task: what their outputs are for; several tasks are for one model each, which are put together as one.
-        config: has the names of their classes, the texts that these are put into, and the processor threads that
-            everything takes from here on.
-    """
+    """Load models; their warnings become sentences of the run. Several tasks are for one model each, and these are put
+    together as one. The configuration has the names of their classes, the texts that these are put into, and the
+    processor threads that everything takes from here on."""
     threads.configure(config.used_threads)
     parts = task.parts if isinstance(task, Together) else (task,) * len(models)
     asked = several(models) if isinstance(task, Together) else models
@@ -110,11 +101,7 @@ def exists_here(model: AnyModel) -> bool:
 
 
 def different(names: Sequence[str], setting: str) -> Sequence[str]:
-    """Return the names.
-
-    Raises:
-        InputError: there are none, or one comes twice.
-    """
+    """Return the names; an InputError says if there are none, or one comes twice."""
     twice = [name for name in names if names.count(name) > 1]
     if twice or not names:
         raise InputError(

@@ -34,12 +34,8 @@ from advsearch.tasks.together import Together
 
 
 def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **more: Any) -> Domain:
-    """Return where a search over some controls may look: the budgets of all their groups, in the order of u.
-
-    Args:
-        start: (d,) float32; by default the controls' own, which leaves the scene as it is.
-        **more: other fields of `Domain`: `gradient_cost`, `partial_gradients`.
-    """
+    """Return where a search over some controls may look: the budgets of all their groups, in the order of u, from
+    `start` (d,) or the controls' own, which leaves the scene as it is; with `more` fields of `Domain`."""
     blocks = tuple(
         Block(
             group.size,
@@ -79,15 +75,8 @@ class Named(Mapping[str, Tensor]):
 
 
 class Asked:
-    """Gives what is asked for at N configurations, which differ in nothing that is searched.
-
-    Args:
-        searched: the controls that are searched, which come first there.
-        wholes: the configurations, (d,) each, of the whole space.
-
-    Attributes:
-        used: whether anything was asked for.
-    """
+    """Gives what is asked for at N configurations (d,) of the whole space, which differ in nothing that is searched;
+    `used` says whether anything was. The searched controls come first there."""
 
     def __init__(self, space: Space, searched: Space, wholes: Sequence[Tensor]) -> None:
         self._space, self._searched, self._wholes = space, searched, wholes
@@ -207,11 +196,8 @@ def objective_for(
     wanted: AnyObjective, task: Task, model: Model, renderer: Renderer, seed: int, ensemble: Way | None = None
 ) -> tuple[Objective, str]:
     """Return what is maximised, and what there is to say about it; one of features is shown the clean picture first.
-
-    Args:
-        ensemble: how the objectives of several models are put together; None for the mean, or the least of those of
-            several tasks, whose units differ.
-    """
+    The objectives of several models are put together as `ensemble` says; without, their mean, or of several tasks,
+    whose units differ, the least."""
     kind = OBJECTIVE_KINDS.get(wanted) if isinstance(wanted, str) else None
     of_features = kind is not None and kind.needs_features
     if isinstance(task, Together):

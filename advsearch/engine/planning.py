@@ -59,13 +59,9 @@ def status_of(cosine: float, converged: float) -> GradientStatus:
 
 
 def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
-    """Return groups of one control with the estimators to compare on them, where there is more than one.
-
-    Args:
-        plan: the plan so far. What was forced is not contested.
-        every: compare wherever several are valid; otherwise only where the interior adjoint is preferred so far: over
-            poses, the model's loss is so rough that none has won, and over shapes the material form is the quietest.
-    """
+    """Return groups of one control with the estimators to compare on them, where there is more than one and none was
+    forced: wherever several are valid (`every`), or only where the interior adjoint is preferred so far: over poses,
+    the model's loss is so rough that none has won, and over shapes the material form is the quietest."""
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in plan.groups:
         if "forced" in group.reason or not group.valid:
@@ -101,13 +97,9 @@ def measured_plan(
     tick: Callable[[], None] = lambda: None,
     keep: Keep = measured_now,
 ) -> GradientPlan:
-    """Return the renderer's plan with every contested choice made by measurement at u.
-
-    Args:
-        renderer: its plan is the one to improve; it is not changed.
-        counted: take the renders that an estimator needs for its time (an adjoint for `ADJOINT_RENDERS`), so that the
-            choice is the same on a busy machine.
-    """
+    """Return the renderer's plan, which is not changed, with every contested choice made by measurement at u. If
+    `counted`, the renders that an estimator needs stand for its time (`ADJOINT_RENDERS` for an adjoint), so that the
+    choice is the same on a busy machine."""
     plan = renderer.plan
     taken = partial(gradients, renderer, loss, u, seed=seed, spp=spp, keep=keep, tick=tick)
     for groups, candidates in contested(plan, every=every):
@@ -306,14 +298,8 @@ def measured_bounces(
     bound: float = BOUND,
     tick: Callable[[], None] = lambda: None,
 ) -> PathLength:
-    """Return the shortest paths whose pictures agree with those of the full length to within a bound.
-
-    Args:
-        seed: root of the noise, which is the same for all lengths.
-
-    Returns:
-        The depth, with what was measured: from the full length downwards, to the first that misses the bound.
-    """
+    """Return the shortest paths whose pictures agree with those of the full length to within a bound, all with the same
+    noise; and what was measured, from the full length downwards to the first that misses the bound."""
     raw = renderer.like(denoiser="none")  # a denoiser would spread a change over its neighbours
     full = raw.scene.max_depth
     noises = [seeds.stream(seed, "half", half) for half in range(2)]

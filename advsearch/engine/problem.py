@@ -32,11 +32,8 @@ from advsearch.tasks.base import Output, Truth, mean, typical
 
 
 class Prepared(NamedTuple):
-    """What is measured before a search, and holds for its queries.
-
-    Attributes:
-        search_depth: longest light path in segments; None for the scene's.
-    """
+    """What is measured before a search, and holds for its queries; the longest light path is in segments, None for the
+    scene's."""
 
     spp: int
     search_depth: int | None
@@ -101,6 +98,7 @@ class Problem:
 
     @plan.setter
     def plan(self, plan: GradientPlan) -> None:
+        """Take a plan: nothing is computed for the conditions, and the domain's cost follows."""
         names = {control.name for control in self.space.controls[self.searched :]} if self._over else set()
         none = {group.name: "none" for group in plan.groups if group.control in names}
         self.renderer.plan = plan.with_estimator(none, BY_CHANCE)
@@ -144,11 +142,8 @@ class Problem:
     # ---- pictures ---------------------------------------------------------------------------------------------------
 
     def whole(self, u: Tensor, draw: int | None = None) -> Tensor:
-        """Return the configuration of the whole space: u, and the conditions of one draw.
-
-        Args:
-            draw: seed of the conditions; None for those that leave the scene as it is.
-        """
+        """Return the configuration of the whole space: u, and the conditions of one draw, by its seed; without, those
+        that leave the scene as it is."""
         if self.conditions is None:
             return u
         if draw is None:
@@ -157,12 +152,8 @@ class Problem:
         return torch.cat([u, self.conditions.sample(generator)[0]])
 
     def picture(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Tensor:
-        """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
-
-        Args:
-            seed: of the noise, and of the conditions where there are any.
-            drawn: whether the conditions are drawn; otherwise the scene has those it comes with.
-        """
+        """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits. The seed is that
+        of the noise and, if they are `drawn`, of the conditions; otherwise the scene has those it comes with."""
         with torch.no_grad():
             return to_8_bit(self.renderer(self.whole(u, seed if drawn else None), seed=seed, spp=spp))
 
@@ -195,11 +186,8 @@ class Problem:
         return Asked(self.space, self.searched_space, wholes)
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
-        """Say a configuration of the searched controls in named values with units, under the conditions of a draw.
-
-        Args:
-            draw: seed of the conditions; None for those that the scene comes with.
-        """
+        """Say a configuration of the searched controls in named values with units, under the conditions of a draw, by
+        its seed; without, those that the scene comes with."""
         return self.space.describe(self.whole(u, draw), self.space.controls[: self.searched])
 
     def plan_summary(self, plan: GradientPlan) -> PlannedGradient:
@@ -316,16 +304,9 @@ class Problem:
     def judged(
         self, render: Callable[[Tensor], Tensor], wholes: Sequence[Tensor], u: Tensor, gradient: WhichGradient
     ) -> tuple[list[tuple[Evaluation, Output]], Tensor | None]:
-        """Ask the model about several pictures at once.
-
-        Args:
-            render: from u to the pictures (N, H, W, 3), with a graph.
-            wholes: the configuration of the whole space of each.
-
-        Returns:
-            An evaluation without derivative and the model's output for each picture, and the derivative (d,) of the sum
-            of their objectives, weighted by `hard_first`.
-        """
+        """Ask the model about several pictures at once: those that `render` makes of u, (N, H, W, 3) with a graph, each
+        of a configuration of the whole space. Returns an evaluation without derivative and the model's output for each,
+        and the derivative (d,) of the sum of their objectives, weighted by `hard_first`."""
         at = u.detach().clone().requires_grad_(bool(gradient))
         with torch.set_grad_enabled(bool(gradient)):
             pictures = render(at)
@@ -358,13 +339,8 @@ class Problem:
         gradient: WhichGradient,
         at_once: int,
     ) -> Evaluation:
-        """Return the mean over conditions whose pictures are predicted.
-
-        Args:
-            render: from some of the conditions and u to their pictures (N, H, W, 3), with a graph.
-            wholes: the configuration of the whole space under each.
-            at_once: pictures that the model is asked about at once.
-        """
+        """Return the mean over conditions whose pictures are predicted: `render` goes from some of them and u to
+        pictures (N, H, W, 3), with a graph. The model is asked about `at_once` of them at once."""
         found, total = [], None
         for begin in range(0, len(wholes), at_once):
             some = slice(begin, begin + at_once)
@@ -375,12 +351,8 @@ class Problem:
         return self.mean(found, u, None if total is None else total / len(wholes))
 
     def mean(self, found: Sequence[tuple[Evaluation, Output]], u: Tensor, gradient: Tensor | None = None) -> Evaluation:
-        """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw.
-
-        Args:
-            found: evaluations under each, and the model's outputs.
-            gradient: of the mean, where the evaluations have none.
-        """
+        """Return the mean over conditions, from evaluations with the model's outputs, and the gradient of the mean
+        where these have none. Its cost is counted in evaluations, each of which takes a picture a draw."""
         each, count = [one for one, _ in found], len(found)
         gradients = [one.gradient[: u.numel()] for one in each if one.gradient is not None]
         if self.task.varies:  # each condition has a truth of its own

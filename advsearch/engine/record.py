@@ -91,12 +91,8 @@ class Findings:
 
 
 class Stages:
-    """Tells a watcher which stage runs, and keeps the time of each.
-
-    Attributes:
-        seconds: time of each stage by name, in seconds.
-        started: when the first began, by `time.perf_counter`.
-    """
+    """Tells a watcher which stage runs, and keeps the seconds of each by name. The first began at `started`, by
+    `time.perf_counter`."""
 
     def __init__(self, progress: Progress, started: float | None = None) -> None:
         self.progress = progress
@@ -149,12 +145,8 @@ def trial_row(
     sought: bool = True,
     **more: Any,
 ) -> Row:
-    """Return what the store keeps of a trial.
-
-    Args:
-        seed: of its render; None of a picture that was predicted.
-        sought: whether a search sought some answer there, so that there is a success.
-    """
+    """Return what the store keeps of a trial; the seed is None of a picture that was predicted. There is a success only
+    where a search sought some answer."""
     return Row(
         kind=kind,
         step=number,
@@ -248,14 +240,8 @@ class OutOfTime(Exception):
 
 
 class Results:
-    """What a run has measured, in its store; measures what is not there, until the time is up.
-
-    Args:
-        seconds: after which nothing more is measured; one measurement is always made, so that it gets on.
-
-    Attributes:
-        made: how many measurements were made. What is stored is read back before the first.
-    """
+    """What a run has measured, in its store; measures what is not there, until the time is up: one measurement is
+    always made, so that it gets on. `made` counts them; what is stored is read back before the first."""
 
     def __init__(self, run: RunDirectory | None, seconds: float | None = None) -> None:
         self._run = run

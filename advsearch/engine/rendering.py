@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from advsearch import seeds
 from advsearch.config import SceneConfig
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
-from advsearch.controls import Control, Space, compose
+from advsearch.controls import Space, compose
 from advsearch.controls.clean import sentences
 from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
@@ -246,7 +246,7 @@ def render(
     model = load_model(model, task=made)
     asked = made.on(model)
     instances = as_controls(controls)
-    if around is not None and any(_turns(one) for one in instances):
+    if around is not None and any(one.kind == "camera" and "azimuth" in one.settings() for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
     size = as_python(resolution) or model.input_size
     progress = watcher(progress)
@@ -342,7 +342,3 @@ def _turned(description: SceneDescription, around: int | None) -> Iterator[Scene
     first = description.number("camera.azimuth")
     for number in range(around):
         yield description.with_values(camera__azimuth=(first + 360.0 * number / around) % 360.0)
-
-
-def _turns(control: Control) -> bool:
-    return control.kind == "camera" and "azimuth" in control.settings()

@@ -70,15 +70,10 @@ def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise
 
 @dataclass
 class SurfaceLight(Predictor):
-    """The light on surfaces of a run whose searches look through many cameras.
-
-    Attributes:
-        steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        at: (d,) the configuration whose light is found; None for the start.
-        places: which numbers of u move; None for those of cameras and environments.
-        renewals: the evaluations at which light was found anew.
-        ended: the evaluation from which on pictures are traced; None where they never are.
-    """
+    """The light on surfaces of a run whose searches look through many cameras, found `at` (d,), or at the start. What
+    comes after `steps` evaluations of a search belongs to the ranking, and is traced. The numbers of u at `places`
+    move, without these those of cameras and environments. Light was found anew at the evaluations `renewals`; from
+    `ended` on pictures are traced."""
 
     way: ClassVar[str] = "surface light"
     problem: Problem

@@ -88,14 +88,9 @@ class Deviation:
 
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions that matrices were made for.
-
-    Attributes:
-        made: how many.
-        dropped: how many of them made room for newer ones.
-        grown: comparisons after which there had to be more.
-        gap: by how much the objective was larger under them than under unseen ones, at the last comparison.
-    """
+    """The conditions that matrices were made for: how many, how many of them were dropped for newer ones, comparisons
+    after which there had to be more, and by how much the objective was larger under them than under unseen ones, at the
+    last."""
 
     made: int
     dropped: int
@@ -129,13 +124,8 @@ def varying(problem: Problem) -> list[str]:
 
 
 class Predictor(ABC):
-    """What predicts the pictures of a run's searches.
-
-    Attributes:
-        way: by what, in words.
-        deviations: what the comparisons with traced pictures found, in order.
-        seconds: spent on making matrices and on comparing.
-    """
+    """What predicts the pictures of a run's searches, in what way; its `deviations` from traced pictures, in order, and
+    the seconds spent on making matrices and comparing."""
 
     way: ClassVar[str] = "matrix"
     deviations: list[Deviation]
@@ -216,13 +206,9 @@ class CleanMatrix:
 
 @dataclass
 class Transport(Predictor):
-    """The matrices of a run's searches where nothing varies by chance.
-
-    Attributes:
-        steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        renewals: by kind of search, the evaluations at which the matrix was made anew, or, where there is none that
-            could be, from which on pictures are traced.
-        clean: where every search begins; made here if it is not there yet.
+    """The matrices of a run's searches where nothing varies by chance. What comes after `steps` evaluations of a search
+    belongs to the ranking, and is traced. `renewals` are, by kind of search, the evaluations at which the matrix was
+    made anew, or, where there is none that could be, from which on pictures are traced. Every search begins at `clean`.
     """
 
     exact: ClassVar[bool] = True

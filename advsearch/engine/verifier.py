@@ -61,13 +61,9 @@ def ladder_of(config: SceneConfig) -> Sequence[int]:
 
 @dataclass
 class Verifier:
-    """Makes the trials of one run: sample count, control group, answers, and configurations one at a time.
-
-    Attributes:
-        ladder: samples a pixel to choose from; a single count is taken as it is.
-        findings: gets the sample count, the control group's trials, pictures and the count of renders.
-        looks: trials of each group; of several numbers, those after which the verdict may stand.
-    """
+    """Makes the trials of one run: sample count (of a ladder; a single one is taken as it is), control group, answers,
+    and configurations one at a time. Each group has as many trials as the last of `looks`; after those before, the
+    verdict may stand. What comes of them, pictures and the count of renders are in `findings`."""
 
     journal: Journal
     ladder: Sequence[int]
@@ -391,11 +387,8 @@ class Retrials:
         return self._clean[condition.name]
 
     def answer(self, kind: str, u: Tensor, condition: RetrialCondition) -> Verification:
-        """Try an answer (d,) under one condition, beside the clean scene; a claim of nothing is never confirmed.
-
-        Args:
-            kind: what it is called among the rows; "KIND under CONDITION" is theirs.
-        """
+        """Try an answer (d,) under one condition, beside the clean scene; a claim of nothing is never confirmed. Its
+        rows are called "KIND under CONDITION"."""
         return verify(
             partial(self._answers, kind, condition),
             condition.problem.domain,

@@ -106,13 +106,8 @@ Numbers = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Factor:
-    """Something that varied.
-
-    Attributes:
-        name: of a parameter, or object, environment or model.
-        unit: of its values; empty for names.
-        options: the names that it takes, in alphabetical order; empty where it takes numbers.
-    """
+    """Something that varied: a parameter with a unit, or, with the names that it takes in alphabetical order, object,
+    environment or model."""
 
     name: str
     unit: str = ""
@@ -121,13 +116,8 @@ class Factor:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Configurations and answers.
-
-    Attributes:
-        factors: what varied, one for each column.
-        values: (n, d) float64; of a factor with options, the number of the option.
-        right: (n,) whether the model was right.
-    """
+    """Configurations (n, d) float64, of a factor with options the number of the option, and answers (n,): whether the
+    model was right."""
 
     factors: tuple[Factor, ...]
     values: Numbers
@@ -176,11 +166,8 @@ def observed(rows: Sequence[tuple[RowValues, bool]]) -> Observations:
 
 
 def encoded(found: Observations) -> tuple[Numbers, list[tuple[int, int | None]]]:
-    """Return the columns for a tree, (n, k): one for each option of a factor with options, 1 where it is taken.
-
-    Returns:
-        The columns, and for each the number of its factor and that of the option, None for numbers.
-    """
+    """Return the columns for a tree, (n, k): one for each option of a factor with options, 1 where it is taken; and for
+    each the number of its factor and that of the option, None for numbers."""
     columns: list[Numbers] = []
     meaning: list[tuple[int, int | None]] = []
     for place, factor in enumerate(found.factors):
@@ -219,14 +206,7 @@ LEAST_GAP = 0.1
 
 @dataclass(frozen=True)
 class RuleCondition:
-    """A part of the values of one factor.
-
-    Attributes:
-        place: number of the factor.
-        low: values are larger than this; -inf without a bound.
-        high: values are at most this; inf without a bound.
-        options: numbers of the options; None where the factor takes numbers.
-    """
+    """A part of the values of one factor, by its number: over `low` and at most `high`, or some of its options."""
 
     place: int
     low: float = -np.inf
@@ -255,13 +235,8 @@ RuleConditions = tuple[RuleCondition, ...]
 
 @dataclass(frozen=True)
 class CountedRule:
-    """A rule, counted on rows that did not choose it and that no rule before it covers.
-
-    Attributes:
-        conditions: all of which hold; at most one for each factor.
-        right, of: rows under it.
-        right_elsewhere, of_elsewhere: the other rows.
-    """
+    """A rule, all of whose conditions hold, at most one for each factor; counted on rows that did not choose it and
+    that no rule before it covers."""
 
     conditions: RuleConditions
     right: int
@@ -305,12 +280,7 @@ def _chance(right: int, of: int, right_elsewhere: int, of_elsewhere: int) -> flo
 
 @dataclass(frozen=True)
 class FoundRules:
-    """What was found.
-
-    Attributes:
-        told: the rules, the weightiest first.
-        next: the best one after these, which is not told; None where there is none to try.
-    """
+    """The rules that are told, the weightiest first, and the best one after these, if there is one to try."""
 
     told: list[CountedRule]
     next: CountedRule | None
@@ -325,28 +295,21 @@ def covered(conditions: RuleConditions, found: Observations) -> Mask:
 
 
 def find_rules(choosing: Observations, counting: Observations, seed: int) -> FoundRules:
-    """Return the rules under which the model is wrong more often than elsewhere.
-
-    Args:
-        choosing: rows that rules are chosen on.
-        counting: other rows, with the same factors, that they are counted on.
-    """
+    """Return the rules under which the model is wrong more often than elsewhere, chosen on some rows and counted on
+    others with the same factors."""
     rules: list[CountedRule] = []
     for number in range(MOST_RULES):
         conditions = _best(choosing, seeds.stream(seed, "rules", number))
         if not conditions:
             return FoundRules(rules, None)
         inside = covered(conditions, counting)
-        rule = _counted(conditions, counting.right[inside], counting.right[~inside])
+        here, elsewhere = counting.right[inside], counting.right[~inside]
+        rule = CountedRule(conditions, int(here.sum()), len(here), int(elsewhere.sum()), len(elsewhere))
         if not rule.holds:
             return FoundRules(rules, rule)
         rules.append(rule)
         choosing, counting = choosing.where(~covered(conditions, choosing)), counting.where(~inside)
     return FoundRules(rules, None)
-
-
-def _counted(conditions: RuleConditions, inside: Mask, elsewhere: Mask) -> CountedRule:
-    return CountedRule(conditions, int(inside.sum()), len(inside), int(elsewhere.sum()), len(elsewhere))
 
 
 def _best(found: Observations, seed: int) -> RuleConditions:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, final
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
 from advsearch.runs import files, images, store, summary, tracking
-from advsearch.runs.files import PART, replacing, storage_errors, write_text
+from advsearch.runs.files import PART, replacing, storage_errors, write_bytes, write_text
 from advsearch.settings import HEADER
 from advsearch.yaml_text import LARGEST
 
@@ -132,11 +132,8 @@ class RunDirectory:
 
     @classmethod
     def of(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
-        """Open the directory of the run that `config` describes: a new one, or the one to go on with.
-
-        Args:
-            resumed: the run to go on with, as for `find_run`; None for a new one.
-        """
+        """Open the directory of the run that `config` describes: a new one, or the one to go on with, as for
+        `find_run`."""
         log: str | None = getattr(config, "log", None)
         tracking.check_tracker(log)
         run = cls.create_for(config) if resumed is None else cls.resume(resumed, config)
@@ -158,14 +155,8 @@ class RunDirectory:
 
     @classmethod
     def resume(cls, run: str | Path, config: Config | None = None) -> RunDirectory:
-        """Open and lock the directory of a run that is there, to go on with it.
-
-        Args:
-            config: what the rest of the run will be carried out with; None if nothing will be.
-
-        Raises:
-            InputError: another process works on it, or `config` would give other numbers than the run began with.
-        """
+        """Open and lock the directory of a run, to go on with it by `config`, if anything goes on; an InputError says
+        if another process works on it, or it would give other numbers than the run began with."""
         path = find_run(run)
         _check_links(path)
         held = files.RunLock(path)
@@ -178,7 +169,8 @@ class RunDirectory:
         try:
             if config is not None:
                 opened._check_same(config)
-                opened._check_goes_on()
+                if (path / OLD_LOG).exists():  # it kept what searches were told elsewhere
+                    raise InputError(f"{path}: cannot go on: it was begun by an older advsearch; {opened.again}")
                 opened._note_sitting(config)
         except BaseException:
             opened.close()
@@ -191,10 +183,6 @@ class RunDirectory:
         if self.store.note(ONLY_HERE) is not None:
             return "start again where it was asked, in Python"
         return f"start again with advsearch run {self.path / CONFIG}"
-
-    def _check_goes_on(self) -> None:
-        if (self.path / OLD_LOG).exists():
-            raise InputError(f"{self.path}: cannot go on: it was begun by an older advsearch; {self.again}")
 
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
@@ -248,21 +236,15 @@ class RunDirectory:
             self.store.set_note(summary.MADE_WITH, json.dumps([*before, now]))
 
     def record(self, *rows: store.Row, told: store.Told | None = None) -> None:
-        """Add evaluated configurations to the results; they survive a kill when this returns (see `store`).
-
-        Args:
-            told: what the last of them told its search beside its row.
-        """
+        """Add evaluated configurations to the results, and what the last of them told its search; they survive a kill
+        when this returns (see `store`)."""
         self.store.append(rows, told)
         if self._tracker is not None:
             self._tracker.rows(rows)
 
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
-        """Write ``<folder>/<name>.png`` and return its path.
-
-        Args:
-            image: (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch.
-        """
+        """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch; return
+        its path."""
         return images.write_png(self.path / folder / f"{name}.png", image)
 
     def save_exr(self, name: str, image: Any, folder: str = IMAGES) -> Path:
@@ -271,7 +253,7 @@ class RunDirectory:
 
     def save_animation(self, name: str, frames: Sequence[Any]) -> Path:
         """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path."""
-        return images.write_animation(self.path / IMAGES / f"{name}.gif", frames)
+        return write_bytes(self.path / IMAGES / f"{name}.gif", images.animation_bytes(frames))
 
     def replacing(self, name: str) -> AbstractContextManager[Path]:
         """Return `files.replacing` of a file of this run: ``with run.replacing("artifacts/mesh.obj") as path: ...``."""
@@ -400,11 +382,7 @@ def is_run(path: Path) -> bool:
 
 
 def check_free(run: str | Path, *, overwrite: bool = False) -> None:
-    """Check that a run may be put at `run`; call it before any long work.
-
-    Raises:
-        RunExistsError: there is something, and `overwrite` is not given or does not apply.
-    """
+    """Check that a run may be put at `run`, or raise RunExistsError; call it before any long work."""
     path = run_path(run)
     if "\0" in str(path):
         raise InputError(f"expected a name or a folder for the run, got {str(path)!r} with a zero byte in it")

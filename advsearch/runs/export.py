@@ -45,12 +45,8 @@ GROUP = 8192
 
 
 def write_rows(store: Store, format: str, out: Path | None, stream: IO[bytes], kind: str | None = None) -> int:
-    """Write the rows and return how many there were.
-
-    Args:
-        out: the file, written whole or not at all; None writes to the stream.
-        kind: only rows of this kind.
-    """
+    """Write the rows, or those of one kind, whole or not at all to a file, or to a stream, and return how many there
+    were."""
     if format not in FORMATS:
         raise UnknownNameError("format", format, FORMATS)
     counts = store.counts()
@@ -291,22 +287,14 @@ def _line(row: Row, names: Iterable[str], prediction: int) -> JsonObject:
 
 @dataclass(frozen=True)
 class Imported:
-    """One line of such a folder.
-
-    Attributes:
-        picture: the file of its picture; None where there is none.
-    """
+    """One line of such a folder, as a sweep stores it, and the file of its picture, if there is one."""
 
     row: Row
     picture: Path | None
 
 
 def read_threedb(folder: Path) -> Iterator[Imported]:
-    """Yield the rows of such a folder.
-
-    Raises:
-        FileFormatError: a file is missing, too large or not what it should be; the message names the line.
-    """
+    """Yield the rows of such a folder; a FileFormatError names the line that is not what it should be."""
     classes = _read_classes(folder / CLASSES)
     try:
         file = open_regular(folder / DETAILS, "the log of 3DB", LARGEST)

@@ -46,13 +46,8 @@ _FIELDS, _LABELS = "fiftyone.core.fields.", "fiftyone.core.labels."
 
 @dataclass(frozen=True)
 class Pictured:
-    """A row that has a picture.
-
-    Attributes:
-        name: of the sample's files; what has the same picture has the same name.
-        layers: the EXR with ground truth beside it; None where there is none.
-        size: (height, width) of the picture that the model saw, pixels, in which boxes are told; None if not known.
-    """
+    """A row that has a picture: the name of the sample's files, the same for the same picture; the EXR with ground
+    truth beside it; and the (height, width) of what the model saw, in which boxes are told, if known."""
 
     name: str
     row: Row

@@ -119,11 +119,8 @@ NAME = ".lock"
 
 
 class RunLock:
-    """The lock on a run directory, held from construction until `release` or the end of the process.
-
-    Raises:
-        InputError: another process works on this run; the message names it.
-    """
+    """The lock on a run directory, held until `release` or the end of the process; an InputError names who else works
+    on it."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
@@ -137,7 +134,8 @@ class RunLock:
             os.truncate(self._descriptor, 0)
             os.write(self._descriptor, str(os.getpid()).encode())
         except OSError as error:
-            message = _refusal(error, folder, self._owner())
+            pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
+            message = _refusal(error, folder, f"process {pid}" if pid.isdigit() else "another process")
             self.release()
             raise message from None
 
@@ -146,10 +144,6 @@ class RunLock:
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
-
-    def _owner(self) -> str:
-        pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
-        return f"process {pid}" if pid.isdigit() else "another process"
 
 
 def is_held(folder: Path) -> bool:
@@ -320,18 +314,12 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
         open_regular(path, "a results.sqlite", LARGEST).close()
     with storage_errors(path):
         db = sqlite3.connect(path)
-        version = _version(db)
-        if version == 0:
-            _make(db)
+        if _version(db) == 0:  # there is nothing in it to lose yet, so the disk isn't waited for
+            db.execute("PRAGMA synchronous = OFF")
+            db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
+            db.execute("PRAGMA journal_mode = WAL")
         _migrate(db)
     return db
-
-
-def _make(db: sqlite3.Connection) -> None:
-    """Start an empty file. There is nothing in it to lose yet, so the disk isn't waited for."""
-    db.execute("PRAGMA synchronous = OFF")
-    db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
-    db.execute("PRAGMA journal_mode = WAL")
 
 
 def connect_to_read(path: Path) -> sqlite3.Connection:

@@ -91,12 +91,8 @@ def write_exr(path: Path, image: Any) -> Path:
 
 
 def write_layers(path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]) -> Path:
-    """Write several layers as one EXR, whole or not at all, and return the path.
-
-    Args:
-        layers: channels (H, W) by name, such as ``normal.X``: numbers in float32, whole numbers as 32 bits.
-        notes: what the values mean, by layer: attributes of the file.
-    """
+    """Write channels (H, W) by name, such as ``normal.X``, as one EXR, whole or not at all, and return the path:
+    numbers in float32, whole numbers as 32 bits, and notes on what they mean as attributes of the file."""
     channels = {}
     for name, layer in layers.items():
         values = layer.numpy() if hasattr(layer, "numpy") else np.asarray(layer)
@@ -132,11 +128,6 @@ def animation_bytes(frames: Sequence[Any]) -> bytes:
             chosen = _spread(chosen, min(len(chosen) * 9 // 10, len(chosen) * ANIMATION_BYTES // len(data)))
         else:
             shrink *= 2
-
-
-def write_animation(path: Path, frames: Sequence[Any]) -> Path:
-    """Write `animation_bytes` to `path`, whole or not at all, and return the path."""
-    return write_bytes(path, animation_bytes(frames))
 
 
 def _gif(pictures: Sequence[Bytes]) -> bytes:

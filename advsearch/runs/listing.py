@@ -63,11 +63,8 @@ def can_resume(path: Path) -> bool:
 
 
 def listed_run(path: Path, *, counts: bool = True) -> Listed:
-    """Return the run in a folder; what cannot be read is shown as far as it can.
-
-    Args:
-        counts: whether rows are counted, which takes a second for a million.
-    """
+    """Return the run in a folder; what cannot be read is shown as far as it can. To count rows takes a second for a
+    million."""
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
@@ -80,6 +77,7 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
             kinds = results.counts()
     object_name = getattr(result, "object", None) or ",".join(getattr(result, "objects", ()))
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
+    ending = "stopped" if result is None or result.goes_on else str(getattr(result, "ending", "done"))
     return Listed(
         name=path.name,
         path=str(path),
@@ -87,7 +85,7 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
         object=str(config.get("object") or object_name or ("" if config else "?")),
         controls=tuple(map(str, controls)) if isinstance(controls, (list, tuple, dict)) else ("?",),
         rows=sum(kinds.values()),
-        state=_state(path, result),
+        state="running" if files.is_held(path) else ending,
         answer=result.brief if result else "",
         kinds=kinds,
         begun=bool(config),
@@ -100,9 +98,3 @@ def _when(path: Path) -> float | None:
         with suppress(OSError):
             return (path / name).stat().st_mtime
     return None
-
-
-def _state(path: Path, result: Result | None) -> str:
-    if files.is_held(path):
-        return "running"
-    return "stopped" if result is None or result.goes_on else str(getattr(result, "ending", "done"))

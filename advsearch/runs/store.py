@@ -133,11 +133,8 @@ _INSERT_TOLD = "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations
 
 @final
 class Store:
-    """The open `results.sqlite` of a run. Close it, or use it in a `with` block.
-
-    Args:
-        read_only: open for reading beside a process that writes.
-    """
+    """The open `results.sqlite` of a run; `read_only` beside a process that writes. Close it, or use it in a `with`
+    block."""
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
@@ -168,11 +165,7 @@ class Store:
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
 
     def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
-        """Yield the rows, or those of one kind, in the order in which they were written.
-
-        Args:
-            after: the id behind which to begin.
-        """
+        """Yield the rows, or those of one kind, in the order in which they were written, behind the id `after`."""
         where, given = ("id > ?", (after,)) if kind is None else ("id > ? AND kind = ?", (after, kind))
         with readable(self.path):
             cursor = self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", given)

@@ -47,11 +47,8 @@ def write_summary(folder: Path, result: Result) -> Path:
 
 
 def read_result(folder: Path) -> Result:
-    """Return the result of the run in `folder`.
-
-    Raises:
-        FileFormatError: there is none (the run did not end yet), it is not JSON, or not what this version writes.
-    """
+    """Return the result of the run in `folder`; a FileFormatError says if there is none, or not what this version
+    writes."""
     path = folder / NAME
     try:
         values = parse_json(read_text(path, "the summary of a run", LARGEST))
@@ -109,11 +106,7 @@ def write_answer(run: Path, u: NDArray[np.float32]) -> Path:
 
 
 def read_answer(run: Path) -> NDArray[np.float32]:
-    """Return the configuration (d,) float32 in [0, 1] that a run answers with.
-
-    Raises:
-        FileFormatError: there is none (the run did not end, or is of an older version), or it is something else.
-    """
+    """Return the configuration (d,) float32 in [0, 1] that a run answers with, or raise a FileFormatError."""
     path = run / FOLDER / ANSWER
     try:
         data = read_bytes(path, "the answer of a run", LARGEST_ANSWER)

@@ -18,13 +18,6 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry
 
-
-def _is_policy(name: str, entry: Any) -> bool:
-    if not isinstance(entry, type) or not is_dataclass(entry):
-        return False
-    return issubclass(entry, Policy) and entry.name == name
-
-
 INSIDE = ("choices", "stay")
 """Policies that only the search asks for."""
 
@@ -37,7 +30,12 @@ def _own() -> dict[str, type[Policy[Any]]]:
 
 
 POLICIES: Registry[type[Policy[Any]]] = Registry(
-    "advsearch.policies", _own(), "a dataclass over Policy whose name is that of the entry point", _is_policy
+    "advsearch.policies",
+    _own(),
+    "a dataclass over Policy whose name is that of the entry point",
+    lambda name, entry: (
+        isinstance(entry, type) and is_dataclass(entry) and issubclass(entry, Policy) and entry.name == name
+    ),
 )
 """Every policy by its word on the command line."""
 

@@ -62,13 +62,8 @@ NEAR, FAR, CENTRES = 256, 128, 4
 
 @dataclass(frozen=True)
 class Plan:
-    """What the renders are for.
-
-    Attributes:
-        screen: renders of the screen.
-        until: renders after which the ascent begins; `steps` if there is none.
-        gradient: what the ascent asks for.
-    """
+    """What the renders are for: the screen; the ascent, which asks for `gradient`, begins after `until`, or never at
+    `steps`."""
 
     steps: int
     screen: int

@@ -30,7 +30,6 @@ from advsearch.attacks.evaluation import (
     NO_COUNTS,
     Counts,
     Evaluated,
-    Evaluation,
     Policy,
     Proposal,
     affordable,
@@ -41,14 +40,8 @@ from advsearch.attacks.evaluation import (
 
 @dataclass(frozen=True, eq=False)
 class Runner:
-    """One search in a race.
-
-    Attributes:
-        policy, domain: what searches where.
-        left: renders left of its share of this round.
-        best: the largest objective it has met.
-        over: whether it has nothing more to propose.
-    """
+    """One search in a race: a policy and its state, renders left of its share of this round, the largest objective it
+    has met, and whether it has nothing more to propose (`over`)."""
 
     policy: Policy[Any]
     domain: Domain
@@ -60,14 +53,8 @@ class Runner:
 
 @dataclass(frozen=True, eq=False)
 class Race:
-    """Where a race stands.
-
-    Attributes:
-        field: numbers of those that are in this round, the best first.
-        round: number of this one, from 0.
-        spent: renders that the evaluations so far took.
-        asked: numbers of the searches whose proposals wait for their evaluations, one for each.
-    """
+    """Where a race of so many steps and rounds stands: the numbers of those that are in this round, the best first
+    (`field`), renders that the evaluations so far took, and the searches whose proposals wait for theirs (`asked`)."""
 
     runners: tuple[Runner, ...]
     steps: int
@@ -269,14 +256,8 @@ MOST_NUMBERS = 2**24
 
 @dataclass(frozen=True, eq=False)
 class ChoicesState:
-    """Where the search stands.
-
-    Attributes:
-        numbers: (k,) positions in u of what is no choice.
-        choices: (c,) positions in u of the choices.
-        combinations: (n, c) the choices' elements of u, one row for each search in the race.
-        race: between the combinations, over the numbers alone.
-    """
+    """Where the search stands: positions in u of numbers (k,) and choices (c,), the choices' elements (n, c) of each
+    search in the race, which goes over the numbers alone."""
 
     domain: Domain
     numbers: Tensor
@@ -333,7 +314,10 @@ class Choices(Policy[ChoicesState]):
         return tuple(replace(proposal, u=_whole(state, proposal.u, number)) for proposal, number in asked), state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
-        inner = [(u[state.numbers], _part(evaluation, state.numbers)) for u, evaluation in evaluated]
+        inner, numbers = [], state.numbers
+        for u, one in evaluated:
+            gradient = None if one.gradient is None else one.gradient[numbers]
+            inner.append((u[numbers], replace(one, gradient=gradient)))
         return replace(state, race=update(state.race, inner))
 
     def counts(self, state: ChoicesState) -> Counts:
@@ -365,11 +349,6 @@ def _without(domain: Domain, numbers: Tensor) -> Domain | None:
         return None
     first = None if domain.first is None else domain.first[numbers]
     return replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
-
-
-def _part(evaluation: Evaluation, numbers: Tensor) -> Evaluation:
-    gradient = evaluation.gradient
-    return evaluation if gradient is None else replace(evaluation, gradient=gradient[numbers])
 
 
 def _whole(state: ChoicesState, numbers: Tensor, combination: int) -> Tensor:

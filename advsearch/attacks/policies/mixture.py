@@ -40,12 +40,8 @@ than so much of the probability."""
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """The d elements of u in shares of their ranges.
-
-    Attributes:
-        counts: (d,) options of each choice, 0 of a number.
-        around: (d,) bool: angles.
-    """
+    """The d elements of u in shares of their ranges: options (d,) of each choice, 0 of a number, and which (d,) are
+    angles."""
 
     counts: Tensor
     around: Tensor
@@ -63,13 +59,8 @@ class Ranges:
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """A mixture of products: normal distributions cut to their ranges, and probabilities of options.
-
-    Attributes:
-        weights: (k,), sum 1.
-        means, deviations: (k, d) in shares of each range.
-        options: (k, d, most options) probabilities.
-    """
+    """A mixture of k products: normal distributions (k, d) cut to their ranges, in shares of these, and probabilities
+    of options (k, d, most options); the weights (k,) have the sum 1."""
 
     weights: Tensor
     means: Tensor

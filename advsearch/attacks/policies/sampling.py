@@ -62,12 +62,7 @@ CHUNK = 2**20
 
 @dataclass(frozen=True, eq=False)
 class SobolState:
-    """Where the sequence stands.
-
-    Attributes:
-        points: (n, k) of the unit cube, n a power of two; drawn from number `begin` of the sequence on.
-        begin: number of the first of them.
-    """
+    """Where the sequence stands: its points (n, k) from number `begin` on, n a power of two, and how many are done."""
 
     domain: Domain
     seed: int
@@ -120,12 +115,8 @@ class Sobol(Policy[SobolState]):
 
 
 def draw(size: int, seed: int, begin: int, count: int) -> Tensor:
-    """Return `count` points of the scrambled sequence of that seed from number `begin` on: (count, size) float32.
-
-    Args:
-        size: dimensions, at most `MOST`.
-        begin, count: which points; the first call takes a power of two, which is what keeps the points balanced.
-    """
+    """Return `count` points of the scrambled sequence of that seed from number `begin` on: (count, size) float32. The
+    first call takes a power of two, which is what keeps the points balanced."""
     from scipy.stats import qmc  # takes most of a second, and few runs need it
 
     engine = qmc.Sobol(size, scramble=True, seed=seed)
@@ -151,13 +142,8 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class GridState:
-    """Where a grid stands.
-
-    Attributes:
-        axes: for each number the (m_i,) values that its element of u takes.
-        order: (n,) numbers of the grid's points, coarse ones first.
-        done: how many of them were proposed.
-    """
+    """Where a grid stands: the (m_i,) values of each element of u, the numbers (n,) of the points, coarse ones first,
+    and how many are done."""
 
     domain: Domain
     axes: tuple[Tensor, ...]

@@ -32,14 +32,8 @@ NEAREST, FARTHEST = 0.01, 0.3
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Which elements of u these are, and what a point x in [0, 1]^k means: u[where] = low + width * x.
-
-    Attributes:
-        where: (k,) positions in u.
-        low, width: (k,) of the bounds.
-        periodic: (k,) whether 0 and 1 are the same place.
-        options: (k,) the number of options of a discrete choice, or 0.
-    """
+    """Which elements of u these are (k,), and what a point x in [0, 1]^k means: u[where] = low + width * x. At the ends
+    of `periodic` ones is the same place; a discrete choice has `options`, others 0."""
 
     where: Tensor
     low: Tensor

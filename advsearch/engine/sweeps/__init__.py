@@ -36,13 +36,8 @@ SAMPLES = 100
 
 @dataclass(frozen=True)
 class NamedScene:
-    """One of the scenes.
-
-    Attributes:
-        held: controls that stay where `u` has them; with the answer of a run, or as they are without it.
-        u: (d,) of these; None leaves the scene as it is.
-        answer: what the place is called beside the same one without the answer; empty where there is no such.
-    """
+    """One of the scenes. Controls that are `held` stay where `u` (d,) has them, or as the scene is without it; `answer`
+    is what the place is called beside the same one without the answer of a run, empty where there is no such."""
 
     object: str
     environment: str
@@ -62,13 +57,8 @@ class NamedScene:
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that was asked for, found and loaded.
-
-    Attributes:
-        controls: what is drawn by chance.
-        aovs: layers of ground truth that are kept of every picture of the first model (`scene.surfaces.AOVS`).
-        metrics: numbers of every picture that rows have beside what the task says.
-    """
+    """Everything that was asked for, found and loaded: `controls` are drawn by chance; `aovs` are layers of ground
+    truth that are kept of every picture of the first model (`scene.surfaces.AOVS`)."""
 
     config: SweepConfig
     places: tuple[NamedScene, ...]
@@ -174,11 +164,7 @@ class Job:
         return Points(space, domain, self.axes, self.samples, config.sampler, config.seed, scenes, among)
 
     def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
-        """What is true of a configuration, as the task of a model needs it.
-
-        Args:
-            look: says what is seen in it; None where no configuration is meant.
-        """
+        """What is true of a configuration, by what is described and seen of it, as the task of a model needs it."""
         return self.tasks[model].truth(self._facts(place, values, look))
 
     def _facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:

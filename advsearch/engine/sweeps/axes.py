@@ -30,11 +30,7 @@ _OUTER = {"object": "`object` mug,bowl", "environment": "`environment` studio,no
 
 @dataclass(frozen=True)
 class Axis:
-    """One parameter and its values.
-
-    Attributes:
-        instance: the name of its instance; the kind unless said otherwise.
-    """
+    """One parameter and its values. The instance has the name of its kind unless said otherwise."""
 
     control: str
     instance: str
@@ -59,12 +55,8 @@ class Axis:
 
 
 def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[Axis, ...]:
-    """Return the axes of a grid.
-
-    Args:
-        grid: name to values: ``"FIRST:LAST:COUNT"``, or a list. A name is KIND.PARAMETER, INSTANCE.PARAMETER of one of
-            `controls`, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
-        controls: what is drawn by chance.
+    """Return the axes of a grid beside the controls that are drawn by chance: name to values, ``"FIRST:LAST:COUNT"`` or
+    a list. A name is KIND.PARAMETER, INSTANCE.PARAMETER of one of `controls`, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
     """
     instances = {control.name: control for control in controls}
     found: dict[str, Axis] = {}

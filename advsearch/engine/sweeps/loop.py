@@ -73,12 +73,8 @@ READ_AT_ONCE = 256
 
 
 class Sweep:
-    """One sweep, from its first configuration or from where it was stopped.
-
-    Args:
-        run: open directory to keep it in, with the rows that are there already; None keeps it in memory.
-        executor: answers batches of queries; None does it here.
-    """
+    """One sweep, from its first configuration or from where it was stopped: `run` has the rows that are there already,
+    and None keeps it in memory. Without an executor all is answered here."""
 
     def __init__(
         self, job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None
@@ -118,11 +114,7 @@ class Sweep:
         self._pairs = self.total // 2 if len(answers) > 1 else 0
 
     def carry_out(self, first: int | None = None) -> SweepResult:
-        """Do what is left and return the answer.
-
-        Args:
-            first: number of the configuration to begin with; None does those that are not stored.
-        """
+        """Do what is left, or all from the configuration with a number on, and return the answer."""
         tally = self._counted()
         ending, worst = FINISHED, None
         self._check_answers()
@@ -344,13 +336,13 @@ class Sweep:
         predicting = self._transport.values() or [[one.summary() for one in (view.light.values() if view else ())]]
         swept = seconds.get("sweep", 0.0)
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
-        gains = self._gains() if formation else {}
+        gains, models = self._gains() if formation else {}, [model.name for model in job.models]
         if formation is not None and len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         summary = SweepSummary(
             run=None if self.run is None else str(self.run.path),
             object=job.config.object,
-            model=",".join(model.name for model in job.models),
+            model=",".join(models),
             task=job.config.task_name,
             environment=self.points.environment or job.config.lit_by,
             controls=[control.name for control in job.controls],
@@ -364,7 +356,7 @@ class Sweep:
             answers=tally.frequent(),
             axes=tally.table(),
             cells=tally.map(),
-            beside=self._beside(tally),
+            beside=BesideAnswer(answer=job.places[-1].answer, pairs=tally.beside(models)) if self._pairs else None,
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
@@ -401,12 +393,6 @@ class Sweep:
             f"{place.object}, {place.environment}": framed(place.scene.description, size).gain
             for place in self.job.places
         }
-
-    def _beside(self, tally: Tally) -> BesideAnswer | None:
-        if not self._pairs:
-            return None
-        models = [one.name for one in self.job.models]
-        return BesideAnswer(answer=self.job.places[-1].answer, pairs=tally.beside(models))
 
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         remarks = lost_remarks(self._lost)

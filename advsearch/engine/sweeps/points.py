@@ -47,14 +47,9 @@ Tell = Callable[[Tensor, "Picks"], list[Mapping[str, Value]]]
 
 @dataclass(frozen=True, eq=False)
 class Picks:
-    """Neighbouring pictures of a scene.
-
-    Attributes:
-        number: of the first of them in the whole sweep.
-        digits: of each, its place on every axis of the grid.
-        shares: (n, k) float64 in [0, 1], the coordinates drawn for small parameters; equal parts are equally likely.
-        parts: of each, the part of every drawn number of the table in which it lies.
-    """
+    """Neighbouring pictures of a scene: the number of the first in the whole sweep; of each, its place on every axis of
+    the grid, shares (n, k) float64 in [0, 1], the coordinates drawn for small parameters, and the part of every drawn
+    number of the table in which it lies."""
 
     number: int
     digits: list[tuple[int, ...]]
@@ -64,13 +59,8 @@ class Picks:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A drawn number, as the table shows it.
-
-    Attributes:
-        column: of `Picks.shares`.
-        parts: what each part of [0, 1] stands for: a pair of ends, or a value of a list.
-        settled: whether these are its values in every scene.
-    """
+    """A drawn number, as the table shows it: its column of `Picks.shares`, and what equal parts of [0, 1] stand for:
+    pairs of ends, or values of a list; if `settled`, in every scene."""
 
     name: str
     unit: str
@@ -358,11 +348,8 @@ def _drawn(
 def _by_description(
     describe: Callable[[Tensor], Mapping[str, Value]], axes: Sequence[tuple[int, Axis]], *, keep: bool
 ) -> Tell:
-    """What the control itself says, one configuration after the other.
-
-    Args:
-        keep: whether these axes are all that the description depends on, so that it can be kept for the next time.
-    """
+    """What the control itself says, one configuration after the other; kept for the next time if these axes are all
+    that it depends on."""
     kept: dict[tuple[int, ...], dict[str, Value]] = {}
 
     def one(u: Tensor, digits: tuple[int, ...]) -> Mapping[str, Value]:

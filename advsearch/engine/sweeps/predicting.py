@@ -46,13 +46,8 @@ MarginOf = Callable[[Tensor, Tensor], float]
 
 @dataclass(frozen=True)
 class Groups:
-    """How the pictures of a scene fall into groups.
-
-    Attributes:
-        within: of every axis of the grid, whether the pictures of a group may differ in it.
-        drawn: whether they may differ in what is drawn.
-        frames: number of the axis of the frames of a drive, which have one draw; None without.
-    """
+    """How the pictures of a scene fall into groups: whether they may differ along each axis of the grid (`within`), and
+    in what is `drawn`. The frames of a drive, on the axis `frames`, have one draw."""
 
     grid: Product
     samples: int
@@ -111,13 +106,8 @@ class Groups:
 
 @dataclass(frozen=True, eq=False)
 class WantedPicture:
-    """A picture that is wanted.
-
-    Attributes:
-        number: of it in the scene.
-        u: (d,) its configuration.
-        seed: of its noise, if it is rendered.
-    """
+    """A picture that is wanted: its number in the scene, its configuration (d,), and the seed of its noise, if it is
+    rendered."""
 
     number: int
     u: Tensor
@@ -126,13 +116,8 @@ class WantedPicture:
 
 @dataclass(frozen=True, eq=False)
 class SweptPicture:
-    """One picture.
-
-    Attributes:
-        picture: (H, W, 3) sRGB in [0, 1].
-        predicted: samples a pixel of what predicted it; 0 if it was rendered.
-        traced: pictures that were traced for it; the first of a group has all that were traced for the group.
-    """
+    """A picture (H, W, 3), sRGB in [0, 1]; the samples a pixel of what predicted it, 0 if it was rendered; and how many
+    were traced for it, of the first of a group all that were traced for the group."""
 
     picture: Tensor
     predicted: int
@@ -340,11 +325,8 @@ LIT_BYTES = 4_000_000
 
 
 def pays_from(renderer: Renderer, spp: int, checks: int, arrangements: float = 1.0) -> int:
-    """Return how many pictures under one light have to be wanted for it to pay.
-
-    Args:
-        arrangements: what texels see is found so many times for each light.
-    """
+    """Return how many pictures under one light have to be wanted for it to pay, where what texels see is found
+    `arrangements` times for each light."""
     height, width = renderer.formation.resolution
     samples = (ARRANGED * arrangements + LIT) / (height * width) + checks * (2 * CHECK_SPP + spp)
     return math.ceil(PAYS * samples / (spp - SHOWN))

@@ -49,13 +49,7 @@ MOST_ANSWERS = 20
 
 @dataclass
 class Count:
-    """Right answers among configurations, for every value of one axis.
-
-    Attributes:
-        values: what each place stands for: a number, a name, or a pair of ends.
-        seen: configurations of each value.
-        correct: those that the model got right.
-    """
+    """Right answers among configurations, for every value of one axis: a number, a name, or a pair of ends."""
 
     name: str
     unit: str
@@ -90,11 +84,8 @@ def rate(correct: int, seen: int) -> CountedAnswers:
 
 
 class Cells:
-    """Counts for every pair of values of two axes, and the sum of the margins there.
-
-    Args:
-        axes: name, unit and values of every axis that has several values, those that are shown first.
-    """
+    """Counts for every pair of values of the first two of several axes (name, unit, values), and the sum of the margins
+    there."""
 
     def __init__(self, axes: Sequence[tuple[str, str, Sequence[Any]]]) -> None:
         self._axes = list(axes[:2])
@@ -161,13 +152,8 @@ class Tally:
         self._cells = Cells([(every[n].name, every[n].unit, every[n].values) for n in self._mapped])
 
     def add(self, index: int, outer: Sequence[int], picks: Picks, place: int, trial: Judgement) -> None:
-        """Count one configuration.
-
-        Args:
-            outer: its places on the outer axes.
-            picks: the pictures it belongs to.
-            place: its place among them.
-        """
+        """Count the configuration with a number: by its places on the outer axes, and its place among the pictures it
+        belongs to."""
         right = trial.right
         if pairs := len(self._verdicts[0]):
             self._verdicts[index // pairs][index % pairs] = RIGHT if right else WRONG
@@ -298,11 +284,7 @@ AT_ONCE = 1000
 
 
 def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bool = False) -> Path:
-    """Read a folder that 3DB wrote into a run, and return its folder.
-
-    Args:
-        run: the run's name or folder; None for ``runs/NAME-3db-NNN``.
-    """
+    """Read a folder that 3DB wrote into a run, by default ``runs/NAME-3db-NNN``, and return its folder."""
     counts = _Counts()
     with RunDirectory.create(run, overwrite=overwrite, default=default_name(folder.resolve().name, ["3db"])) as kept:
         rows: list[Row] = []

@@ -56,17 +56,8 @@ LEVEL = 0.05
 
 
 class PartCounts:
-    """Counts of n parts over pictures: of the answers, and of the wrong ones shared out by chance.
-
-    Args:
-        pictures: how many there will be.
-        failures: of them, those whose answer is wrong.
-
-    Attributes:
-        seen: (n,) pictures in which each part holds.
-        wrong: (n,) of them, those whose answer is wrong.
-        chance: (SHARINGS, n) the same for wrong answers that were shared out.
-    """
+    """Counts of n parts over so many pictures, of which some are `failures`: those that show each (`seen`), and of
+    these the failures (`wrong`), both (n,); `chance` (SHARINGS, n) is the same for failures that are shared out."""
 
     def __init__(self, parts: int, pictures: int, failures: int, seed: int) -> None:
         self.pictures, self.failures = pictures, failures
@@ -76,11 +67,7 @@ class PartCounts:
         self._random = np.random.default_rng(seed)
 
     def add(self, parts: Counts, failed: bool) -> None:
-        """Count a picture.
-
-        Args:
-            parts: numbers of those that hold in it, each once.
-        """
+        """Count a picture, by the numbers of the parts that hold in it, each once."""
         self.seen[parts] += 1
         self.wrong[parts] += failed
         drawn = self._random.random(SHARINGS) * self._left < self._to_go  # so each choice of pictures is equally likely
@@ -118,11 +105,8 @@ class Association:
 
 
 def association(tally: PartCounts, some: slice, least: int) -> Association:
-    """Compare the answers where each of some parts holds with those where it does not.
-
-    Args:
-        least: a part is compared that holds in so many pictures and does not in as many.
-    """
+    """Compare the answers where each of some parts holds with those where it does not; at least so many pictures of
+    either kind."""
     seen, wrong, pictures, failures = tally.seen[some], tally.wrong[some], tally.pictures, tally.failures
     compared = (seen >= least) & (pictures - seen >= least)
     low, high, difference, p = np.full((4, len(seen)), np.nan)
@@ -189,21 +173,13 @@ AT_ONCE = 16
 
 
 class SurfaceCounts:
-    """How often each part of an object's surface was seen, and how often the answers were wrong then.
-
-    Args:
-        tallies: for each model, of as many parts.
-    """
+    """How often each part of an object's surface was seen, and how often the answers of each model were wrong then."""
 
     def __init__(self, parts: SurfaceParts, tallies: Sequence[PartCounts]) -> None:
         self.parts, self.tallies = parts, tuple(tallies)
 
     def add(self, shown: Surfaces, wrong: Mapping[int, bool]) -> None:
-        """Count a picture.
-
-        Args:
-            wrong: by the number of the model, whether its answer is wrong.
-        """
+        """Count a picture, by what it shows and the models whose answers are wrong."""
         there = shown.seen(OBJECT)
         face, uv = shown.face[there].numpy(), shown.uv[there].numpy().astype(np.float64)
         seen = np.unique(self.parts.cells(face, uv))

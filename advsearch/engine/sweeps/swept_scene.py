@@ -110,13 +110,8 @@ class SweptLight(SweptPredictor):
 
 
 class SweptScene:
-    """One scene, ready to be rendered and shown to the models: what a `Problem` is to an attack.
-
-    Attributes:
-        points: its configurations for each size of picture, on which what a control frames may depend.
-        renderers: likewise.
-        light: what predicts pictures of these that differ in little.
-    """
+    """One scene, ready to be rendered and shown to the models: what a `Problem` is to an attack. Points, renderers and
+    what predicts pictures are there for each size of picture, on which what a control frames may depend."""
 
     prepared: Any = None
 
@@ -210,11 +205,8 @@ class SweptScene:
         return self._judged(model, picture[None], [(u, {})])[0]
 
     def truth(self, model: int, u: Tensor, listed: Mapping[str, Value]) -> Truth:
-        """What is true of a configuration (d,), as the task of one model needs it.
-
-        Args:
-            listed: values of the grid as they were given, in the place of what single precision makes of them.
-        """
+        """What is true of a configuration (d,), as the task of one model needs it; values of the grid as they were
+        `listed`, not what single precision makes of them."""
         job, size = self.job, self.job.sizes[model]
         if not job.tasks[model].varies:
             return self._truths[model]
@@ -227,12 +219,8 @@ class SweptScene:
             return to_8_bit(self.renderers[self.job.sizes[model]](u, seed=seed, spp=spp))
 
     def surfaces(self, picks: Picks, size: tuple[int, int] | None = None, fineness: int = 1) -> Iterator[Surfaces]:
-        """What is seen in the pixels of pictures, one after the other.
-
-        Args:
-            size: (height, width) of the pictures; None for those that the first model is shown.
-            fineness: parts of each side of a pixel.
-        """
+        """What is seen in the pixels of pictures, one after the other: of a size, by default that of the first model,
+        in `fineness` parts of each side of a pixel."""
         size = size or self.job.sizes[0]
         for u in self.points[size].configurations(picks):
             yield self.renderers[size].surfaces(u, fineness)
@@ -300,13 +288,8 @@ class OneModel:
 def check_worst(
     view: SweptScene, job: Job, model: int, u: Tensor, run: RunDirectory | None, stages: Stages
 ) -> WorstVerified | None:
-    """Render a configuration again, and say how often the model is wrong.
-
-    Trials that the run has stored already are not made again.
-
-    Returns:
-        As `verified` in the summary; None without trials.
-    """
+    """Render a configuration again, and say how often the model is wrong; None without trials. Those that the run has
+    stored already are not made again."""
     config = job.config
     if config.trials == 0:
         return None
