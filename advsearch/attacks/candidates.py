@@ -1,13 +1,6 @@
-"""What a search may answer with: the few best configurations, many different failures, the smallest change.
-
-The largest of many noisy values is mostly a lucky one (the winner's curse): with noise of one logit, the best of 40
-equal configurations looks two logits better than it is. So a search keeps several candidates, renders each again with
-seeds it has not used, the same seeds for all, and believes only those renders.
-
-The smallest change that flips the answer: a scale s in (0, 1] multiplies every budget of a domain at once. The answer
-is a bracket [low, high]: at `high` a configuration passed the trials; at `low` a whole search found none that did. The
-upper end is a fact; the lower one is only as good as the search.
-"""
+"""What a search may answer with: the few best configurations, rendered again with seeds it has not used, as the largest
+of many noisy values is mostly a lucky one (the winner's curse); many different failures; and the smallest change, a
+bracket of scales of all budgets, whose upper end passed the trials, and at whose lower end a search found nothing."""
 
 from __future__ import annotations
 

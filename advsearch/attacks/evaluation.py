@@ -1,9 +1,5 @@
-"""What passes between a scene, a search and a trial: one question, its answer, and the contract of a policy.
-
-A policy is three functions over a state that is passed and never kept, so that a policy can be shared, wrapped,
-replayed and resumed. `search` owns everything else: the budget, stopping, the best so far, logging. A policy knows no
-physics and no seeds, only a `Domain` and numbers.
-"""
+"""What passes between a scene, a search and a trial: one question, its answer, and the contract of a policy: three
+functions over a state that is passed and never kept, so that it can be shared, wrapped, replayed and resumed."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""The independent re-check of a search's answer (docs/design.md, "Verification"). A verdict's rule stands here only.
-
-Every trial renders a configuration with a seed nobody has used, at a sample count shown to be high enough, with the
-pixels rounded to 8 bits, and has a task judge what the model says of it. The clean configuration goes through exactly
-the same trials as a control group.
-"""
+"""The independent re-check of a search's answer (docs/design.md, "Verification"): fresh seeds, enough samples, 8 bits,
+a task that judges, and a control group of the clean configuration. A verdict's rule stands here only."""
 
 from __future__ import annotations
 

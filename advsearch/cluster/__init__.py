@@ -1,9 +1,6 @@
-"""Work on many processors: batches carried out somewhere, here by default, and on workers of Dask when asked.
-
-`Executor` is all that the rest of advsearch knows of it: in this process (`InProcess`), or on workers
-(`coordinator.Coordinator`), which sees them as a `Pool`: they come and go, take calls and answer them. A batch may be
-carried out by anybody, any number of times: what comes of it depends on it and on the run's settings alone.
-"""
+"""Work on many processors: batches carried out by an `Executor`, in this process (`InProcess`), or on a `Pool` of
+workers (`coordinator.Coordinator`). Anybody may do it, any number of times: it depends on the batch and the run's
+settings alone."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""Gives batches to workers and takes what comes of them, whatever happens to the workers.
-
-Every batch is pinned to one worker, which has `DEPTH` of them at most. A batch whose worker died is given to another,
-from then on as the only one that a worker has, so that it is known what it died of: after `DEATHS` such deaths the
-batch is cut in halves, and a single item that has as many is given up in words. A worker that takes far longer than
-the median counts as dead. Answers that come later than that change nothing: their tickets are not known any more.
+"""Gives batches to workers, `DEPTH` at most to each, and takes what comes of them. A batch whose worker died is then
+the only one that a worker has, so that it is known what it died of: after `DEATHS` it is cut in halves, and a single
+item given up in words. A worker that takes far longer than the median counts as dead; its late answers change nothing.
 """
 
 from __future__ import annotations

@@ -1,13 +1,7 @@
-"""From what a user says (`workers`, `cluster`) to an executor over workers of Dask.
-
-They are processes on this machine, of a scheduler that runs, or of a cluster that is started. Dask carries calls and
-answers, and starts and watches processes; who does what is decided in `coordinator`. All of it runs in an event loop of
-its own, in a thread. Nothing is kept on the cluster: an answer is fetched and let go.
-
-What is relied on (https://distributed.dask.org): the scheduler tells the topic "all" of each worker that it adds and
-removes; a call that is pinned to a worker runs nowhere else; a nanny starts a worker that died again, at another
-address; processes are spawned, and end with their parent.
-"""
+"""From what a user says (`workers`, `cluster`) to an executor over workers of Dask, in an event loop of its own. Relied
+on (https://distributed.dask.org): the scheduler tells the topic "all" of each worker that it adds and removes; a call
+that is pinned to a worker runs nowhere else; a nanny starts a worker that died again, at another address; processes are
+spawned, and end with their parent."""
 
 from __future__ import annotations
 

@@ -1,12 +1,6 @@
-"""What runs on a worker. It gets ready for a work once, then carries out batches of it; it never sees the store.
-
-Errors go back as values: an exception of ours may not survive being pickled, and says more than its class.
-
-A worker says what it runs on, as far as it decides the last bits of a row, and whether it is the same advsearch. Files
-that a work needs are known by the digest of what is in them, and are sent once, where they are not. A mesh may name
-other files beside it, so what goes along with one is its folder: the files in it and below of the kinds that a scene
-consists of.
-"""
+"""What runs on a worker: it gets ready for a work once, then carries out batches. Errors go back as values, as they may
+not survive being pickled. Files that a work needs are known by their digest and sent once; with a mesh goes its folder,
+files in it and below of the kinds that a scene consists of."""
 
 from __future__ import annotations
 

@@ -1,12 +1,6 @@
-"""Searches over base colours under conditions that vary by chance, by a matrix of light transport for each of many.
-
-Evaluations draw conditions from the bank. It begins with few and grows with each evaluation of the first half, by one
-for `GROWTH` that it draws; what is new is looked at at once. The second half is for learning what there is. Every
-`EVERY` evaluations the present configuration is traced under conditions that no matrix was made for: where these are
-not clearly better for the model than those in the bank, the bank does not grow until the next comparison. The oldest
-matrices make room where there is no memory. All of that follows from the seed, so that a run that goes on makes the
-same matrices and comparisons again.
-"""
+"""Searches over base colours under conditions that vary by chance, by a matrix of light transport for each of a growing
+bank of them (docs/transport.md). All of it follows from the seed, so that a run that goes on makes the same matrices
+and comparisons again."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""Measures gradient estimators on a scene as it is: error, noise and cost, against differences (docs/gradients.md).
-
-A *probe* is a direction in u along which a derivative is measured: one coordinate, or, for a group of many (texels,
-modes), one direction in all of them. The reference is a central difference of the loss with common random numbers, at
-two step sizes, repeated with other seeds until its own noise is known and small.
-"""
+"""Measures gradient estimators on a scene as it is: error, noise and cost, along *probes*, directions in u, against
+central differences with common random numbers at two step sizes (docs/gradients.md)."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""The journal of a run: what was asked and answered, as rows of its store. A question that is in it is not asked again.
-
-So a run that was stopped goes on by asking everything once more, in the same order: it reads back what it knows, and a
-search comes to where it was by being told all of it. It goes on only with the functions and networks that it began
-with, which settings call by name only. What is not in it is answered by workers, in the order in which it was asked.
-"""
+"""The journal of a run: what was asked and answered, as rows of its store. What is in it is not asked again, so a run
+goes on by asking everything once more, with the functions and networks that it began with; the rest is answered in
+order, by workers where there are some."""
 
 from __future__ import annotations
 

@@ -1,13 +1,7 @@
-"""What a search maximises, over which domain, and what `printable` takes from it.
-
-An objective may ask for more than a model's output, the pictures and the truth (docs/objectives.md). As the terms of
-`printable` this depends on u alone, so that it is the same for rendered and for predicted pictures.
-
-The terms of `printable` are how rough the colours to be printed are, and how far from ink. Sharif et al. 2016,
-*Accessorize to a Crime*, sections 5.2.2 (total variation) and 5.2.3 (the non-printability score). Theirs are sums over
-pixels; these are means, so that a weight means the same at every resolution. Their score is a product of distances to
-all printable colours; here it is the distance to the nearest, which is zero at the same colours.
-"""
+"""What a search maximises, over which domain, and what `printable` takes from it: how rough colours are, and how far
+from ink (Sharif et al. 2016, *Accessorize to a Crime*, sections 5.2.2 and 5.2.3). Theirs are sums over pixels, and a
+product of distances to all printable colours; these are means, and the distance to the nearest, which is zero at the
+same colours."""
 
 from __future__ import annotations
 

@@ -1,14 +1,6 @@
-"""Chooses estimators, steps, sample counts and bounces of light by measurement on the scene and the loss at hand.
-
-Which estimator: the one with the least (squared error) x time, error against differences of the same loss. Which step
-and sample count: the cheapest whose gradient has a cosine of at least `GOAL` with the converged one, of the model's
-own loss (docs/gradients.md, "The model's own loss": over poses that loss is rough at the scale of a pixel and sensitive
-to noise).
-
-How many bounces: as many as change the picture. Renders of other path lengths with the same seed draw the same paths,
-cut off earlier, so that their difference is the light of the bounces left out, almost without noise. A search may leave
-out what the eye could not see; a verification leaves out nothing, so that no answer rests on it.
-"""
+"""Chooses estimators (least squared error x time), steps and sample counts (the cheapest with a cosine of `GOAL` with
+the converged gradient of the model's own loss, docs/gradients.md) and bounces of light (as many as change the picture:
+paths of other lengths with one seed are the same, cut off earlier) by measurement on the scene."""
 
 from __future__ import annotations
 

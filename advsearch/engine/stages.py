@@ -1,8 +1,5 @@
-"""The stages of an attack, one after the other: first look, search, random search beside it, verification.
-
-Searches are rendered or predicted, and read back where they are stored. For the smallest change that flips the answer,
-searches and trials take turns, within ever smaller budgets.
-"""
+"""The stages of an attack, one after the other: first look, search, random search beside it, verification. For the
+smallest change that flips the answer, searches and trials take turns, within ever smaller budgets."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
-"""Searches in which cameras move, by light kept on surfaces: cameras are searched, or vary by chance.
-
-Where environments vary by chance, too, they are those of a bank. Before the search, and within it,
-pictures are traced beside predicted ones. Where these are further off than two levels, and than a rendered evaluation's
-own noise, the light is found anew for the present base colours, if these are searched; where that was so the time
-before, too, or before the search, pictures are traced from there on, or predicted by matrices instead.
-"""
+"""Searches in which cameras move, by light kept on surfaces (docs/surface-light.md). Pictures are traced beside
+predicted ones: where these are too far off, the light is found anew for the present base colours, if they are searched;
+the second time in a row pictures are traced from there on, or predicted by matrices."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""Searches over base colours and light by light transport, and how far its pictures are from traced ones.
-
-The evaluations of the search itself are predicted; the renders of the ranking after it and all trials trace paths.
-Every `EVERY` evaluations the present configuration and that of the matrix are traced with one seed: where the change
-between them is predicted wrongly by more than `BOUND`, the matrix is made anew at the present one.
-"""
+"""Searches over base colours and light by light transport, and how far its pictures are from traced ones. Every `EVERY`
+evaluations the change since the matrix was made is traced: where it is predicted wrongly by more than `BOUND`, the
+matrix is made anew. The ranking and all trials trace paths."""
 
 from __future__ import annotations
 

@@ -1,10 +1,7 @@
-"""Why a model is wrong, in words: rows of sweeps as one table, and rules with few conditions that hold in it.
-
-Candidates are the nodes of decision trees (Breiman et al. 1984) on one half of the rows. The best by weighted relative
-accuracy (Lavrac, Flach and Zupan 1999: share of the rows times excess of errors) is made shorter where that costs
-nothing, and what it covers is put aside before the next is sought (sequential covering; Friedman and Fisher 1999). The
-other half of the rows, which no choice has seen, says whether a rule holds.
-"""
+"""Why a model is wrong, in words: rows of sweeps as one table, and rules found on half of it: nodes of decision trees
+(Breiman et al. 1984), the best by weighted relative accuracy (Lavrac, Flach and Zupan 1999), made shorter where that
+costs nothing, one after the other (sequential covering; Friedman and Fisher 1999); the other half says whether a rule
+holds."""
 
 from __future__ import annotations
 

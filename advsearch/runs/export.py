@@ -1,15 +1,6 @@
-"""A run's rows for other programs: as a table (CSV, JSON, Parquet), and as folders of 3DB (Leclerc et al. 2021).
-
-One line for each evaluated configuration, in the order in which they were evaluated. The columns of the store come
-first; then one for each of the run's metrics; then one for each value, with its unit in its name: ``pose.yaw
-[degrees]``. A value of several numbers has a column for each: ``camera.target[0]``. What a task keeps of an answer
-(``payload``) is nested in JSON and a JSON text in the others. What a row has not is empty.
-
-3DB writes, and its dashboard reads: `details.log`, where each line is a JSON object: ``id``, ``environment``, ``model``
-(there the object), ``is_correct`` as "True" or "False", ``prediction`` (classes by number, the best first), ``loss``,
-``output_type`` and ``render_args`` with the parameters; `class_maps.json` with the classes' names; and pictures
-``images/<id>_rgb.png``.
-"""
+"""A run's rows for other programs: as a table (CSV, JSON, Parquet), a line for each, with a column for each metric and
+each value, its unit in the name: ``pose.yaw [degrees]``, ``camera.target[0]`` (docs/runs.md); and as folders of 3DB
+(Leclerc et al. 2021): `details.log`, a JSON object a line, `class_maps.json`, and ``images/<id>_rgb.png``."""
 
 from __future__ import annotations
 

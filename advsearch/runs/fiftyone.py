@@ -1,10 +1,6 @@
-"""Datasets as FiftyOne stores them, so that `fiftyone.Dataset.from_dir` imports them as they are.
-
-A folder of its type `FiftyOneDataset` (fiftyone/utils/data/importers.py): `metadata.json` describes the fields,
-`samples.json` holds the samples with the paths of their media, `data/` the media, and `fields/NAME/` the files of a
-field. All of it is JSON with MongoDB's words for identities (``{"$oid": ...}``). A version is part of it, from which a
-newer FiftyOne migrates; an older one than that refuses it.
-"""
+"""Datasets as FiftyOne stores them (its `FiftyOneDataset`, fiftyone/utils/data/importers.py), so that
+`fiftyone.Dataset.from_dir` imports them as they are: JSON with MongoDB's words for identities, and a version from which
+a newer FiftyOne migrates."""
 
 from __future__ import annotations
 

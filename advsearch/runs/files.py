@@ -1,10 +1,6 @@
-"""The files of a run: written whole or not at all, held by one process, and among them that of `results.sqlite`.
-
-A kill of the process never leaves a part of a file under its name. A power cut may empty a picture or the report that
-was written in the last half minute (they can be made again); `run.yaml` and `summary.json` are on the disk when their
-writer returns. What keeps a run to one process is an advisory lock that the kernel drops when the process ends, however
-it ends. Of `results.sqlite`: its tables, how it is opened, and how an older one is brought up to date.
-"""
+"""The files of a run: written whole or not at all, also in a kill (a power cut may empty what can be made again), held
+by one process through a lock that the kernel drops when it ends; and `results.sqlite`: its tables, how it is opened,
+and how an older one is brought up to date."""
 
 from __future__ import annotations
 

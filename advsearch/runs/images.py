@@ -1,8 +1,5 @@
-"""Pictures of a run as files: 8-bit PNG, linear EXR, an animation of the search.
-
-Pictures come as (H, W, 3) or (H, W) arrays, of numpy or torch. A PNG holds display-referred (sRGB) values in [0, 1],
-rounded as verification rounds them, so that the file is exactly what was classified. An EXR holds the values it is
-given as float32.
+"""Pictures of a run, (H, W, 3) or (H, W), of numpy or torch, as files: 8-bit PNG of sRGB values, rounded as
+verification rounds them, so that the file is exactly what was classified; EXR in float32; an animation of the search.
 """
 
 from __future__ import annotations

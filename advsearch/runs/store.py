@@ -1,10 +1,6 @@
-"""`results.sqlite`: every evaluated configuration of a run.
-
-What survives: when `Store.append` returns, its rows are handed to the operating system (write-ahead log), so that
-killing the process loses nothing. A power cut loses at most the rows written within a second after the last one known
-to be on the disk, and never damages the file: `append` forces the log to the disk when the last time is a second ago
-(on a slow disk, so long ago that this takes 2 % of the time).
-"""
+"""`results.sqlite`: every evaluated configuration of a run. Rows survive a kill when `Store.append` returns
+(write-ahead log); a power cut loses at most those of a second (on a slow disk more, so that forcing takes 2 % of the
+time)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
-"""The answer of a run: `summary.json` as plain JSON (docs/design.md, "summary.json"), and `artifacts/answer.npy`.
-
-The latter is the configuration that a run answers with, so that it can be rendered again elsewhere. And what a run is
-made with: versions, and digests of the files that its settings name, kept as a note in its store.
-"""
+"""The answer of a run: `summary.json` (docs/design.md), and `artifacts/answer.npy`, the configuration, so that it can
+be rendered again elsewhere. And what a run is made with: versions, and digests of the files that its settings name."""
 
 from __future__ import annotations
 

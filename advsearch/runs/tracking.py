@@ -1,10 +1,5 @@
-"""What is evaluated, told to MLflow, TensorBoard or Weights & Biases through their own packages, when asked.
-
-Each of them gets the settings of the run and, whenever rows are kept, the mean of their numbers by kind: exact for a
-search, which keeps its rows one by one; of a batch for a sweep, with the accuracy so far. A thread of its own tells it,
-so that neither a slow network nor one that fails holds up the run: after the first failure nothing more is told, and a
-line of the log `advsearch` says so.
-"""
+"""What is evaluated, told to MLflow, TensorBoard or Weights & Biases: settings, and the mean numbers of rows by kind. A
+thread of its own tells it, so that neither a slow network nor one that fails holds up the run."""
 
 from __future__ import annotations
 

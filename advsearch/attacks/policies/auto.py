@@ -1,8 +1,5 @@
-"""The policy to use first, and what wraps others: several policies on one budget, or several starts of one.
-
-`auto` looks everywhere, then where a model of what it has seen promises most, then uphill. Of several policies, what
-does better gets more of the budget.
-"""
+"""The policy to use first (it looks everywhere, then where a model of what it has seen promises most, then uphill), and
+what wraps others: several policies on one budget, or several starts of one."""
 
 from __future__ import annotations
 

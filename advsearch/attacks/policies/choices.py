@@ -1,16 +1,7 @@
-"""Discrete choices around a policy that knows only numbers: options outside, the continuous search inside.
-
-Searches race by successive halving: after each round the better half goes on. Rounds get equal shares of the renders,
-and within a round every search that is still in gets an equal share. They take turns, step by step: next comes whoever
-has most of its share left, so that steps of different searches, which do not wait for each other, can be evaluated
-together. After a round the half that has reached more goes on. With n searches there are 1 + ceil(log2 n) rounds, the
-last for one alone, so it gets many times the renders of those that fell first (Karnin, Koren and Somekh 2013, "Almost
-optimal exploration in multi-armed bandits"; Jamieson and Talwalkar 2016). With one round for all, each gets the same.
-What is left of the renders after the last round is for the best.
-
-A share counts what a proposal may cost, so that the order does not depend on how many are evaluated at once; where one
-costs less, the rounds to come get what is left.
-"""
+"""Discrete choices around a policy that knows only numbers: options outside, the continuous search inside. Searches
+race by successive halving (Karnin, Koren and Somekh 2013, "Almost optimal exploration in multi-armed bandits"; Jamieson
+and Talwalkar 2016): 1 + ceil(log2 n) rounds with equal shares of the renders, and within a round equal shares for all
+that are still in, who take turns, whoever has most left first. A share counts what a proposal may cost."""
 
 from __future__ import annotations
 

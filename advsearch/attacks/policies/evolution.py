@@ -1,8 +1,5 @@
-"""Evolution strategies, without gradients: one of independent elements, and covariance matrix adaptation.
-
-A natural evolution strategy follows the gradient of the expected objective; covariance matrix adaptation learns where
-to look from ranks alone.
-"""
+"""Evolution strategies, without gradients: a natural one of independent elements, which follows the gradient of the
+expected objective, and covariance matrix adaptation, which learns where to look from ranks alone."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
-"""Ascents along gradients: projected gradient ascent with momentum, and Adam with projection.
-
-A gradient through a renderer has finite mean and, at times, no useful variance: one path in ten thousand may outweigh
-all others. Averages then follow the outliers. So what is far out of the usual is cut to the edge of it: clipping (Zhang
-et al. 2020, Why are adaptive methods good for attention models?) bounds them at the price of a bias, which the
-stability suite measures.
-"""
+"""Ascents along gradients: projected gradient ascent with momentum, and Adam with projection. A gradient through a
+renderer has at times no useful variance, so outliers are cut to what is usual (Zhang et al. 2020, Why are adaptive
+methods good for attention models?), at the price of a bias."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""Policies that look without learning: random search, quasi-random search, and a regular grid.
-
-Random search is the baseline that every worst-case claim is measured against (docs/design.md, "The search").
-Quasi-random points fill the domain more evenly than independent ones. A grid is a full factorial over a few numbers,
-as fine as the renders allow.
-"""
+"""Policies that look without learning: random search, the baseline of every worst-case claim; quasi-random points,
+which fill the domain more evenly; and a grid, as fine as the renders allow."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
-"""A Gaussian process over a few coordinates: what a handful of noisy renders say about the rest of the box.
-
-Matérn-5/2 kernel, one length for each coordinate, and a noise that stands for the renderer's and for all roughness
-finer than the points tell apart. Everything is fitted by maximum likelihood over fixed grids and every proposal is one
-of a finite set of candidates, so that the last bits of a matrix factorisation do not change an answer. The coordinates
-are the box blocks of a domain as one small unit box: poses, cameras, lights, choices; everything but the norm balls.
-"""
+"""A Gaussian process (Matérn-5/2, a length for each coordinate, noise) over the box blocks of a domain as one unit box.
+All is fitted by maximum likelihood over fixed grids, and every proposal is one of finitely many, so that last bits of a
+factorisation do not change an answer."""
 
 from __future__ import annotations
 

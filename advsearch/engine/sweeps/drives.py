@@ -1,8 +1,6 @@
-"""Drives: what a sweep over the frames of a path says of whole drives, and the pictures of the worst of them.
-
-A drive is everything that varies but the time: one point of the rest of the grid, one draw. Frames of a drive are not
-independent, so intervals are over drives (a bootstrap of their mean, Efron and Tibshirani 1993, section 13.3).
-"""
+"""Drives: what a sweep over the frames of a path says of whole drives, everything that varies but the time, and the
+worst of them. Frames are not independent, so intervals are over drives (a bootstrap, Efron and Tibshirani 1993, section
+13.3)."""
 
 from __future__ import annotations
 

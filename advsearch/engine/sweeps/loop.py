@@ -1,11 +1,7 @@
-"""The loop of a sweep: ask about every configuration, store and count what is answered, sum it up.
-
-Configurations are numbered: scenes (object, environment; beside an answer first all without it), then the grid with its
-last axis fastest, then the draws of a point of the grid, then the models. Models are shown the same pictures, so that
-they can be compared, and one is rendered once. A batch begins at a multiple of its size and is stored in one
-transaction, each row in the place of its number, so that a sweep that was stopped, or whose batches come in another
-order, ends bit for bit as one that was not.
-"""
+"""The loop of a sweep: ask about every configuration, store and count what is answered, sum it up. They are numbered:
+scenes (beside an answer first all without it), then the grid with its last axis fastest, then draws, then models; a
+batch begins at a multiple of its size, so that a sweep that was stopped, or whose batches come in another order, ends
+bit for bit as any other."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept.
-
-Within a scene, pictures are numbered along the grid, and the draws of one point of the grid follow each other. Every
-picture of a sweep has a draw of its own, also where the grid is the same, so that pictures are independent; only what
-is compared in pairs, without an answer and with it, has the same ones.
-"""
+"""From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept. Every
+picture has a draw of its own, so that pictures are independent; only pairs without and with an answer have the same
+ones."""
 
 from __future__ import annotations
 

@@ -1,13 +1,6 @@
-"""What predicts pictures of a sweep: of neighbours that have most things in common, once that pays.
-
-Pictures that have everything in common but what a prediction follows are a *group*. What predicts them is found for
-each group by itself, and depends on the group alone, so that a sweep that was stopped goes on with the same. Some
-pictures of each group are traced beside; where predicted ones are too far off, the group is rendered.
-
-Where the camera alone differs, that is light on surfaces (docs/surface-light.md): a group is a pose and an environment,
-say, seen by all of its cameras. Groups in which object and surroundings stand the same have one arrangement, and each
-has light of its own.
-"""
+"""What predicts pictures of a sweep, for each *group* of pictures that have the rest in common, and by the group alone,
+so that a sweep that was stopped goes on with the same. Some are traced beside; where predicted ones are too far off,
+the group is rendered. Where the camera alone differs, that is light on surfaces (docs/surface-light.md)."""
 
 from __future__ import annotations
 

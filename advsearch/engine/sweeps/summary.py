@@ -1,8 +1,5 @@
-"""Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its answer as Python has it.
-
-The memory that counting takes does not grow, but for a byte a configuration where pairs are compared. Sweeps that
-another program made are read into a run here, too.
-"""
+"""Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its answer as Python has it; sweeps
+that another program made are read into a run here, too. The memory that counting takes hardly grows."""
 
 from __future__ import annotations
 

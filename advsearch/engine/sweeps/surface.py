@@ -1,15 +1,7 @@
-"""Which parts of an object's surface, when seen, go with wrong answers (docs/sweeps.md, "The surface").
-
-It comes from the rows of a sweep that has ended and from what each of its pictures sees first, without noise: another
-pass over the same rows says the same, whether the sweep was stopped on the way or not.
-
-Whether answers are wrong more often where a part is seen: the interval of a difference is Newcombe's (1998, "Interval
-estimation for the difference between independent proportions", Statistics in Medicine 17, method 10), made of Wilson's
-score intervals (1927). How likely it is by chance comes from sharing the wrong answers out among the pictures anew: a
-part is compared with the part that stands out most each time, so that looking at many parts at once is accounted for,
-and that neighbours are seen together (Westfall and Young 1993, "Resampling-Based Multiple Testing", the single-step
-maximum). How far a part stands out is said by the likelihood-ratio statistic of its two shares.
-"""
+"""Which parts of an object's surface, when seen, go with wrong answers (docs/sweeps.md, "The surface"): the interval of
+a difference is Newcombe's (1998, Statistics in Medicine 17, method 10) of Wilson's (1927); what is chance comes from
+sharing the wrong answers out anew, each time with the part that stands out most (Westfall and Young 1993, the
+single-step maximum) by the likelihood ratio."""
 
 from __future__ import annotations
 

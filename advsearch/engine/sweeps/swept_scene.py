@@ -1,14 +1,6 @@
-"""The scenes of a sweep: each answers queries about its pictures, rendered or predicted, by all models of the sweep.
-
-What comes of a query depends on it and on the job alone, so it may be answered anywhere, in whatever company.
-
-Pictures that differ in light alone are put together from basis pictures, once these pay (docs/transport.md). A group
-is a pose, say, under all of its light, and has basis pictures of its own.
-
-The worst configuration is checked again: fresh seeds, enough samples, 8 bits. A sweep has no clean configuration, so
-there is no control group: a trial counts where the model is wrong. Its place in the answer: docs/sweeps.md, "What it
-says".
-"""
+"""The scenes of a sweep: each answers queries by all models, rendered or predicted, which depends on query and job
+alone, so that anybody may. Pictures that differ in light alone are put together from basis pictures, once these pay
+(docs/transport.md). And the worst configuration, checked again (docs/sweeps.md, "What it says")."""
 
 from __future__ import annotations
 
