@@ -31,9 +31,12 @@ threads.configure()
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.controls import Space  # noqa: E402
 from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
-from advsearch.engine.sweeps import swept_scene  # noqa: E402
+from advsearch.engine.sweeps import (  # noqa: E402
+    Job,
+    NamedScene,
+    swept_scene,
+)
 from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
-from advsearch.engine.sweeps.job import Job, NamedScene  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402

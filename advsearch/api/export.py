@@ -27,7 +27,7 @@ from advsearch.controls.texture import TextureControl
 from advsearch.engine.attack_parts import judged_alone, problem_from_config
 from advsearch.engine.loading import as_controls, load_scene
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import kept_answer
+from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run

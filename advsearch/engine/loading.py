@@ -272,9 +272,6 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
     """Return settings by name, as a file holds them, for controls in whatever form they were given.
 
     Of a control that was given by its name it is what was said about it; of an instance, all of it.
-
-    Raises:
-        InputError: not controls at all, or two of one name.
     """
     asked = controls_by_name(controls)
     if not isinstance(controls, Mapping):
@@ -283,12 +280,7 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
 
 
 def as_controls(controls: Controls) -> tuple[Control, ...]:
-    """Return control instances for whatever form they were given in, in the order in which they were given.
-
-    Raises:
-        UnknownNameError: a name is not a control.
-        InputError: not controls at all, or two of one name.
-    """
+    """Return control instances for whatever form they were given in, in the order in which they were given."""
     asked = controls_by_name(controls)
     ready = {name: one for name, one in asked.items() if isinstance(one, Control)}
     named = gathered({name: {} if isinstance(one, Control) else one for name, one in asked.items()})
@@ -299,11 +291,7 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
 
 
 def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
-    """Return instances and settings by name, in the order in which they were given.
-
-    Raises:
-        InputError: not controls at all, two of one name, or an instance under another name than its own.
-    """
+    """Return instances and settings by name, in the order in which they were given."""
     if isinstance(controls, Mapping):
         asked = dict(controls)
         for name, one in asked.items():
@@ -350,12 +338,7 @@ _LENT: ContextVar[Mapping[tuple[str, str], Any]] = ContextVar("lent", default=Ma
 
 
 def lent(kind: str, name: str) -> Any:
-    """Return what stands for a name where only names are told; None if nothing does.
-
-    Args:
-        kind: `CONTROL`, `SCENE` or `MODEL`.
-        name: as settings have it.
-    """
+    """Return what stands for a name where only names are told; None if nothing does."""
     return _LENT.get().get((kind, name))
 
 

@@ -127,8 +127,8 @@ def load_blend(path: Path) -> None:
 
 def load_threedb(path: Path) -> None:
     """Read a folder of 3DB as `import-3db` does."""
-    from advsearch.engine.sweeps.imported import read_picture
-    from advsearch.runs.threedb import read_threedb
+    from advsearch.engine.sweeps.summary import read_picture
+    from advsearch.runs.export import read_threedb
 
     for one in read_threedb(path.parent):
         if one.picture is not None:

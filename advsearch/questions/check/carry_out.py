@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
 from advsearch.controls import CONTROLS
-from advsearch.engine import run_settings
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import (
     FACTORS,
@@ -27,8 +26,7 @@ from advsearch.engine.gradients import (
     smooth_loss,
 )
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
-from advsearch.engine.naming import AnyModel
+from advsearch.engine.naming import AnyModel, settings_alone
 from advsearch.engine.planning import (
     CONVERGED,
     COUNTS,
@@ -39,6 +37,7 @@ from advsearch.engine.planning import (
     tuned,
 )
 from advsearch.engine.problem import Problem
+from advsearch.engine.record import Results, kept_rows
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.check.answer import (
     WHOLE,
@@ -195,7 +194,7 @@ def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
                     "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
                     "controls": {control: {}},
                     "label": None,
-                    **run_settings.alone(config, control, {}),
+                    **settings_alone(config, control, {}),
                 }
             )
 

@@ -13,7 +13,7 @@ from advsearch.api.keywords import Named, Names, SampledKeywords, asks, configur
 from advsearch.api.studies import carry_out_part
 from advsearch.attacks import clopper_pearson
 from advsearch.engine.loading import Controls
-from advsearch.engine.sweeps.job import check_all
+from advsearch.engine.sweeps import check_all
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import interruptible

@@ -17,12 +17,11 @@ import numpy as np
 from advsearch import seeds
 from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
-from advsearch.cluster.executor import Executor, InProcess
-from advsearch.engine import run_settings
+from advsearch.cluster import Executor, InProcess
 from advsearch.engine.attack_parts import LOADING, executor_for
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.loading import Controls
-from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name
+from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
 from advsearch.models.imported import split_weights
@@ -173,7 +172,7 @@ def _carry_out(
 ) -> HardenResult:
     begun = time.perf_counter()
     progress.stage(LOADING)
-    run_settings.check(config)
+    check_run_settings(config)
     task = make_task(config.task)
     (loaded, *_), warnings = load_models([model], task, config)
     student = trainable(loaded, config.layers)

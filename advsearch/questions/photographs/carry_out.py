@@ -18,15 +18,13 @@ from advsearch import seeds
 from advsearch.attacks import clopper_pearson
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
-from advsearch.engine.answers import facts_of
 from advsearch.engine.attack_parts import judged_alone, problem_from_config
-from advsearch.engine.metrics import judgements
-from advsearch.engine.naming import load_models, scene_of
-from advsearch.engine.retrial import kept_answer
-from advsearch.engine.rows import judged
-from advsearch.engine.sweeps.job import check_all
+from advsearch.engine.judging import facts_of, judgements
+from advsearch.engine.naming import in_turn, load_models, scene_of
+from advsearch.engine.record import judged
+from advsearch.engine.sweeps import check_all
 from advsearch.engine.sweeps.swept_scene import Scenes
-from advsearch.engine.turn import in_turn
+from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model

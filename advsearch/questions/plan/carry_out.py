@@ -12,7 +12,6 @@ from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, conf
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import inside
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import (
     GOAL,
@@ -25,6 +24,7 @@ from advsearch.engine.planning import (
     tuned,
 )
 from advsearch.engine.problem import Problem
+from advsearch.engine.record import Results, kept_rows
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, GainRow, PlanResult, TexelRow
 from advsearch.questions.plan.leaving_out import measured_gains, most_gradients, resolved_texels

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Literal
 
 from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, Names, asks, configured
 from advsearch.attacks import make_policy
-from advsearch.cluster.executor import Call, Executor
+from advsearch.cluster import Call, Executor
 from advsearch.engine.attack_parts import LOADING, executor_for, problem_from_config
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.problem import Problem
+from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import NullProgress, Progress, Watched, watcher

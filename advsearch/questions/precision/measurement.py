@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Policy
-from advsearch.cluster.executor import Executor
+from advsearch.cluster import Executor
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem

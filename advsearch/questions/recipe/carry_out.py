@@ -18,9 +18,9 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.engine.attack_parts import check_from_config
-from advsearch.engine.sweeps.job import check_all
+from advsearch.engine.sweeps import check_all
 from advsearch.errors import InputError
-from advsearch.explanations.observations import TRIAL, WORKERS, Answered, rows_of
+from advsearch.explanations import TRIAL, WORKERS, Answered, rows_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.recipe.answer import RecipeFigure, RecipePart, RecipeResult

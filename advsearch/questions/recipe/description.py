@@ -19,7 +19,7 @@ from advsearch import seeds
 from advsearch.config import CONFIGS
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.explanations.observations import ANSWER, GROUP, PART, PHOTOGRAPHS
+from advsearch.explanations import ANSWER, GROUP, PART, PHOTOGRAPHS
 from advsearch.questions.recipe.figures import read_options
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Options

@@ -16,15 +16,14 @@ from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import most_at_once
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, problem_from_config
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.outcome import transport_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.sharing import Shared
 from advsearch.engine.surface_light import COMPARED, LIGHTS, SurfaceLight
-from advsearch.engine.sweeps.surface_light import pays_from
+from advsearch.engine.sweeps.predicting import pays_from
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible

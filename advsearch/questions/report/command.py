@@ -189,13 +189,13 @@ def _photos(folder: Path) -> list[Claim]:
 def _made_with(folder: Path) -> dict[str, str]:
     """What the run noted at each sitting; of several that differ, all."""
     # late, so that --help answers at once
-    from advsearch.runs.made_with import NOTE
     from advsearch.runs.store import NAME as STORE
     from advsearch.runs.store import Store
+    from advsearch.runs.summary import MADE_WITH
 
     try:
         with Store(folder / STORE, read_only=True) as store:
-            noted: Any = json.loads(store.note(NOTE) or "[]")
+            noted: Any = json.loads(store.note(MADE_WITH) or "[]")
     except (AdvsearchError, ValueError):
         return {}
     facts: dict[str, dict[str, None]] = {}

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations.observations import PHOTOGRAPHS, Answered
+from advsearch.explanations import PHOTOGRAPHS, Answered
 from advsearch.questions.recipe.answer import AgreementCount, AgreementFigure, AgreementSeries
 from advsearch.questions.recipe.figures.along import COLOURS, MARKS
 from advsearch.questions.recipe.table import FigureKind, Options, Table, count_of, rate_with_interval

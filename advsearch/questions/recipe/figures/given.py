@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.explanations.observations import Answered
+from advsearch.explanations import Answered
 from advsearch.questions.recipe.answer import AnswersFigure, AnswersRow, CuesFigure, CuesRow, GivenAnswer, NamedCount
 from advsearch.questions.recipe.table import (
     FigureKind,
