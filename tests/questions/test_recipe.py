@@ -21,13 +21,12 @@ from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe import carry_out as carrying_out
-from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult
+from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult, figure_table, told_once
 from advsearch.questions.recipe.description import Recipe, check_figures, planned, read_recipe, recipe_names, titles
 from advsearch.questions.recipe.figures import FIGURES, accuracy, compute, draw_figure, read_options
 from advsearch.questions.recipe.figures.given import fitting
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, count_of
-from advsearch.questions.recipe.words import figure_table, told_once
 from advsearch.runs.images import write_png
 from advsearch.runs.results.attack import AnswerDistribution, FoundValue
 from advsearch.runs.results.sweep import SurfaceMap

@@ -118,10 +118,6 @@ def attack(
         run: folder to keep the run in; None keeps it in memory only.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
     task = make_task(task) if callable(task) else task

@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from advsearch.files import JsonObject
+from advsearch.questions.attack.answer import answered_text, failures_part, failures_text, range_text
 from advsearch.questions.attack.method import PLAN_HEADS, method_facts, plan_rows, plan_text
-from advsearch.questions.attack.words import answered_text, failures_part, failures_text, range_text
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.markup import Html, element, join_html

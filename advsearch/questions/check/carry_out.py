@@ -92,18 +92,7 @@ def check(
     progress: Watched = None,
     **settings: Unpack[CheckKeywords],
 ) -> CheckResult:
-    """Compare the gradient of every parameter of a scene with differences (docs/gradients.md).
-
-    All other arguments are the settings of `advsearch check`. The run is kept, in `run` or under runs/.
-
-    Args:
-        object: from `load_scene`, or the name of an object, or a file of one.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Compare the gradient of every parameter of a scene with differences (docs/gradients.md)."""
     config = configured(CheckConfig, object=object, model=model, **settings)
     return check_from_config(config, progress=watcher(progress))
 

@@ -64,10 +64,6 @@ def compare(
     Args:
         compared: names or folders of runs of `sweep`: one of several models, or several of the same draws. With
             `object`, names of models, which are shown it first.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     return compare_from_config(configured(CompareConfig, compared=compared, **settings), progress=watcher(progress))
 

@@ -62,15 +62,9 @@ def explain(
 ) -> ExplainResult:
     """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
 
-    All other arguments are the settings of `advsearch explain`. The run is kept, in `run` or under runs/.
-
     Args:
         sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
             recipe, its sweeps.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=watcher(progress))
 

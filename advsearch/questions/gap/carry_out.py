@@ -28,15 +28,8 @@ def gap(
 ) -> GapResult:
     """Compare the worst configuration with the average, for each object and each control (docs/questions.md).
 
-    All other arguments are the settings of `advsearch gap`. The run is kept, in `run` or under runs/.
-
     Args:
         object: from `load_scene`, or names of objects, or files of them, separated by commas.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(GapConfig, object=object, model=model, **settings)
     return gap_from_config(config, progress=watcher(progress))

@@ -28,7 +28,7 @@ from advsearch.interrupts import interruptible
 from advsearch.models.imported import split_weights
 from advsearch.models.trainable import Trainable, trainable
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.harden.answer import HardenedControl, HardenResult, Share, SplitSide
+from advsearch.questions.harden.answer import HardenedControl, HardenResult, Share, SplitSide, hardened_figure
 from advsearch.questions.harden.lessons import FOLDER, Lesson
 from advsearch.questions.harden.scenes import (
     CLEAN_SCENES,
@@ -58,7 +58,6 @@ from advsearch.questions.harden.training import (
     TrainingRounds,
     right_share,
 )
-from advsearch.questions.harden.words import hardened_figure
 from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import SharedWork
@@ -143,10 +142,6 @@ def harden(
             (N,). One is taken with each step.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     if not isinstance(model, (str, Path)):
         check_not_spread(settings)

@@ -57,18 +57,7 @@ def plan(
     progress: Watched = None,
     **settings: Unpack[PlanKeywords],
 ) -> PlanResult:
-    """Choose how every derivative of a search is obtained and what is left out, by measurement (docs/gradients.md).
-
-    All other arguments are the settings of `advsearch plan`. The run is kept, in `run` or under runs/.
-
-    Args:
-        object: from `load_scene`, or the name of an object, or a file of one.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Choose how every derivative of a search is obtained and what is left out, by measurement (docs/gradients.md)."""
     config = configured(PlanConfig, object=object, model=model, **settings)
     return plan_from_config(config, progress=watcher(progress))
 

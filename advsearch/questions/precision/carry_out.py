@@ -70,18 +70,7 @@ def precision(
     progress: Watched = None,
     **settings: Unpack[PrecisionKeywords],
 ) -> PrecisionResult:
-    """Measure error against run time of a scene, its gradients and searches over it (docs/precision.md).
-
-    All other arguments are the settings of `advsearch precision`. The run is kept, in `run` or under runs/.
-
-    Args:
-        object: from `load_scene`, or the name of an object, or a file of one.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Measure error against run time of a scene, its gradients and searches over it (docs/precision.md)."""
     config = configured(PrecisionConfig, object=object, model=model, **settings)
     return precision_from_config(config, progress=watcher(progress))
 

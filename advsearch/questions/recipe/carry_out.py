@@ -89,14 +89,8 @@ NOTE = "recipe"
 def recipe(recipe: str | Path, *, progress: Watched = None, **settings: Unpack[RecipeKeywords]) -> RecipeResult:
     """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
 
-    All other arguments are the settings of `advsearch recipe`. The run is kept, in `run` or under runs/.
-
     Args:
         recipe: the name of a bundled recipe, or a YAML file.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=watcher(progress))
 

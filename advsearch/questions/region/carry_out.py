@@ -29,10 +29,9 @@ from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult
+from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult, map_figure
 from advsearch.questions.region.growing import ATTEMPTS, MOST_PROBED, USUAL, GrownBox, grow
 from advsearch.questions.region.settings import RegionConfig
-from advsearch.questions.region.words import map_figure
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
@@ -87,18 +86,7 @@ def region(
     progress: Watched = None,
     **settings: Unpack[RegionKeywords],
 ) -> RegionResult:
-    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md).
-
-    All other arguments are the settings of `advsearch region`. The run is kept, in `run` or under runs/.
-
-    Args:
-        object: from `load_scene`, or the name of an object, or a file of one.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md)."""
     config = configured(RegionConfig, object=object, model=model, **settings)
     return region_from_config(config, progress=watcher(progress))
 

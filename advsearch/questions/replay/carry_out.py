@@ -191,14 +191,8 @@ def replay(
 ) -> ReplayResult:
     """Render the answer of a run under other conditions, each beside the clean scene (docs/questions.md).
 
-    All other arguments are the settings of `advsearch replay`. The run is kept, in `run` or under runs/.
-
     Args:
         answer: of an attack that was kept and has ended: its result, or name or folder of its run.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     if not isinstance(answer, AttackResult):
         return replay_from_config(configured(ReplayConfig, answer=answer, **settings), progress=watcher(progress))

@@ -40,7 +40,7 @@ def claims_of(result: Result) -> list[Claim]:
     if result.goes_on:
         told = f"; so far: {result.brief}" if result.brief else ""
         return [nothing_claimed(f"the run was stopped before its end{told}")]
-    if own := rooms.in_room(result.command, "words", "claims"):
+    if own := rooms.in_room(result.command, "answer", "claims"):
         return list(own(result)) or [nothing_claimed("nothing in this run came to its end")]
     return [nothing_claimed(f"the command {result.command} measures something else than how often a model is right")]
 

@@ -16,8 +16,7 @@ from advsearch.engine.measuring import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.test import words
-from advsearch.questions.test.answer import FAILED, UNDECIDED, ClaimAnswer, SuiteResult, verdict
+from advsearch.questions.test.answer import FAILED, NOT_TRIED, STOPPED, TIME_OVER, UNDECIDED, ClaimAnswer, SuiteResult, statement, verdict
 from advsearch.questions.test.claims import Trial
 from advsearch.questions.test.counterexamples import (
     Counterexample,
@@ -137,11 +136,11 @@ class _SuiteRun:
                         self.trial.run.write_summary(self.result(INTERRUPTED, seconds, None))  # what a kill leaves
         except KeyboardInterrupt:
             for one in self.planned[len(self.answers) :]:
-                self._add(one, self._not_tried(one, words.STOPPED))
+                self._add(one, self._not_tried(one, STOPPED))
             return INTERRUPTED
-        if any(one.reason == words.NOT_TRIED for one in self.answers):
+        if any(one.reason == NOT_TRIED for one in self.answers):
             self.trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
-        return OUT_OF_TIME if any(words.TIME_OVER in one.reason for one in self.answers) else "done"
+        return OUT_OF_TIME if any(TIME_OVER in one.reason for one in self.answers) else "done"
 
     def _tried(self, one: PlannedClaim, results: Results) -> ClaimAnswer:
         """What a claim says; what is decided, or has used its pictures, is stored."""
@@ -150,23 +149,23 @@ class _SuiteRun:
             return ClaimAnswer.of(stored)
         failed = [known for known in self.answers if known.kind == "counterexample" and not known.accepted]
         if failed and one.one is None and not self.config.all:
-            return self._not_tried(one, words.NOT_TRIED)
+            return self._not_tried(one, NOT_TRIED)
         if self.trial.late():
-            return self._not_tried(one, f"{words.TIME_OVER} before it began")
+            return self._not_tried(one, f"{TIME_OVER} before it began")
         if one.one is None:
             found = self.trial.claim(one.name, self.suite.claims[one.name], one.config)
         else:
             assert isinstance(one.config, AttackConfig)
             found = self.trial.counterexample(one.one, one.config)
-        if words.TIME_OVER not in found.reason and found.reason != words.STOPPED:
+        if TIME_OVER not in found.reason and found.reason != STOPPED:
             results.put(key, found.to_dict())
-        if found.reason == words.STOPPED:
+        if found.reason == STOPPED:
             raise KeyboardInterrupt
         return found
 
     def _not_tried(self, one: PlannedClaim, reason: str) -> ClaimAnswer:
         claim = self.suite.claims.get(one.name)
-        said = "" if claim is None or one.one is not None else words.statement(claim, one.config)
+        said = "" if claim is None or one.one is not None else statement(claim, one.config)
         return ClaimAnswer(name=one.name, kind=one.kind, statement=said, answer=UNDECIDED, reason=reason)
 
     def _add(self, one: PlannedClaim, found: ClaimAnswer) -> None:
@@ -182,7 +181,7 @@ class _SuiteRun:
         changes: list[str] = []
         answers = self.answers
         if self.config.update and ending == "done":
-            now = {one.name: one.answer for one in answers if words.NOT_TRIED not in one.reason}
+            now = {one.name: one.answer for one in answers if NOT_TRIED not in one.reason}
             changes = write_expected(self.config.suite, now)
             answers = [one.model_copy(update={"expected": now.get(one.name, one.expected)}) for one in answers]
         return SuiteResult(

@@ -25,8 +25,7 @@ from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.verifier import ladder_of
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.questions.test import words
-from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer
+from advsearch.questions.test.answer import FAILED, HELD, TIME_OVER, UNDECIDED, ClaimAnswer, difference_reason, right_reason, search_answer, statement, tried_reason
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
 from advsearch.questions.test.settings import AnyClaim, DrawnConfig, NoWorseClaim, RightClaim
 from advsearch.report.wording import number_text
@@ -71,7 +70,7 @@ class Trial:
         """Try a claim; what was asked before is read back."""
         begun = time.perf_counter()
         asked = ClaimAnswer(
-            name=name, kind=claim.claim, statement=words.statement(claim, config), answer=UNDECIDED, reason=""
+            name=name, kind=claim.claim, statement=statement(claim, config), answer=UNDECIDED, reason=""
         )
         if isinstance(claim, RightClaim):
             found = self._right(asked, claim, config)
@@ -108,7 +107,7 @@ class Trial:
             _, query, label = wrong[0]
             worst = f"most wrong where it says {label}: {self._described(problem, query)}"
             picture = self._picture(asked.name, problem, query)
-        reason = words.right_reason(answer, right, sequence.count, sequence.interval, worst)
+        reason = right_reason(answer, right, sequence.count, sequence.interval, worst)
         return self._decided(asked, answer, reason, sequence, config, picture, (0.0, 1.0))
 
     # ---- two models -------------------------------------------------------------------------------------------------
@@ -156,7 +155,7 @@ class Trial:
                     break
         low, high = sequence.interval
         counts = (sequence.count, ours, theirs)
-        reason = words.difference_reason(answer, counts, (2 * low - 1, 2 * high - 1), claim.than)
+        reason = difference_reason(answer, counts, (2 * low - 1, 2 * high - 1), claim.than)
         picture = None if first is None else self._picture(asked.name, problem, first)
         return self._decided(asked, answer, reason, sequence, config, picture, (-1.0, 2.0))
 
@@ -175,7 +174,7 @@ class Trial:
         summary = carry_out_part(path, own, self.progress)
         assert isinstance(summary, AttackSummary)
         self.warnings += summary.warnings
-        answer, reason = words.search_answer(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
+        answer, reason = search_answer(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
         shown = "clean" if summary.ending == "already wrong" else "adversarial"
         file = f"{PARTS}/{asked.name}/{IMAGES}/{shown}.png"
         return asked.model_copy(
@@ -219,9 +218,9 @@ class Trial:
                 label, picture = evaluation.said.answer.label, self._picture(one.name, problem, query)
             if 0 < right < tried:
                 break  # it depends on the noise, whatever comes
-        answer, reason = words.tried_reason(right, tried - right, label)
+        answer, reason = tried_reason(right, tried - right, label)
         if tried < count and not 0 < right < tried:
-            answer, reason = UNDECIDED, words.TIME_OVER
+            answer, reason = UNDECIDED, TIME_OVER
         return asked.model_copy(
             update={
                 "answer": answer,
@@ -282,7 +281,7 @@ class Trial:
     ) -> ClaimAnswer:
         """What drawn pictures say; `scale` has the value of a mean of 0, and how much more that of 1 is."""
         if answer == UNDECIDED and self.late():
-            reason = f"{reason}; {words.TIME_OVER}"
+            reason = f"{reason}; {TIME_OVER}"
         begin, wide = scale
         low, high = sequence.interval
         return asked.model_copy(

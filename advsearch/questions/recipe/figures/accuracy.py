@@ -19,6 +19,7 @@ from advsearch.questions.recipe.answer import (
     PointsFigure,
     SurfaceFigure,
     SurfaceOf,
+    bare,
 )
 from advsearch.questions.recipe.figures.along import COLOURS, MARKS
 from advsearch.questions.recipe.table import (
@@ -32,7 +33,6 @@ from advsearch.questions.recipe.table import (
     plural,
     rate_with_interval,
 )
-from advsearch.questions.recipe.words import bare
 from advsearch.report.figures import BLUE
 from advsearch.report.sweeps import surface_sentences
 from advsearch.runs.directory import IMAGES, PARTS

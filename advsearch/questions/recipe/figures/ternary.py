@@ -11,9 +11,8 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.explanations.observations import Answered
-from advsearch.questions.recipe.answer import MixtureLead, TernaryAnswer, TernaryCell, TernaryFigure
+from advsearch.questions.recipe.answer import MixtureLead, TernaryAnswer, TernaryCell, TernaryFigure, bare
 from advsearch.questions.recipe.table import CONFIDENCE, FigureKind, Options, Table, count_of, extremes, most_frequent
-from advsearch.questions.recipe.words import bare
 from advsearch.report.phrases import percent
 
 Shares = tuple[float, float, float]

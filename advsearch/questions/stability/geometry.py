@@ -13,14 +13,17 @@ from torch import Tensor
 
 from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.questions.stability.scene import (
     BARE,
     SPP,
+    CaseGroup,
+    Check,
     ControlSettings,
+    Outcome,
     compared,
     dark,
     examine_gradient,
+    holds,
     mesh_of,
     search_domain,
     small,
@@ -38,7 +41,7 @@ SAME_PICTURE = 2e-3
 """Mean difference of two pictures that should be one: an 8-bit level is 4e-3."""
 FAR = 1e4
 
-GROUP = CaseGroup("geometry")
+GEOMETRY = CaseGroup("geometry")
 _SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
 _IMPORT = "the import removes faces without area and says so; the renderer never hits one"
 _NORMAL = "the import brings every object to size 1 at the origin, in 64-bit numbers"
@@ -51,7 +54,7 @@ def mesh(made: Mesh) -> Outcome:
     return examine_gradient(small(thing(made), PAINTED, settings=FRONT)).findings()
 
 
-@GROUP.case(
+@GEOMETRY.case(
     "degenerate-triangles",
     "Faces without area change neither the picture nor the gradient.",
     _IMPORT,
@@ -68,16 +71,14 @@ def degenerate() -> Outcome:
         path = Path(folder) / "degenerate.obj"
         path.write_text(text)
         asset = import_object(path)
-    found = mesh(mesh_of(QUAD + line, faces))
-    more = (
+    return mesh(mesh_of(QUAD + line, faces)).with_checks(
         Check("mean difference from the square alone", same, most=SAME_PICTURE),
         Check("faces left after the import", float(len(asset.mesh.faces)), 2.0, 2.0),
         holds("the import says what it removed", any("without area" in note for note in asset.warnings)),
     )
-    return Outcome((*found.checks, *more), found.finite, found.relative_error, found.ending, found.measured)
 
 
-@GROUP.case(
+@GEOMETRY.case(
     "sliver-triangles",
     "A triangle a million times as long as wide leaves everything finite and right.",
     _SCENE,
@@ -89,22 +90,21 @@ def sliver() -> Outcome:
     return mesh(mesh_of([*QUAD, [0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]], [*HALVES, [4, 5, 6]]))
 
 
-@GROUP.case("coincident-faces", "Two faces in one place look like one.", _SCENE, "texture, pose", cheap=False)
+@GEOMETRY.case("coincident-faces", "Two faces in one place look like one.", _SCENE, "texture, pose", cheap=False)
 def coincident() -> Outcome:
     """Two squares in one place: which is hit is chance, but not what the picture is."""
     twice = mesh_of(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]])
-    found = mesh(twice)
-    same = Check("mean difference from one square", _difference(twice, mesh_of(QUAD, HALVES)), most=SAME_PICTURE)
-    return Outcome((*found.checks, same), found.finite, found.relative_error, found.ending, found.measured)
+    apart = _difference(twice, mesh_of(QUAD, HALVES))
+    return mesh(twice).with_checks(Check("mean difference from one square", apart, most=SAME_PICTURE))
 
 
-@GROUP.case("one-triangle", "Finite, and both gradients are right.", _SCENE, "texture, pose", cheap=False)
+@GEOMETRY.case("one-triangle", "Finite, and both gradients are right.", _SCENE, "texture, pose", cheap=False)
 def one_triangle() -> Outcome:
     """A mesh of one triangle."""
     return mesh(mesh_of([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
 
 
-@GROUP.case(
+@GEOMETRY.case(
     "million-triangles",
     "Finite, right, and like the coarse mesh of the same shape.",
     _SCENE,
@@ -134,7 +134,7 @@ def sized(scale: float) -> Outcome:
 
 
 for scale in (0.01, 100.0):
-    GROUP.case(f"scale-{scale:g}", "Picture and gradient are finite.", _SCENE, "pose")(partial(sized, scale))
+    GEOMETRY.case(f"scale-{scale:g}", "Picture and gradient are finite.", _SCENE, "pose")(partial(sized, scale))
 
 
 def file_units(scale: float, shift: float = 0.0) -> Outcome:
@@ -155,10 +155,10 @@ def file_units(scale: float, shift: float = 0.0) -> Outcome:
 
 
 for scale in (0.01, 100.0):
-    GROUP.case(f"file-in-units-of-{scale:g}", "A file in other units gives the same picture.", _NORMAL, "pose")(
+    GEOMETRY.case(f"file-in-units-of-{scale:g}", "A file in other units gives the same picture.", _NORMAL, "pose")(
         partial(file_units, scale)
     )
-GROUP.case(
+GEOMETRY.case(
     "file-10000-sizes-off",
     "A mesh that its file puts 10,000 sizes from the origin gives the same picture.",
     _NORMAL,
@@ -166,7 +166,7 @@ GROUP.case(
 )(partial(file_units, 1.0, FAR))
 
 
-@GROUP.case(
+@GEOMETRY.case(
     "translation-10000",
     "The picture is that of the scene without the object, and the gradient is zero.",
     _SCENE,
@@ -190,21 +190,21 @@ def extreme_view(controls: ControlSettings, u: Sequence[float], *, black: bool =
     return examine_gradient(renderer, torch.tensor(u, dtype=torch.float32), compare=compare).findings()
 
 
-GROUP.case("grazing-view", "Looking along the ground, the gradient by the elevation is right.", _PIXEL, "camera")(
+GEOMETRY.case("grazing-view", "Looking along the ground, the gradient by the elevation is right.", _PIXEL, "camera")(
     partial(extreme_view, {"camera": {"elevation": [-10.0, 10.0]}}, [0.5])
 )
-GROUP.case("near-plane", "With the camera inside the object, picture and gradient are finite.", _SCENE, "camera")(
+GEOMETRY.case("near-plane", "With the camera inside the object, picture and gradient are finite.", _SCENE, "camera")(
     partial(extreme_view, {"camera": {"distance": [0.05, 0.2]}}, [0.5], black=False, compare=False)
 )
-GROUP.case("object-fills-the-frame", "Finite where nothing but the object is seen.", _SCENE, "camera")(
+GEOMETRY.case("object-fills-the-frame", "Finite where nothing but the object is seen.", _SCENE, "camera")(
     partial(extreme_view, {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, [0.5], black=False, compare=False)
 )
-GROUP.case("object-leaves-the-frame", "Half outside, the gradient by the shift is right.", _PIXEL, "pose")(
+GEOMETRY.case("object-leaves-the-frame", "Half outside, the gradient by the shift is right.", _PIXEL, "pose")(
     partial(extreme_view, {"pose": {"x": [0.0, 2.0]}}, [0.5])
 )
 
 
-@GROUP.case(
+@GEOMETRY.case(
     "gimbal-angles",
     "At a pitch of 90 degrees the gradients by angles and by the rotation vector are right.",
     "differences of each number; the rotation vector does not lock",
@@ -248,7 +248,7 @@ def full_turn(controls: ControlSettings) -> Outcome:
 
 
 for name in ("pose.yaw", "camera.azimuth", "environment.rotation"):
-    GROUP.case(
+    GEOMETRY.case(
         f"full-turn-{name.replace('.', '-')}",
         "0 and 360 degrees give one picture and one gradient, and a step goes on across the seam.",
         _WRAP,

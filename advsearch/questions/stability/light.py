@@ -1,10 +1,12 @@
-"""Light that is very strong, absent or impossible, and pictures at the ends of their range."""
+"""Light that is very strong, absent or impossible, pictures and surfaces at the ends of their range."""
 
 from __future__ import annotations
 
 import tempfile
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -14,18 +16,37 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Adam, Auto, Policy, search
 from advsearch.attacks.evaluation import Query
+from advsearch.engine.gradients import smooth_loss
 from advsearch.errors import InputError
-from advsearch.questions.stability.case import CaseGroup, Check, Outcome, holds
-from advsearch.questions.stability.scene import ControlSettings, Evaluator, examine_gradient, search_domain, small
+from advsearch.questions.stability.scene import (
+    ERROR,
+    REFERENCE_SPP,
+    SPP,
+    CaseGroup,
+    Check,
+    ControlSettings,
+    Evaluator,
+    Outcome,
+    examine_gradient,
+    holds,
+    search_domain,
+    small,
+)
+from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Floats
+from advsearch.scene.description import describe
 from advsearch.scene.environments import import_environment
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.mitsuba_backend.parts import Translation, translation
+from advsearch.scene.parts import ScenePart
+from advsearch.scene.renderer import Renderer
 
 BRIGHT = 1e5
 PLATEAU_STEPS = 40
 """Evaluations in which a search has to be off a plateau."""
 POLICIES: tuple[Policy[Any], ...] = (PGD(), Adam(), Auto())
 
-GROUP = CaseGroup("radiometric")
+RADIOMETRIC = CaseGroup("radiometric")
 _SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
 _FLAT = "a zero gradient gives a random step; the fifth in a row ends the search as 'stalled'"
 _REFUSED = "import_environment counts the texels that are not light and refuses the map"
@@ -45,7 +66,7 @@ def grey_map(value: float, texel: float | None = None) -> EnvironmentAsset:
     return EnvironmentAsset("made", _radiance(value, texel))
 
 
-@GROUP.case(
+@RADIOMETRIC.case(
     "hdri-texel-100000",
     "Pictures and gradients are finite, raw and denoised, and gradients are right.",
     _SCENE,
@@ -66,7 +87,7 @@ def bright_texel() -> Outcome:
     )
 
 
-@GROUP.case(
+@RADIOMETRIC.case(
     "black-environment", "The picture is black, the gradient zero, and the search ends as stalled.", _FLAT, "texture"
 )
 def black_environment() -> Outcome:
@@ -83,7 +104,7 @@ def black_environment() -> Outcome:
     )
 
 
-@GROUP.case(
+@RADIOMETRIC.case(
     "lamp-in-the-dark",
     "A lamp lights a scene that has no other light.",
     "the lamp's power is in multiples of the environment's metered light",
@@ -112,13 +133,13 @@ def refused_texel(value: float, *, as_file: bool) -> Outcome:
                 rendered(rendered.start, seed=0, spp=1)
     except InputError as error:
         said = "texels" in str(error) and "\n" not in str(error)
-        return Outcome((holds("refused in a sentence that counts the texels", said),), ending="refused")
-    return Outcome((holds("refused", False),), ending="rendered all the same")
+        return Outcome(holds("refused in a sentence that counts the texels", said), ending="refused")
+    return Outcome(holds("refused", False), ending="rendered all the same")
 
 
 for word, value in (("negative", -1.0), ("infinite", np.inf), ("nan", np.nan)):
     for as_file in (True, False):
-        GROUP.case(
+        RADIOMETRIC.case(
             f"{word}-texel-{'file' if as_file else 'array'}",
             "The map is refused before anything is rendered.",
             _REFUSED if as_file else _ASSET,
@@ -139,7 +160,7 @@ def extreme_exposure(control: str, stops: float) -> Outcome:
 
 for control in ("camera", "environment"):
     for stops in (10.0, -10.0):
-        GROUP.case(
+        RADIOMETRIC.case(
             f"{control}-exposure-{'up' if stops > 0.0 else 'down'}",
             "Picture and gradient are finite; the gradient of the linear picture is right.",
             _SCENE,
@@ -173,18 +194,139 @@ def plateau(low: float, high: float) -> Outcome:
     assert first.gradient is not None
     slope = float(first.gradient.abs().max())
     return Outcome(
-        (Check("gradient at the start", slope, 0.0, 0.0), *checks),
+        Check("gradient at the start", slope, 0.0, 0.0),
+        *checks,
         ending=", ".join(endings),
         measured={"evaluations without a gradient": float(flat)},
     )
 
 
-GROUP.case(
+RADIOMETRIC.case(
     "saturated-plateau",
     f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations.",
     _FLAT,
     "camera",
 )(partial(plateau, -10.0, 10.0))
-GROUP.case("saturated-plateau-narrow-way-out", "The same where the way out is a tenth of the range.", _FLAT, "camera")(
-    partial(plateau, 1.0, 10.0)
+RADIOMETRIC.case(
+    "saturated-plateau-narrow-way-out", "The same where the way out is a tenth of the range.", _FLAT, "camera"
+)(partial(plateau, 1.0, 10.0))
+
+
+MATERIALS = CaseGroup("materials")
+_MOVED = "values are rendered inside the range in which the adjoint is right (metallic at most 0.999)"
+
+
+@dataclass(frozen=True, eq=False)
+class GlassBall(ScenePart):
+    """A ball of clear glass; nothing of it varies.
+
+    Attributes:
+        name: of the part.
+        place: (3,) of its middle.
+        radius: in object sizes.
+    """
+
+    place: tuple[float, float, float]
+    radius: float
+
+
+@translation.register
+def _glass(part: GlassBall) -> Translation:
+    surface = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+    ball = {"type": "sphere", "center": list(part.place), "radius": part.radius, "bsdf": surface}
+    return Translation({part.name: ball})
+
+
+def behind_glass(controls: ControlSettings) -> Renderer:
+    """The mug behind a ball of clear glass, which covers part of it."""
+    camera = camera_to_world(describe("mug"))
+    x, y, z = (float(one) for one in camera[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
+    return small("mug", controls, parts=[GlassBall("glass", (x, y, z), 0.3)])
+
+
+def extreme_surface(searched: dict[str, list[float]], **values: float) -> Outcome:
+    """A surface with some numbers at the ends of their range, and the derivative by some of them there."""
+    settings = {f"material.{name}": value for name, value in values.items()}
+    return examine_gradient(small("mug", {"material": searched}, settings=settings)).findings()
+
+
+MATERIALS.case(
+    "roughness-0",
+    "Finite, and the gradient by the roughness is right, at the polished end.",
+    "Mitsuba's lobe is never narrower than a roughness of 0.03, so the derivative is finite",
+    "material",
+)(partial(extreme_surface, {"roughness": [0.0, 1.0]}, roughness=0.0))
+MATERIALS.case(
+    "roughness-1",
+    "Finite, and the gradient by the roughness is right, at the matt end.",
+    _SCENE,
+    "material",
+    cheap=False,
+)(partial(extreme_surface, {"roughness": [0.0, 1.0]}, roughness=1.0, metallic=1.0))
+MATERIALS.case(
+    "metallic-1",
+    "Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
+    _MOVED,
+    "material",
+    cheap=False,
+)(partial(extreme_surface, {"metallic": [0.0, 1.0]}, metallic=1.0))
+MATERIALS.case(
+    "perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.", _MOVED, "material", cheap=False
+)(partial(extreme_surface, {"roughness": [0.0, 1.0], "metallic": [0.0, 1.0]}, roughness=0.0, metallic=1.0))
+
+
+@MATERIALS.case(
+    "clear-glass",
+    "A texel behind clear glass has the right gradient, and nothing is NaN.",
+    _SCENE,
+    "texture, environment",
+    cheap=False,
 )
+def clear_glass() -> Outcome:
+    """The object behind a ball of clear glass: light bends twice, and a texel still has its gradient."""
+    controls: ControlSettings = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
+    glass = behind_glass(controls)
+    without = small("mug", controls)
+    with torch.no_grad():
+        moved = float((glass(glass.start, 0, 8) - without(without.start, 0, 8)).abs().mean())
+    return examine_gradient(glass).findings(Check("mean change of the picture by the glass", moved, least=0.01))
+
+
+@MATERIALS.case(
+    "texels-0-and-1",
+    "Texels at the ends of the range have a gradient, and the search moves them inwards only.",
+    "the straight piece of the sRGB curve at 0; projection onto the bounds",
+    "texture",
+)
+def texels_at_the_ends() -> Outcome:
+    """A texture of texels that are exactly 0 and exactly 1: the gradient is there, and the search moves inwards."""
+    checks = np.indices((8, 8)).sum(axis=0) % 2
+    texels = np.repeat(checks[:, :, None], 3, axis=2).astype(np.float32)
+    mug = replace(library.load_object("mug"), name="checked", base_color=texels)
+    renderer = small(mug, {"texture": {"resolution": 8, "epsilon": 0.2}})
+    seen = examine_gradient(renderer, compare=False)
+    best = seen.result.best_u
+    error = _inward_error(renderer)
+    return seen.findings(
+        Check("gradient error along a direction that points inwards", error, most=ERROR),
+        Check("smallest texel of the answer", float(best.min()), least=0.0),
+        Check("largest texel of the answer", float(best.max()), most=1.0),
+        Check("texels that the search moved", float((best != renderer.start).sum()), least=1.0),
+        holds("the start has both 0 and 1", set(renderer.start.tolist()) == {0.0, 1.0}),
+        relative_error=error,
+    )
+
+
+def _inward_error(renderer: Renderer, repeats: int = 8, step: float = 0.04) -> float:
+    """Compare the gradient with one-sided differences of second order, since there is no other side at a bound."""
+    renderer.formation = replace(renderer.formation, transfer="linear")
+    loss, u = smooth_loss(renderer.formation.resolution), renderer.start
+    slope = renderer.gradient(loss, u, 0, SPP)[1]
+    inwards = torch.where(u > 0.5, -1.0, 1.0) * (slope * (0.5 - u) > 0.0)
+    found, wanted = [], []
+    for seed in range(repeats):
+        found.append(float(renderer.gradient(loss, u, seed, REFERENCE_SPP)[1] @ inwards))
+        with torch.no_grad():
+            here, near, far = (float(loss(renderer(u + k * step * inwards, seed, REFERENCE_SPP))) for k in range(3))
+        wanted.append((4.0 * near - 3.0 * here - far) / (2.0 * step))
+    return abs(fmean(found) / fmean(wanted) - 1.0)

@@ -7,7 +7,6 @@ each number there: its curvatures, whose ratio (the condition number) is printed
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,25 +17,23 @@ from advsearch.attacks import PGD, Policy, SearchResult, make_policy, search
 from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
 from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.case import (
+from advsearch.questions.stability.scene import (
+    SHARPNESS,
     CaseGroup,
     Check,
+    ControlSettings,
+    Evaluator,
     Outcome,
     Toy,
     Value,
     box_domain,
     condition_number,
+    examine_gradient,
     hessian,
     quadratic,
-    valley,
-)
-from advsearch.questions.stability.scene import (
-    SHARPNESS,
-    ControlSettings,
-    Evaluator,
-    examine_gradient,
     search_domain,
     small,
+    valley,
 )
 from advsearch.scene.renderer import Renderer
 
@@ -52,7 +49,7 @@ SAME = 1e-5
 SLOWER = 1.5
 """Factor by which a rate may depend on the scale."""
 
-GROUP = CaseGroup("stiff")
+STIFF = CaseGroup("stiff")
 _BOX = "controls map their units to the unit box; policies know nothing else"
 _BLOCKS = "a step has the length of each block's own radius (Domain.steepest); adam divides by each number's own scale"
 
@@ -75,7 +72,7 @@ def path(toy: Toy, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0) ->
 # ---- units ----------------------------------------------------------------------------------------------------------
 
 
-@GROUP.case(
+@STIFF.case(
     "rescaled-units",
     "A search in milliwatts and radians goes through the same configurations as in watts and degrees.",
     _BOX,
@@ -95,7 +92,9 @@ def rescaled_units() -> Outcome:
             endings.add(result.ending.value)
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
     return Outcome(
-        (Check("largest distance of two trajectories in u", worst, most=SAME),), True, worst, ", ".join(sorted(endings))
+        Check("largest distance of two trajectories in u", worst, most=SAME),
+        relative_error=worst,
+        ending=", ".join(sorted(endings)),
     )
 
 
@@ -118,7 +117,7 @@ def _lamp_and_rotation(watt: float, degree: float) -> Toy:
     return Toy(value, box_domain(start))
 
 
-@GROUP.case(
+@STIFF.case(
     "rescaled-objective",
     "A search of the objective times a million goes through the same configurations.",
     "steps are normalised, ranks and standardised values have no unit",
@@ -132,13 +131,13 @@ def objective_units() -> Outcome:
             toy = Toy(quadratic([0.7, 0.4], [1.0, 30.0]), box_domain([0.1, 0.9]), scale=scale)
             paths.append(path(toy, make_policy(name), steps=60)[1])
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
-    return Outcome((Check("largest distance of two trajectories in u", worst, most=SAME),), True, worst)
+    return Outcome(Check("largest distance of two trajectories in u", worst, most=SAME), relative_error=worst)
 
 
 # ---- curvatures -----------------------------------------------------------------------------------------------------
 
 
-@GROUP.case("curvatures-1e6", "A search takes no more evaluations than where the curvatures are equal.", _BLOCKS)
+@STIFF.case("curvatures-1e6", "A search takes no more evaluations than where the curvatures are equal.", _BLOCKS)
 def curvatures(ratio: float = RATIO) -> Outcome:
     """Two numbers whose curvatures differ by a million: evaluations until both are at the peak, against equal ones."""
     checks, measured, start, peak = [], {}, [0.15, 0.9], [0.63, 0.37]
@@ -157,7 +156,7 @@ def curvatures(ratio: float = RATIO) -> Outcome:
     found = condition_number(second)
     measured["condition number"] = found
     checks.append(Check("estimated condition number over the true one", found / ratio, 0.95, 1.05))
-    return Outcome(tuple(checks), True, abs(found / ratio - 1.0), measured=measured)
+    return Outcome(*checks, relative_error=abs(found / ratio - 1.0), measured=measured)
 
 
 def _until_there(name: str, value: Value, start: list[float], peak: list[float], scale: float = 1.0) -> float:
@@ -178,7 +177,7 @@ def _until_there(name: str, value: Value, start: list[float], peak: list[float],
     return sum(counts) / len(counts)
 
 
-@GROUP.case("scaled-derivative", "One control's derivative times a million changes nothing about the rate.", _BLOCKS)
+@STIFF.case("scaled-derivative", "One control's derivative times a million changes nothing about the rate.", _BLOCKS)
 def scaled_block() -> Outcome:
     """The gradient of one number times a million or a millionth, the objective as it is: the rate has to stay.
 
@@ -192,13 +191,13 @@ def scaled_block() -> Outcome:
             measured[f"{name}: evaluations at x {scale:g}"] = counts[scale]
         worst = max(counts.values()) / counts[1.0]
         checks.append(Check(f"{name}: evaluations over those of the unscaled gradient", worst, most=SLOWER))
-    return Outcome(tuple(checks), measured=measured)
+    return Outcome(*checks, measured=measured)
 
 
 # ---- valleys and boxes ----------------------------------------------------------------------------------------------
 
 
-@GROUP.case(
+@STIFF.case(
     "curved-valley",
     "auto, adam and cmaes are no worse than random search, auto or cmaes reaches the peak, pgd the valley.",
     "auto models the objective, cmaes learns the valley's shape; pgd steps by signs and is slow",
@@ -229,10 +228,10 @@ def curved_valley(steps: int = 400) -> Outcome:
     best = min(measured[f"{name}: median gap"] for name in ("auto", "cmaes"))
     checks.append(Check("smallest gap of auto and cmaes", best, most=1e-3))
     checks.append(Check("condition number over 2508", measured["condition number"] / 2508.0, 0.9, 1.1))
-    return Outcome(tuple(checks), measured=measured)
+    return Outcome(*checks, measured=measured)
 
 
-@GROUP.case(
+@STIFF.case(
     "badly-scaled-box",
     "A peak a thousandth of the range wide is found by what converges.",
     "step sizes fall until the peak is resolved",
@@ -259,10 +258,10 @@ def wide_box(width: float = 1e-3) -> Outcome:
         checks.append(
             Check(f"{name}: distance to the peak in its widths", measured[f"{name}: median distance"] / width, most=3.0)
         )
-    return Outcome(tuple(checks), measured=measured)
+    return Outcome(*checks, measured=measured)
 
 
-@GROUP.case(
+@STIFF.case(
     "badly-scaled-range",
     "The derivative does not depend on how wide the searched range is.",
     "a difference is as wide as moves the outline by a pixel, but at least 1e-6 of the range",
@@ -278,8 +277,8 @@ def wide_range() -> Outcome:
     ]
     error = float((slopes[0] / slopes[1] - 1.0).abs())
     found = examine_gradient(wide, compare=False)
-    return replace(
-        found.findings(Check("error of the derivative per object size", error, most=0.2)),
+    return found.findings(
+        Check("error of the derivative per object size", error, most=0.2),
         relative_error=error,
         measured={"step in u": wide.plan.groups[0].step, "step in object sizes": wide.plan.groups[0].step * 2e4},
     )
@@ -288,7 +287,7 @@ def wide_range() -> Outcome:
 # ---- a scene --------------------------------------------------------------------------------------------------------
 
 
-@GROUP.case(
+@STIFF.case(
     "light-rotation-texel",
     "All three move, the condition number is printed, and the objective's unit does not matter.",
     _BLOCKS,
@@ -334,7 +333,7 @@ def light_rotation_texel() -> Outcome:
             most=1e-3,
         ),
     )
-    return replace(found.findings(*checks), ending=result.ending.value, measured=measured)
+    return found.findings(*checks, ending=result.ending.value, measured=measured)
 
 
 def _walk(renderer: Renderer, u: Tensor, loss: Value, scale: float) -> tuple[SearchResult, Tensor]:
