@@ -66,15 +66,9 @@ def grey_map(value: float, texel: float | None = None) -> EnvironmentAsset:
     return EnvironmentAsset("made", _radiance(value, texel))
 
 
-@RADIOMETRIC.case(
-    "hdri-texel-100000",
-    "Pictures and gradients are finite, raw and denoised, and gradients are right.",
-    _SCENE,
-    "environment, texture",
-    cheap=False,
-)
+@RADIOMETRIC.case("hdri-texel-100000", _SCENE, "environment, texture", cheap=False)
 def bright_texel() -> Outcome:
-    """A sky of 0.3 with one texel of 100,000, raw and denoised."""
+    """Pictures and gradients are finite, raw and denoised, and gradients are right."""
     flash = grey_map(0.3, BRIGHT)
     seen = examine_gradient(
         small("mug", {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}, environment=flash)
@@ -87,11 +81,9 @@ def bright_texel() -> Outcome:
     )
 
 
-@RADIOMETRIC.case(
-    "black-environment", "The picture is black, the gradient zero, and the search ends as stalled.", _FLAT, "texture"
-)
+@RADIOMETRIC.case("black-environment", _FLAT, "texture")
 def black_environment() -> Outcome:
-    """Nothing shines: the picture is black, no texel matters, and the search has to say that it is stuck."""
+    """The picture is black, the gradient zero, and the search ends as stalled."""
     seen = examine_gradient(
         small("mug", {"texture": {"resolution": 8}}, environment=grey_map(0.0)),
         compare=False,
@@ -104,14 +96,9 @@ def black_environment() -> Outcome:
     )
 
 
-@RADIOMETRIC.case(
-    "lamp-in-the-dark",
-    "A lamp lights a scene that has no other light.",
-    "the lamp's power is in multiples of the environment's metered light",
-    "light",
-)
+@RADIOMETRIC.case("lamp-in-the-dark", "the lamp's power is in multiples of the environment's metered light", "light")
 def lamp_in_the_dark() -> Outcome:
-    """A black environment and a lamp: the lamp has to be able to light the scene."""
+    """A lamp lights a scene that has no other light."""
     controls = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z": 2.0}}
     seen = examine_gradient(small("mug", controls, environment=grey_map(0.0)), torch.tensor([0.5]))
     return seen.findings(Check("mean of the picture", seen.mean, least=0.01))
@@ -141,9 +128,9 @@ for word, value in (("negative", -1.0), ("infinite", np.inf), ("nan", np.nan)):
     for as_file in (True, False):
         RADIOMETRIC.case(
             f"{word}-texel-{'file' if as_file else 'array'}",
-            "The map is refused before anything is rendered.",
             _REFUSED if as_file else _ASSET,
             "environment",
+            holds="The map is refused before anything is rendered.",
         )(partial(refused_texel, value, as_file=as_file))
 
 
@@ -162,9 +149,9 @@ for control in ("camera", "environment"):
     for stops in (10.0, -10.0):
         RADIOMETRIC.case(
             f"{control}-exposure-{'up' if stops > 0.0 else 'down'}",
-            "Picture and gradient are finite; the gradient of the linear picture is right.",
             _SCENE,
             f"{control}, texture",
+            holds="Picture and gradient are finite; the gradient of the linear picture is right.",
             cheap=control == "camera",
         )(partial(extreme_exposure, control, stops))
 
@@ -203,12 +190,12 @@ def plateau(low: float, high: float) -> Outcome:
 
 RADIOMETRIC.case(
     "saturated-plateau",
-    f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations.",
     _FLAT,
     "camera",
+    holds=f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations.",
 )(partial(plateau, -10.0, 10.0))
 RADIOMETRIC.case(
-    "saturated-plateau-narrow-way-out", "The same where the way out is a tenth of the range.", _FLAT, "camera"
+    "saturated-plateau-narrow-way-out", _FLAT, "camera", holds="The same where the way out is a tenth of the range."
 )(partial(plateau, 1.0, 10.0))
 
 
@@ -252,38 +239,36 @@ def extreme_surface(searched: dict[str, list[float]], **values: float) -> Outcom
 
 MATERIALS.case(
     "roughness-0",
-    "Finite, and the gradient by the roughness is right, at the polished end.",
     "Mitsuba's lobe is never narrower than a roughness of 0.03, so the derivative is finite",
     "material",
+    holds="Finite, and the gradient by the roughness is right, at the polished end.",
 )(partial(extreme_surface, {"roughness": [0.0, 1.0]}, roughness=0.0))
 MATERIALS.case(
     "roughness-1",
-    "Finite, and the gradient by the roughness is right, at the matt end.",
     _SCENE,
     "material",
+    holds="Finite, and the gradient by the roughness is right, at the matt end.",
     cheap=False,
 )(partial(extreme_surface, {"roughness": [0.0, 1.0]}, roughness=1.0, metallic=1.0))
 MATERIALS.case(
     "metallic-1",
-    "Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
     _MOVED,
     "material",
+    holds="Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
     cheap=False,
 )(partial(extreme_surface, {"metallic": [0.0, 1.0]}, metallic=1.0))
 MATERIALS.case(
-    "perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.", _MOVED, "material", cheap=False
+    "perfect-mirror",
+    _MOVED,
+    "material",
+    holds="A metal of roughness 0 is finite, and both gradients are right.",
+    cheap=False,
 )(partial(extreme_surface, {"roughness": [0.0, 1.0], "metallic": [0.0, 1.0]}, roughness=0.0, metallic=1.0))
 
 
-@MATERIALS.case(
-    "clear-glass",
-    "A texel behind clear glass has the right gradient, and nothing is NaN.",
-    _SCENE,
-    "texture, environment",
-    cheap=False,
-)
+@MATERIALS.case("clear-glass", _SCENE, "texture, environment", cheap=False)
 def clear_glass() -> Outcome:
-    """The object behind a ball of clear glass: light bends twice, and a texel still has its gradient."""
+    """A texel behind clear glass has the right gradient, and nothing is NaN."""
     controls: ControlSettings = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
     glass = behind_glass(controls)
     without = small("mug", controls)
@@ -292,14 +277,9 @@ def clear_glass() -> Outcome:
     return examine_gradient(glass).findings(Check("mean change of the picture by the glass", moved, least=0.01))
 
 
-@MATERIALS.case(
-    "texels-0-and-1",
-    "Texels at the ends of the range have a gradient, and the search moves them inwards only.",
-    "the straight piece of the sRGB curve at 0; projection onto the bounds",
-    "texture",
-)
+@MATERIALS.case("texels-0-and-1", "the straight piece of the sRGB curve at 0; projection onto the bounds", "texture")
 def texels_at_the_ends() -> Outcome:
-    """A texture of texels that are exactly 0 and exactly 1: the gradient is there, and the search moves inwards."""
+    """Texels at the ends of the range have a gradient, and the search moves them inwards only."""
     checks = np.indices((8, 8)).sum(axis=0) % 2
     texels = np.repeat(checks[:, :, None], 3, axis=2).astype(np.float32)
     mug = replace(library.load_object("mug"), name="checked", base_color=texels)

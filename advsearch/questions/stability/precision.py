@@ -42,13 +42,9 @@ SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
 PRECISION = CaseGroup("precision")
 
 
-@PRECISION.case(
-    "verdicts-in-single-precision",
-    "The model's answers in single and double precision differ only where the margin is under 0.001 logits.",
-    "20 trials with fresh noise, which moves margins a thousand times more",
-)
+@PRECISION.case("verdicts-in-single-precision", "20 trials with fresh noise, which moves margins a thousand times more")
 def verdicts() -> Outcome:
-    """The reference model in single and in double precision, on pictures on its own decision boundaries.
+    """The model's answers in single and double precision differ only where the margin is under 0.001 logits.
 
     Between two pictures with different answers the boundary is found by bisection in single precision; there the two
     may disagree, and what matters is how far from the boundary they still do.
@@ -94,13 +90,9 @@ def verdicts() -> Outcome:
     )
 
 
-@PRECISION.case(
-    "bytes-in-single-precision",
-    "The 8-bit picture is the same but for ties, and the model does not notice.",
-    "values on the edge of two levels take either",
-)
+@PRECISION.case("bytes-in-single-precision", "values on the edge of two levels take either")
 def picture_bytes() -> Outcome:
-    """The tone curve and the rounding to 8 bits in single and in double precision, and what that does to the model."""
+    """The 8-bit picture is the same but for ties, and the model does not notice."""
     model = load_model("reference")
     radiance = 1.2 * torch.rand(*model.input_size, 3, generator=torch.Generator().manual_seed(1))
     single, double = to_8_bit(linear_to_srgb(radiance)), to_8_bit(linear_to_srgb(radiance.double()))
@@ -116,13 +108,9 @@ def picture_bytes() -> Outcome:
     )
 
 
-@PRECISION.case(
-    "ball-of-a-million-numbers",
-    "A projection in single precision lies inside the ball in double precision.",
-    "Domain.TOLERANCE: 2e-6 of the radius",
-)
+@PRECISION.case("ball-of-a-million-numbers", "Domain.TOLERANCE: 2e-6 of the radius")
 def large_ball(size: int = 1_000_000) -> Outcome:
-    """The projection of a million numbers onto an L2 ball, its norm in double precision."""
+    """A projection in single precision lies inside the ball in double precision."""
     generator = torch.Generator().manual_seed(0)
     start = torch.rand(size, generator=generator)
     radius = 0.1 * math.sqrt(size)
@@ -176,19 +164,15 @@ def many_steps(name: str) -> Outcome:
 for name in ("pgd", "adam"):
     PRECISION.case(
         f"ten-thousand-steps-{name}",
-        "The search stays inside its budget and at its peak.",
         "momentum forgets; each step is projected anew",
+        holds="The search stays inside its budget and at its peak.",
         cheap=False,
     )(partial(many_steps, name))
 
 
-@PRECISION.case(
-    "ten-thousand-turns",
-    "An angle that goes round in small steps does not drift, and no two steps have one seed.",
-    "wrapped at every step, so it stays small",
-)
+@PRECISION.case("ten-thousand-turns", "wrapped at every step, so it stays small")
 def accumulation() -> Outcome:
-    """10,000 small steps of an angle around its circle, in single against double precision, and 10,000 seeds."""
+    """An angle that goes round in small steps does not drift, and no two steps have one seed."""
     domain = Domain(torch.zeros(1), (Block(1, periodic=True, name="angle"),))
     u, exact, step = torch.zeros(1), 0.0, 0.000_731
     for _ in range(LONG):
@@ -222,15 +206,9 @@ def rendered(path: str, count: int) -> None:
     np.savez(path, allow_pickle=False, **{name: one.numpy() for name, one in found.items()})
 
 
-@PRECISION.case(
-    "one-and-two-threads",
-    "The same bits every time with one thread; with two, adjoints may differ in the last.",
-    "box filter; `deterministic` takes one thread",
-    "texture, pose",
-    cheap=False,
-)
+@PRECISION.case("one-and-two-threads", "box filter; `deterministic` takes one thread", "texture, pose", cheap=False)
 def one_and_two_threads() -> Outcome:
-    """Pictures, pictures of a moved mesh and an adjoint: twice with one thread and once with two, in processes each.
+    """The same bits every time with one thread; with two, adjoints may differ in the last.
 
     A moved mesh is sorted anew by all threads, which could decide which of two triangles a ray meets on their common
     edge (seen in no picture so far); so the limit is `BITS` there.
@@ -278,13 +256,12 @@ def changed_threads(counts: Sequence[int] = (2, 1, 2, 1, 2, 1)) -> None:
 
 @PRECISION.case(
     "threads-change-under-a-scene",
-    "Changing the number of threads while a scene is in use does not end the process.",
     "a recorded kernel is made anew when the number of threads changes",
     "pose",
     cheap=False,
 )
 def threads_under_a_scene() -> Outcome:
-    """A scene that lives while the number of threads is changed, as a deterministic second search does."""
+    """Changing the number of threads while a scene is in use does not end the process."""
     status, said = _in_a_process(f"from {__name__} import changed_threads; changed_threads()")
     return Outcome(
         Check("exit status of the process" + (f" ({said})" if said else ""), float(status), 0.0, 0.0),

@@ -70,66 +70,59 @@ def texture_of(side: int) -> Outcome:
 
 
 TRANSPORT.case(
-    "predicted-4-texels", "Changes of a texture of 4 texels are predicted.", _LINEAR, "texture", cheap=False
+    "predicted-4-texels", _LINEAR, "texture", holds="Changes of a texture of 4 texels are predicted.", cheap=False
 )(partial(texture_of, 2))
 TRANSPORT.case(
-    "predicted-4096-texels", "Changes of a texture of 4,096 texels are predicted.", _LINEAR, "texture", cheap=False
+    "predicted-4096-texels",
+    _LINEAR,
+    "texture",
+    holds="Changes of a texture of 4,096 texels are predicted.",
+    cheap=False,
 )(partial(texture_of, 64))
 
 
-@TRANSPORT.case("predicted-epsilon-1", "Changes to white and black are predicted.", _LINEAR, "texture", cheap=False)
+@TRANSPORT.case("predicted-epsilon-1", _LINEAR, "texture", cheap=False)
 def epsilon_1() -> Outcome:
-    """Every texel becomes white or black."""
+    """Changes to white and black are predicted."""
     return predicted(small("mug", {"texture": {"resolution": 8, "epsilon": 1.0}}), epsilon=1.0, off=0.3)
 
 
-@TRANSPORT.case(
-    "predicted-black-and-white",
-    "Changes of a texture that is exactly 0 and 1 are predicted.",
-    _LINEAR,
-    "texture",
-    cheap=False,
-)
+@TRANSPORT.case("predicted-black-and-white", _LINEAR, "texture", cheap=False)
 def black_and_white() -> Outcome:
-    """A checked texture of texels that are exactly 0 and 1; it changes inwards alone."""
+    """Changes of a texture that is exactly 0 and 1 are predicted."""
     checks = np.indices((8, 8)).sum(axis=0) % 2
     return predicted(small(mug(np.repeat(checks[:, :, None], 3, axis=2)), {"texture": {"resolution": 8}}), 0.2, off=0.3)
 
 
-@TRANSPORT.case("predicted-mirror", "Changes of a mirror's tint are predicted.", _LINEAR, "texture", cheap=False)
+@TRANSPORT.case("predicted-mirror", _LINEAR, "texture", cheap=False)
 def mirror() -> Outcome:
-    """A metal of roughness 0: its base colour is the tint of what it reflects, and much of that is the mug itself."""
+    """Changes of a mirror's tint are predicted."""
     settings = {"material.roughness": 0.0, "material.metallic": 1.0}
     return predicted(small("mug", {"texture": {"resolution": 8}}, settings=settings), off=0.35)
 
 
-@TRANSPORT.case(
-    "predicted-behind-glass",
-    "Changes of a texture behind clear glass are predicted texel by texel.",
-    _LINEAR,
-    "texture",
-)
+@TRANSPORT.case("predicted-behind-glass", _LINEAR, "texture")
 def glass() -> Outcome:
-    """The object behind a ball of clear glass."""
+    """Changes of a texture behind clear glass are predicted texel by texel."""
     return predicted(behind_glass({"texture": {"resolution": 32}}))
 
 
-@TRANSPORT.case("predicted-out-of-sight", "A texture that nobody sees changes nothing.", _NOTHING, "texture")
+@TRANSPORT.case("predicted-out-of-sight", _NOTHING, "texture")
 def out_of_sight() -> Outcome:
-    """The object 10,000 sizes away."""
+    """A texture that nobody sees changes nothing."""
     return predicted(small("mug", {"texture": {"resolution": 8}}, settings={"pose.x": 1e4}))
 
 
-@TRANSPORT.case("predicted-without-light", "A texture that no light reaches changes nothing.", _NOTHING, "texture")
+@TRANSPORT.case("predicted-without-light", _NOTHING, "texture")
 def without_light() -> Outcome:
-    """A black environment."""
+    """A texture that no light reaches changes nothing."""
     night = EnvironmentAsset("night", np.zeros((16, 32, 3), np.float32))
     return predicted(small("mug", {"texture": {"resolution": 8}}, environment=night))
 
 
-@TRANSPORT.case("predicted-light-out", "A lamp that goes out is predicted, to darkness.", _LIGHT, "light")
+@TRANSPORT.case("predicted-light-out", _LIGHT, "light")
 def light_out() -> Outcome:
-    """Basis pictures made while the only lamp shines, used where it does not; and likewise beside an environment."""
+    """A lamp that goes out is predicted, to darkness."""
     night = EnvironmentAsset("night", np.zeros((16, 32, 3), np.float32))
     alone = small("mug", {"light": {"power": [0.0, 12.0]}}, environment=night)
     beside = small("mug", {"light": {"power": [0.0, 12.0]}})
@@ -216,30 +209,25 @@ def seen(controls: ControlSettings, texels: np.ndarray | None = None, slope: flo
 
 
 SURFACE_LIGHT.case(
-    "lit-grazing-view", "Looking along the ground, picture and derivative are right.", _MEASURED, "texture, camera"
-)(partial(seen, {"texture": {"resolution": 8}, "camera": {"elevation": [-10.0, 10.0]}}))
-SURFACE_LIGHT.case(
-    "lit-camera-inside",
-    "From inside the mug, picture and derivative are right.",
+    "lit-grazing-view",
     _MEASURED,
     "texture, camera",
+    holds="Looking along the ground, picture and derivative are right.",
+)(partial(seen, {"texture": {"resolution": 8}, "camera": {"elevation": [-10.0, 10.0]}}))
+SURFACE_LIGHT.case(
+    "lit-camera-inside", _MEASURED, "texture, camera", holds="From inside the mug, picture and derivative are right."
 )(partial(seen, {"texture": {"resolution": 8}, "camera": {"distance": [0.05, 0.2]}}, slope=INSIDE))
-SURFACE_LIGHT.case("lit-4-texels", "A texture of 4 texels is predicted.", _MEASURED, "texture, camera")(
+SURFACE_LIGHT.case("lit-4-texels", _MEASURED, "texture, camera", holds="A texture of 4 texels is predicted.")(
     partial(seen, {"texture": {"resolution": 2}, "camera": {}})
 )
 SURFACE_LIGHT.case(
-    "lit-black-and-white", "Texels that are exactly 0 and 1 are predicted.", _MEASURED, "texture, camera"
+    "lit-black-and-white", _MEASURED, "texture, camera", holds="Texels that are exactly 0 and 1 are predicted."
 )(partial(seen, PAINTED, np.repeat(np.indices((8, 8)).sum(axis=0)[:, :, None] % 2, 3, axis=2)))
 
 
-@SURFACE_LIGHT.case(
-    "lit-unseen-texels",
-    "Texels that the view does not meet have a derivative of exactly 0, and no change of them is predicted.",
-    "the matrix of a view has entries for what it meets alone",
-    "texture, camera",
-)
+@SURFACE_LIGHT.case("lit-unseen-texels", "the matrix of a view has entries for what it meets alone", "texture, camera")
 def lit_unseen() -> Outcome:
-    """Texels on the far side become black; a traced picture changes by what they reflect and no more."""
+    """Texels that the view does not meet have a derivative of exactly 0, and no change of them is predicted."""
     renderer = small("mug", PAINTED)
     light, u = lit(renderer), renderer.start
     slope = light.gradient(lambda picture: picture.square().mean(), u, 0, 1)[1]
@@ -257,25 +245,23 @@ def lit_unseen() -> Outcome:
     return Outcome(*checks, finite=bool(torch.isfinite(slope).all()), measured={"rms": rms})
 
 
-@SURFACE_LIGHT.case("lit-map-half-black", "Half of the map is black, the other white.", _MEASURED, "texture, camera")
+@SURFACE_LIGHT.case("lit-map-half-black", _MEASURED, "texture, camera")
 def half_black() -> Outcome:
-    """Light from one side alone: shadows have no light of their own."""
+    """Half of the map is black, the other white."""
     radiance = grey_map(0.0).radiance.copy()
     radiance[:, :16] = 1.0
     return lit_picture(small("mug", PAINTED, environment=EnvironmentAsset("half", radiance)), 1.5 * LEVELS)
 
 
-@SURFACE_LIGHT.case("lit-map-white", "The map is white everywhere.", _MEASURED, "texture, camera")
+@SURFACE_LIGHT.case("lit-map-white", _MEASURED, "texture, camera")
 def white_map() -> Outcome:
-    """No direction differs from another."""
+    """The map is white everywhere."""
     return lit_picture(small("mug", PAINTED, environment=grey_map(1.0)))
 
 
-@SURFACE_LIGHT.case(
-    "lit-map-black", "The picture is black, the derivative 0.", "no light has nothing to add", "texture"
-)
+@SURFACE_LIGHT.case("lit-map-black", "no light has nothing to add", "texture")
 def black_map() -> Outcome:
-    """Nothing shines."""
+    """The picture is black, the derivative 0."""
     renderer = small("mug", PAINTED, environment=grey_map(0.0))
     light = lit(renderer)
     value, slope = light.gradient(lambda picture: picture.sum(), renderer.start, 0, 1)
@@ -286,20 +272,15 @@ def black_map() -> Outcome:
     return Outcome(*checks, finite=bool(torch.isfinite(slope).all()))
 
 
-@SURFACE_LIGHT.case(
-    "lit-sun",
-    "A sun of one texel, 300,000 times as bright as the sky, casts the shadow that is traced.",
-    "rays of their own towards what is hot, spread over its texels",
-    "texture, camera",
-)
+@SURFACE_LIGHT.case("lit-sun", "rays of their own towards what is hot, spread over its texels", "texture, camera")
 def sun() -> Outcome:
-    """The picture would be off by 7 levels if the sun were a point."""
+    """A sun of one texel, 300,000 times as bright as the sky, casts the shadow that is traced."""
     return lit_picture(small("mug", PAINTED, environment=grey_map(0.3, BRIGHT)), 1.5 * LEVELS)
 
 
-@SURFACE_LIGHT.case("lit-out-of-sight", "A texture out of sight changes nothing.", _NO_ENTRIES, "texture, camera")
+@SURFACE_LIGHT.case("lit-out-of-sight", _NO_ENTRIES, "texture, camera")
 def lit_out_of_sight() -> Outcome:
-    """The object 10,000 sizes away."""
+    """A texture out of sight changes nothing."""
     renderer = small("mug", PAINTED, settings={"pose.x": 1e4})
     light = lit(renderer)
     with torch.no_grad():
@@ -312,11 +293,9 @@ def lit_out_of_sight() -> Outcome:
     return Outcome(*checks, finite=bool(torch.isfinite(slope).all()))
 
 
-@SURFACE_LIGHT.case(
-    "lit-mirror", "A mirror is too far off, and the comparison says so.", _MEASURED, "camera", cheap=False
-)
+@SURFACE_LIGHT.case("lit-mirror", _MEASURED, "camera", cheap=False)
 def lit_mirror() -> Outcome:
-    """A metal of roughness 0 is taken for a diffuse surface of its colour; one that is not a mirror is accepted."""
+    """A mirror is too far off, and the comparison says so."""
     taken = []
     for given in ({"material.roughness": 0.0, "material.metallic": 1.0}, {}):
         renderer = small("mug", PAINTED, settings=given, denoise="oidn")
@@ -331,9 +310,9 @@ def lit_mirror() -> Outcome:
     return Outcome(*checks, ending="refused")
 
 
-@SURFACE_LIGHT.case("lit-behind-glass", "An object behind clear glass is refused in words.", _REFUSED, "camera")
+@SURFACE_LIGHT.case("lit-behind-glass", _REFUSED, "camera")
 def lit_glass() -> Outcome:
-    """Nothing in the method follows light through a surface."""
+    """An object behind clear glass is refused in words."""
     reason = why_not(behind_glass(PAINTED), ["camera"])
     without = why_not(small("mug", PAINTED, denoise="oidn"), ["camera"])
     checks = (

@@ -145,12 +145,16 @@ class CaseGroup:
     cases: list[Case] = field(default_factory=list)
 
     def case(
-        self, name: str, holds: str, rule: str, control: str = "", *, cheap: bool = True
+        self, name: str, rule: str, control: str = "", *, holds: str = "", cheap: bool = True
     ) -> Callable[[Find], Find]:
-        """Make a function a case of the group; arguments as the attributes of `Case`."""
+        """Make a function a case of the group; arguments as the attributes of `Case`.
+
+        Where `holds` is not given, the first sentence of its docstring says what must hold.
+        """
 
         def added(find: Find) -> Find:
-            self.cases.append(Case(name, self.name, holds, rule, control, cheap, find))
+            said = holds or " ".join((find.__doc__ or "").partition("\n\n")[0].split())
+            self.cases.append(Case(name, self.name, said, rule, control, cheap, find))
             return find
 
         return added

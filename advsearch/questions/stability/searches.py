@@ -83,13 +83,15 @@ def logits_like(rows: list[list[float]], *, same: float = 1e-5) -> Outcome:
 
 
 OBJECTIVE.case(
-    "logits-of-10000", "Every objective and its gradient are finite, not lost, and as in double precision.", _LOGITS
+    "logits-of-10000",
+    _LOGITS,
+    holds="Every objective and its gradient are finite, not lost, and as in double precision.",
 )(partial(logits_like, [[1e4, -1e4, 0.0, 5e3], [-1e4, 1e4, 9e3, 0.0], [1e4, 9999.0, 9998.0, -1e4]], same=SPACING))
 
 
-@OBJECTIVE.case("ties", "Tied logits share the gradient, and a tie is no success.", _LOGITS)
+@OBJECTIVE.case("ties", _LOGITS)
 def ties() -> Outcome:
-    """The largest logits are equal: the gradient is shared, and a tie is no success."""
+    """Tied logits share the gradient, and a tie is no success."""
     rows = [[1.0, 1.0, 0.0, -1.0], [2.0, 2.0, 2.0, 2.0], [0.0, 3.0, 3.0, 3.0]]
     found = logits_like(rows)
     task = Classification()
@@ -115,13 +117,9 @@ class _Certain(nn.Module):
         return torch.stack([light, 0.5 - light, torch.zeros_like(light)], dim=1).mul(self.sharpness).softmax(dim=1)
 
 
-@OBJECTIVE.case(
-    "probabilities-0-and-1",
-    "Nothing is infinite, and where the model is flat the search goes elsewhere or says so.",
-    _LOGITS,
-)
+@OBJECTIVE.case("probabilities-0-and-1", _LOGITS)
 def certain() -> Outcome:
-    """A model that answers with probabilities of exactly 0 and 1: finite, and its flatness is named."""
+    """Nothing is infinite, and where the model is flat the search goes elsewhere or says so."""
     model = Model(_Certain(1e4), "certain", ("a", "b", "c"), Preprocessing((8, 8)), probabilities=True)
     image = torch.full((8, 8, 3), 0.9, requires_grad=True)
     logits = model(image)
@@ -176,20 +174,20 @@ def nan_at(steps: frozenset[int], *, ends: bool) -> Outcome:
     )
 
 
-OBJECTIVE.case("nan-at-step-0", "Every policy counts it and goes on.", _NAN)(
+OBJECTIVE.case("nan-at-step-0", _NAN, holds="Every policy counts it and goes on.")(
     partial(nan_at, frozenset({0}), ends=False)
 )
-OBJECTIVE.case("nan-at-steps-7-and-8", "Every policy counts them and goes on.", _NAN)(
+OBJECTIVE.case("nan-at-steps-7-and-8", _NAN, holds="Every policy counts them and goes on.")(
     partial(nan_at, frozenset({7, 8}), ends=False)
 )
-OBJECTIVE.case("nan-three-times-in-a-row", "Every search ends as non-finite, with what it had.", _NAN)(
+OBJECTIVE.case("nan-three-times-in-a-row", _NAN, holds="Every search ends as non-finite, with what it had.")(
     partial(nan_at, frozenset({3, 4, 5}), ends=True)
 )
 
 
-@OBJECTIVE.case("constant-model", "Nothing is found; policies that follow gradients end as stalled.", _FLAT)
+@OBJECTIVE.case("constant-model", _FLAT)
 def constant_model() -> Outcome:
-    """A model whose answer never changes: nothing is found, and who follows gradients says that there are none."""
+    """Nothing is found; policies that follow gradients end as stalled."""
     wrong, endings = [], set()
     for name in POLICIES:
         toy = Toy(lambda u: 0.0 * u.sum() - 1.0, box_domain([0.2, 0.2]), threshold=0.0)
@@ -234,8 +232,8 @@ def chance(rate: float, runs: int = 100) -> Outcome:
 for rate in (0.1, 0.5, 0.9):
     OBJECTIVE.case(
         f"random-model-wrong-{round(100 * rate)}-percent",
-        "What the search claims is never verified.",
         "fresh trials of the answer and of the clean configuration (advsearch.attacks.verification)",
+        holds="What the search claims is never verified.",
     )(partial(chance, rate))
 
 
@@ -284,11 +282,7 @@ def normalised_mean(samples: Tensor) -> Tensor:
     return (samples / samples.abs().mean(dim=-1, keepdim=True).clamp_min(1e-30)).mean(dim=-2)
 
 
-ESTIMATORS: dict[str, Estimator] = {
-    "mean": plain_mean,
-    "median of means": median_of_means,
-    "clipping": clipped_mean,
-}
+ESTIMATORS: dict[str, Estimator] = {"mean": plain_mean, "median of means": median_of_means, "clipping": clipped_mean}
 
 
 def _heavy_noise(kind: str, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
@@ -331,8 +325,8 @@ def estimators(kind: str) -> Outcome:
 for kind in ("symmetric", "skewed"):
     NOISE.case(
         f"heavy-tails-{kind}",
-        "Median of means and clipping beat the mean; their bias and that of normalisation are known.",
         "median of means of 6 groups; clipping at 3 median lengths; normalisation",
+        holds="Median of means and clipping beat the mean; their bias and that of normalisation are known.",
     )(partial(estimators, kind))
 
 
@@ -362,7 +356,7 @@ for kind, result in (
     ("lengths", "the result with gaussian noise of the same median, with a heavy tail in its size."),
     ("spike", "the optimum, with one gradient 1e12 times too large."),
 ):
-    NOISE.case(f"heavy-tailed-search-{kind}", "Within 1.25 of " + result, _RULE)(partial(heavy_search, kind))
+    NOISE.case(f"heavy-tailed-search-{kind}", _RULE, holds="Within 1.25 of " + result)(partial(heavy_search, kind))
 
 
 def _share_of_optimum(name: str, kind: str, seeds: int = 9) -> float:
@@ -400,14 +394,10 @@ def _disturbance(kind: str, index: int, size: int, generator: torch.Generator) -
 
 
 @NOISE.case(
-    "one-sample-a-pixel",
-    "Finite; the mean of 48 gradients is right; the denoiser copes.",
-    "a new seed at every step, and momentum over steps",
-    "texture, environment, pose",
-    cheap=False,
+    "one-sample-a-pixel", "a new seed at every step, and momentum over steps", "texture, environment, pose", cheap=False
 )
 def one_sample() -> Outcome:
-    """One sample a pixel: the mean of many gradients is that of a quiet one, and the denoiser takes such a picture."""
+    """Finite; the mean of 48 gradients is right; the denoiser copes."""
     controls: ControlSettings = {
         "texture": {"resolution": 8},
         "environment": {"exposure": [-1.0, 1.0]},
@@ -423,13 +413,12 @@ def one_sample() -> Outcome:
 
 @NOISE.case(
     "heavy-tails-of-a-moving-mesh",
-    "The plan takes differences of the loss for what moves a mesh, which have no heavy tail.",
     "the plan prefers differences of the loss for what moves a mesh",
     "pose",
     cheap=False,
 )
 def heavy_render(count: int = SAMPLES) -> Outcome:
-    """Gradients of a shift at 4 samples a pixel: how heavy their tails are, and what each rule makes of them."""
+    """The plan takes differences of the loss for what moves a mesh, which have no heavy tail."""
     renderer = small("mug", {"pose": {"x": [-0.3, 0.3]}})
     renderer.formation = replace(renderer.formation, transfer="linear")
     loss, u = smooth_loss(renderer.formation.resolution), renderer.start

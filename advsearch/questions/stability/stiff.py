@@ -72,13 +72,9 @@ def path(toy: Toy, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0) ->
 # ---- units ----------------------------------------------------------------------------------------------------------
 
 
-@STIFF.case(
-    "rescaled-units",
-    "A search in milliwatts and radians goes through the same configurations as in watts and degrees.",
-    _BOX,
-)
+@STIFF.case("rescaled-units", _BOX)
 def rescaled_units() -> Outcome:
-    """A lamp and a rotation, in watts and degrees or in milliwatts and radians: the same search.
+    """A search in milliwatts and radians goes through the same configurations as in watts and degrees.
 
     The ranges are read and mapped as those of any control are.
     """
@@ -117,13 +113,9 @@ def _lamp_and_rotation(watt: float, degree: float) -> Toy:
     return Toy(value, box_domain(start))
 
 
-@STIFF.case(
-    "rescaled-objective",
-    "A search of the objective times a million goes through the same configurations.",
-    "steps are normalised, ranks and standardised values have no unit",
-)
+@STIFF.case("rescaled-objective", "steps are normalised, ranks and standardised values have no unit")
 def objective_units() -> Outcome:
-    """The same objective times a millionth and a million: the same search."""
+    """A search of the objective times a million goes through the same configurations."""
     worst = 0.0
     for name in ("pgd", "adam", "cmaes", "nes", "auto"):
         paths = []
@@ -137,9 +129,9 @@ def objective_units() -> Outcome:
 # ---- curvatures -----------------------------------------------------------------------------------------------------
 
 
-@STIFF.case("curvatures-1e6", "A search takes no more evaluations than where the curvatures are equal.", _BLOCKS)
+@STIFF.case("curvatures-1e6", _BLOCKS)
 def curvatures(ratio: float = RATIO) -> Outcome:
-    """Two numbers whose curvatures differ by a million: evaluations until both are at the peak, against equal ones."""
+    """A search takes no more evaluations than where the curvatures are equal."""
     checks, measured, start, peak = [], {}, [0.15, 0.9], [0.63, 0.37]
     for name in FOLLOWERS:
         worst = 0.0
@@ -177,9 +169,9 @@ def _until_there(name: str, value: Value, start: list[float], peak: list[float],
     return sum(counts) / len(counts)
 
 
-@STIFF.case("scaled-derivative", "One control's derivative times a million changes nothing about the rate.", _BLOCKS)
+@STIFF.case("scaled-derivative", _BLOCKS)
 def scaled_block() -> Outcome:
-    """The gradient of one number times a million or a millionth, the objective as it is: the rate has to stay.
+    """One control's derivative times a million changes nothing about the rate.
 
     So it is where one control's derivative comes in other units than another's.
     """
@@ -199,12 +191,11 @@ def scaled_block() -> Outcome:
 
 @STIFF.case(
     "curved-valley",
-    "auto, adam and cmaes are no worse than random search, auto or cmaes reaches the peak, pgd the valley.",
     "auto models the objective, cmaes learns the valley's shape; pgd steps by signs and is slow",
     cheap=False,
 )
 def curved_valley(steps: int = 400) -> Outcome:
-    """Rosenbrock's valley: what policies have left to its peak after 400 renders, beside random search.
+    """auto, adam and cmaes are no worse than random search, auto or cmaes reaches the peak, pgd the valley.
 
     PGD steps by signs in numbers that are blocks of their own, so it has to go round the bend in small steps: it gets
     down into the valley, and no further than random search does in two dimensions. That is measured, not required.
@@ -231,14 +222,9 @@ def curved_valley(steps: int = 400) -> Outcome:
     return Outcome(*checks, measured=measured)
 
 
-@STIFF.case(
-    "badly-scaled-box",
-    "A peak a thousandth of the range wide is found by what converges.",
-    "step sizes fall until the peak is resolved",
-    cheap=False,
-)
+@STIFF.case("badly-scaled-box", "step sizes fall until the peak is resolved", cheap=False)
 def wide_box(width: float = 1e-3) -> Outcome:
-    """A box a thousand times as wide as the objective's own scale in one number, and just right in the other."""
+    """A peak a thousandth of the range wide is found by what converges."""
     peak, start = [0.63, 0.3712], [0.2, 0.9]
 
     def value(u: Tensor) -> Tensor:
@@ -263,12 +249,11 @@ def wide_box(width: float = 1e-3) -> Outcome:
 
 @STIFF.case(
     "badly-scaled-range",
-    "The derivative does not depend on how wide the searched range is.",
     "a difference is as wide as moves the outline by a pixel, but at least 1e-6 of the range",
     "pose",
 )
 def wide_range() -> Outcome:
-    """A shift searched over 20,000 object sizes: its derivative has to be that of a sensible range."""
+    """The derivative does not depend on how wide the searched range is."""
     wide, narrow = (small("mug", {"pose": {"x": [-reach, reach]}}) for reach in (1e4, 0.3))
     loss = smooth_loss(wide.formation.resolution)
     slopes = [
@@ -287,15 +272,9 @@ def wide_range() -> Outcome:
 # ---- a scene --------------------------------------------------------------------------------------------------------
 
 
-@STIFF.case(
-    "light-rotation-texel",
-    "All three move, the condition number is printed, and the objective's unit does not matter.",
-    _BLOCKS,
-    "light, pose, texture",
-    cheap=False,
-)
+@STIFF.case("light-rotation-texel", _BLOCKS, "light, pose, texture", cheap=False)
 def light_rotation_texel() -> Outcome:
-    """A lamp's power beside a rotation beside texels, rendered: how stiff it is, and whether each of them moves."""
+    """All three move, the condition number is printed, and the objective's unit does not matter."""
     controls: ControlSettings = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
         "pose": {"yaw": [0.0, 360.0]},
