@@ -32,14 +32,7 @@ from advsearch.engine.attack_parts import (
 )
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.journal import Journal, check_made_of
-from advsearch.engine.loading import (
-    Controls,
-    Scene,
-    load_scene,
-    only_here,
-    scene_as_settings,
-    settings_of,
-)
+from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
 from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
 from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
@@ -180,16 +173,7 @@ def attack(
 def attack_from_config(
     config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> AttackResult | CurveResult | MatrixResult:
-    """Do what a configuration describes: one attack, a curve or a matrix of several; see `attack`.
-
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with: what was evaluated is not rendered again.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Do what a configuration describes: one attack, a curve or a matrix of several; see `attack`."""
     if config.is_matrix:
         return matrix_from_config(config, progress=progress, resumed=resumed)
     if config.is_curve:

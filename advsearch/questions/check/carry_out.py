@@ -29,15 +29,7 @@ from advsearch.engine.gradients import (
 from advsearch.engine.loading import Scene
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.naming import AnyModel
-from advsearch.engine.planning import (
-    CONVERGED,
-    COUNTS,
-    cosine_samples,
-    cosines,
-    measured_plan,
-    plan_gradients,
-    tuned,
-)
+from advsearch.engine.planning import CONVERGED, COUNTS, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.check.answer import (
@@ -104,9 +96,6 @@ def check_from_config(
 
     What is measured is stored at once, so that a check that was stopped, by Ctrl-C, by a kill or because its `seconds`
     were over, goes on where it was and ends with the same rows; only times differ.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     progress, begun = progress or NullProgress(), time.perf_counter()
     progress.stage(LOADING)
@@ -143,13 +132,7 @@ def check_from_config(
 
 @dataclass(frozen=True)
 class CheckedPart:
-    """One scene with its controls and one loss: what is checked in one go.
-
-    Attributes:
-        number: from 1.
-        config: the scene, and what may vary.
-        loss: "linear" or "model".
-    """
+    """One scene with its controls and one loss ("linear" or "model"): what is checked in one go; numbered from 1."""
 
     number: int
     config: CheckConfig

@@ -51,10 +51,7 @@ class CompareKeywords(SampledKeywords, total=False):
 
 @asks(CompareConfig, CompareKeywords)
 def compare(
-    compared: str | Path | Sequence[str | Path],
-    *,
-    progress: Watched = None,
-    **settings: Unpack[CompareKeywords],
+    compared: str | Path | Sequence[str | Path], *, progress: Watched = None, **settings: Unpack[CompareKeywords]
 ) -> CompareResult:
     """Compare models, objects or answers on the same pictures, pair by pair (docs/compare.md).
 
@@ -179,14 +176,7 @@ class _Pictures:
     scenes: dict[Path, Scenes | None] = field(default_factory=dict)
 
     def of(self, first: Side, second: Side, most: int, pair: int) -> Iterator[PairPicture]:
-        """Yield what one side alone gets right, with pictures as far as they are to be had.
-
-        Args:
-            first: of the sides.
-            second: of them.
-            most: pictures of each.
-            pair: number of the two.
-        """
+        """Yield what one side alone gets right, at most so many of each, with pictures as far as they are to be had."""
         numbers, columns = far_apart(first, second, most), varying(first.columns)
         together = first.folder == second.folder and bool((first.numbers == second.numbers).all())
         sides = [first] if together else [first, second]

@@ -260,17 +260,8 @@ MOST_VALUES = 64
 
 
 def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> ComparedPair:
-    """Return what the pairs of two sides say, without pictures.
-
-    Args:
-        first: of them.
-        second: of them.
-        seed: of which half of the pairs chooses rules, and which counts them.
-        rules: whether they are sought.
-
-    Raises:
-        InputError: rules are sought, and scikit-learn is missing.
-    """
+    """Return what the pairs of two sides say, without pictures; an InputError where rules are sought and scikit-learn
+    is missing. `seed` says which half of the pairs chooses rules, and which counts them."""
     columns = shared_columns(first, second)
     lost, won = first.right & ~second.right, ~first.right & second.right
     return ComparedPair(
@@ -286,15 +277,8 @@ def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> Com
 
 
 def far_apart(first: Side, second: Side, most: int) -> list[int]:
-    """Return numbers of pairs that one side alone gets right: first those of the first side, then those of the second.
-
-    Of each side the ones where the margins are farthest apart come first.
-
-    Args:
-        first: of the sides.
-        second: of them.
-        most: of each side.
-    """
+    """Return numbers of pairs that one side alone gets right, at most so many of each: first those of the first side,
+    where the margins are farthest apart first."""
     apart = np.nan_to_num(second.margin.astype(np.float64) - first.margin, nan=0.0)
     found: list[int] = []
     for alone, sign in ((first.right & ~second.right, -1.0), (~first.right & second.right, 1.0)):

@@ -13,13 +13,7 @@ from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
 from advsearch.explanations.observations import Answered, Factor, Observations, observed
-from advsearch.explanations.rules import (
-    CHANCE,
-    FEWEST_ROWS,
-    CountedRule,
-    condition_rows,
-    find_rules,
-)
+from advsearch.explanations.rules import CHANCE, FEWEST_ROWS, CountedRule, condition_rows, find_rules
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.explain.answer import (
     EnvelopeRow,
@@ -55,10 +49,7 @@ class ExplainKeywords(RunKeywords, total=False):
 
 @asks(ExplainConfig, ExplainKeywords)
 def explain(
-    sweeps: str | Path | Sequence[str | Path],
-    *,
-    progress: Watched = None,
-    **settings: Unpack[ExplainKeywords],
+    sweeps: str | Path | Sequence[str | Path], *, progress: Watched = None, **settings: Unpack[ExplainKeywords]
 ) -> ExplainResult:
     """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
 

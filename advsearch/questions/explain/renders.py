@@ -327,15 +327,10 @@ class Renders:
 
 
 def typical_failures(found: Observations, rules: Sequence[CountedRule], most: int) -> list[tuple[int, RuleConditions]]:
-    """Return failures with the conditions of the rule that they are under, the most typical first.
+    """Return at most so many failures with the conditions of the rule that they are under, the most typical first.
 
-    Rules take turns, and what fails under none of them is the last to take one. Of each the failure nearest to the
-    middle of its failures, by ranks, comes first.
-
-    Args:
-        found: the rows.
-        rules: which rows they cover is said by their conditions; a row belongs to the first.
-        most: failures at most.
+    Rules take turns, a row belongs to the first that covers it, and what fails under none of them is the last to take
+    one. Of each the failure nearest to the middle of its failures, by ranks, comes first.
     """
     left = ~found.right
     queues: list[list[tuple[int, RuleConditions]]] = []
@@ -362,11 +357,8 @@ def _sweep_of(index: int, asked: Sequence[AskedSweep]) -> AskedSweep:
 
 
 def pictures_again(config: SweepConfig, numbers: Sequence[int], progress: Progress) -> tuple[Tensor, Features]:
-    """Return pictures (n, H, W, 3) of a sweep of one model, as the model saw them, and what reads its features.
-
-    Raises:
-        InputError: the scene is not to be had any more, or the task is another than classification.
-    """
+    """Return pictures (n, H, W, 3) of a sweep of one model, as the model saw them, and what reads its features; an
+    InputError where the scene is not to be had any more, or the task is another than classification."""
     job = job_of(config)
     if job.tasks[0].varies:
         raise InputError(f"task {config.task_name}: features are read of classifiers")

@@ -48,11 +48,7 @@ class ExplainConfig(Config):
         le=10_000,
     )
     accuracy: float = setting(
-        0.95,
-        "explain",
-        "accuracy that the envelope promises, at 95 % confidence",
-        gt=0.0,
-        le=0.999,
+        0.95, "explain", "accuracy that the envelope promises, at 95 % confidence", gt=0.0, le=0.999
     )
     seed: int = setting_as_in(SceneConfig, "seed")
     threads: int | None = setting_as_in(SceneConfig, "threads")

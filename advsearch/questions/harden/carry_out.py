@@ -196,11 +196,7 @@ def _carry_out(
 
 
 def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
-    """Note what a training has from Python, or refuse to go on with other means than it began with.
-
-    Raises:
-        InputError: it had something else.
-    """
+    """Note what a training has from Python, or refuse (InputError) to go on with other means than it began with."""
     before = json.loads(run.store.note(MEANS) or "{}")
     if not before:
         run.store.set_note(MEANS, json.dumps(given))
@@ -214,15 +210,8 @@ def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
 
 @dataclass
 class Hardening:
-    """One run of `harden`.
-
-    Attributes:
-        run: keeps what is done.
-        course: trains a copy of the model.
-        scenes: does what there is to do with single ones; has what was asked and the model as it was given.
-        progress: told how far it is.
-        seconds: that its parts took.
-    """
+    """One run of `harden`: a course that trains a copy of the model, and scenes, with what was asked and the model as
+    it was given."""
 
     run: RunDirectory
     course: Course
@@ -290,11 +279,7 @@ class Hardening:
         return {**counts, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
     def _each(self, wanted: Sequence[Wanted]) -> Iterator[tuple[int, Any]]:
-        """Have done what is wanted of scenes; yield the place of each and what came of it, in any order.
-
-        Raises:
-            ClusterError: workers died of one.
-        """
+        """Have done what is wanted of scenes; yield the place of each and what came of it, in any order."""
         places = {id(one): place for place, one in enumerate(wanted)}
         for done in self._executor.results([one] for one in wanted):
             (one,) = done.items

@@ -72,11 +72,7 @@ class Lesson:
 
 @dataclass(eq=False)
 class Disguise:
-    """An adversarial texture, of one view or shared by several.
-
-    Attributes:
-        u: (d,) where it is.
-    """
+    """An adversarial texture (d,), of one view or shared by several."""
 
     u: Tensor
 
@@ -113,12 +109,8 @@ class TextureLesson(Lesson):
 
 @dataclass(eq=False)
 class RenderedLesson(Lesson):
-    """A lesson whose pictures were rendered.
-
-    Attributes:
-        pictures: (N, H, W, 3) uint8, at random configurations.
-        losses: (N,) of each, when a model last looked at it; infinite of those that none has.
-    """
+    """A lesson whose pictures (N, H, W, 3) uint8 were rendered at random configurations, with the loss (N,) of each
+    when a model last looked at it; infinite of those that none has."""
 
     pictures: Tensor
     losses: Tensor
@@ -231,13 +223,7 @@ def unchanged(images: Tensor) -> Tensor:
 
 def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
     """Make the worst pictures of lessons worse for a model: further steps of their textures, and a look at what was
-    rendered in several configurations.
-
-    Args:
-        chosen: lessons.
-        model: that gets them wrong.
-        steps: of each texture.
-    """
+    rendered in several configurations."""
     for begin in range(0, len(chosen), TOGETHER):
         part = chosen[begin : begin + TOGETHER]
         ascend(part, partial(slopes, model=model), steps)
@@ -258,13 +244,8 @@ def _look(chosen: Sequence[RenderedLesson], model: Model) -> None:
 def ascend(
     some: Sequence[Lesson], slopes_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]], steps: int = 1
 ) -> None:
-    """Steps uphill of the textures of lessons; views that share one add up.
-
-    Args:
-        some: lessons; those without a texture stay as they are.
-        slopes_of: from lessons to what `slopes` says of them.
-        steps: of each texture.
-    """
+    """Steps uphill of the textures of lessons, by what `slopes` says of them; views that share one add up. Lessons
+    without a texture stay as they are."""
     chosen = [one for one in some if isinstance(one, TextureLesson)]
     if not chosen:
         return
@@ -279,17 +260,10 @@ def ascend(
 
 
 def slopes(
-    chosen: Sequence[TextureLesson],
-    model: Callable[[Tensor], Tensor],
-    change: Callable[[Tensor], Tensor] = unchanged,
+    chosen: Sequence[TextureLesson], model: Callable[[Tensor], Tensor], change: Callable[[Tensor], Tensor] = unchanged
 ) -> Sequence[Tensor]:
-    """Return the derivative (d,) of the loss of each lesson with respect to its texture.
-
-    Args:
-        chosen: lessons.
-        model: that gets them wrong.
-        change: what happens to the pictures (N, H, W, 3) before the model sees them.
-    """
+    """Return the derivative (d,) of the loss of each lesson with respect to its texture; `change` is what happens to
+    the pictures (N, H, W, 3) before the model sees them."""
     leaves = [one.texture.u.clone().requires_grad_() for one in chosen]
     pictures = torch.stack([one.picture(u) for one, u in zip(chosen, leaves, strict=True)])
     return torch.autograd.grad(surprise(model(change(pictures)), [one.right for one in chosen]).sum(), leaves)
@@ -300,14 +274,7 @@ KINDS = ("plain", "worst")
 
 
 def save_pictures(folder: Path, number: int, chosen: Sequence[Lesson], labels: Sequence[str]) -> None:
-    """Write the pictures of a round's lessons: ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``.
-
-    Args:
-        folder: of the data set.
-        number: of the round.
-        chosen: lessons.
-        labels: names of the model's classes.
-    """
+    """Write the pictures of a round's lessons: ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``."""
     for place, one in enumerate(chosen):
         name = re.sub(r"[^a-z0-9]+", "-", labels[one.right[0]].lower()).strip("-")
         for kind in KINDS if isinstance(one, (TextureLesson, RenderedLesson)) else KINDS[:1]:

@@ -82,10 +82,7 @@ class Augmentation:
         mirror = 1.0 - 2.0 * _chosen(count, self.flip, generator).float()
         angle = _uniform(count, -self.turn, self.turn, generator) * (math.pi / 180.0)
         along, across = scale * angle.cos(), scale * angle.sin()
-        rows = (
-            torch.stack([along * mirror, -across, shift[0]], 1),
-            torch.stack([across * mirror, along, shift[1]], 1),
-        )
+        rows = (torch.stack([along * mirror, -across, shift[0]], 1), torch.stack([across * mirror, along, shift[1]], 1))
         grid = F.affine_grid(torch.stack(rows, 1), list(x.shape), align_corners=False)
         return F.grid_sample(x, grid, mode="bilinear", padding_mode="border", align_corners=False)
 
@@ -148,26 +145,16 @@ Found = TypeVar("Found")
 
 
 class Gradients:
-    """Takes gradients for a network that is trained.
-
-    Args:
-        student: the network; its parameters collect the gradients.
-        given: the model as it was given; its answers to plain pictures are kept.
-        pool: threads that have one of torch's each.
-    """
+    """Takes gradients for a network that is trained, whose parameters collect them, on threads that have one of torch's
+    each. The answers of the model as it was given to plain pictures are kept."""
 
     def __init__(self, student: Trainable, given: Model, pool: Executor) -> None:
         self._student, self._given, self._pool = student, given, pool
         self._twins: list[Trainable] = []
 
     def take(self, batch: Sequence[Lesson], beside: tuple[Tensor, Tensor] | None, seed: int) -> None:
-        """Make the worst pictures of lessons worse, and leave the gradient of their loss with the parameters.
-
-        Args:
-            batch: lessons.
-            beside: further images (N, H, W, 3) and class indices (N,), which count too.
-            seed: of what is random.
-        """
+        """Make the worst pictures of lessons worse, and leave the gradient of their loss with the parameters. Further
+        images (N, H, W, 3) and class indices (N,) count too."""
         batch = sorted(batch, key=lambda one: not isinstance(one, TextureLesson))  # parts are those of `_slopes`
         ascend(batch, lambda chosen: self._slopes(chosen, seed))
         plain, worst = 1.0 / len(batch), 1.0 / max(1, len(with_worst(batch)))

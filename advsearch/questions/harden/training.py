@@ -51,12 +51,8 @@ MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
 
 @dataclass(frozen=True)
 class Score:
-    """How a model does on lessons that it was not trained on.
-
-    Attributes:
-        clean: share of plain pictures that it has right.
-        robust: share of the worst pictures, searched for against these weights.
-    """
+    """How a model does on lessons that it was not trained on: its share of plain pictures, and of the worst ones,
+    searched for against these weights."""
 
     clean: float
     robust: float
@@ -82,13 +78,8 @@ class Course:
     _further: Iterator[tuple[Tensor, Tensor]] = field(default_factory=lambda: iter(()))
 
     def round(self, number: int, chosen: Sequence[Lesson], tick: Callable[[], None] = lambda: None) -> None:
-        """Train on lessons; the student has the average of the weights afterwards.
-
-        Args:
-            number: of the round; decides the order.
-            chosen: lessons.
-            tick: told of every step.
-        """
+        """Train on lessons in an order that the number of the round decides; the student has the average of the weights
+        afterwards."""
         parameters, config = self.student.parameters(), self.config
         if self.optimiser is None:
             optimiser: torch.optim.Optimizer = torch.optim.AdamW(parameters, lr=config.rate, weight_decay=WEIGHT_DECAY)
@@ -178,15 +169,7 @@ Draw = Callable[[str, str, Sequence[int], int], list[Lesson]]
 
 @dataclass
 class TrainingRounds:
-    """The rounds of a run.
-
-    Attributes:
-        run: keeps them.
-        course: trains.
-        draw: draws lessons.
-        progress: told how far it is.
-        done: what each round came to; the first is the model as it was.
-    """
+    """The rounds of a run; `done` is what each came to, of which the first is the model as it was."""
 
     run: RunDirectory
     course: Course

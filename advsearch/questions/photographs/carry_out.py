@@ -166,8 +166,7 @@ class _PhotoJudge:
 
     Attributes:
         object: what a rendering shows that says nothing else.
-        model: loaded.
-        task: on it.
+        task: on the model.
         size: (height, width) of the run's renderings, in pixels.
         several: models that the run has.
         truth: what is true of a photograph, by the rendering that it was aligned with and the object.

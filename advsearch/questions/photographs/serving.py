@@ -203,11 +203,7 @@ def photo(run: Path, name: str) -> Response:
 
 
 def check_sender(headers: Message, key: str) -> None:
-    """Refuse what this server's own page did not send.
-
-    Raises:
-        Refused: it has no origin, or not the key.
-    """
+    """Refuse what this server's own page did not send: it has no origin, or not the key."""
     given = headers.get(KEY, "").encode("utf-8", "replace")
     if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), given):
         raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")

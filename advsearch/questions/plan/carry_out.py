@@ -70,14 +70,6 @@ def plan_from_config(
     What is measured is kept at once in a run directory, so that a plan that was stopped, by Ctrl-C, by a kill or
     because its `seconds` were over, goes on where it was and ends with the same rows; times differ, and what is chosen
     by them (estimators, the better denoiser) may.
-
-    Args:
-        config: scene, model, controls, and where the run is kept.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     progress, begun = progress or NullProgress(), time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
@@ -93,14 +85,7 @@ def plan_from_config(
 
 
 class _Measurements:
-    """What a plan measures, one after the other, what matters most first.
-
-    Args:
-        problem: whose derivatives are planned.
-        config: of the plan.
-        results: what is known already.
-        progress: told how far it is.
-    """
+    """What a plan measures, one after the other, what matters most first."""
 
     def __init__(self, problem: Problem, config: PlanConfig, results: Results, progress: Progress) -> None:
         self._problem, self._config, self._results, self._progress = problem, config, results, progress
@@ -115,11 +100,7 @@ class _Measurements:
         self._left += [f"{name} with denoiser {self._other}" for name in self._controls]
 
     def rows(self) -> Iterator[PlannedRow]:
-        """Measure, and yield each row as it comes.
-
-        Raises:
-            OutOfTime: the time of the results is up.
-        """
+        """Measure, and yield each row as it comes, until the time of the results is up."""
         if self._gradients:
             self._compare_estimators()
             self._left.pop(0)
@@ -144,14 +125,7 @@ class _Measurements:
             self._left.pop(0)
 
     def result(self, rows: Sequence[PlannedRow], ending: str, run: str, seconds: float) -> PlanResult:
-        """Return what some rows come to.
-
-        Args:
-            rows: so far.
-            ending: how it ended.
-            run: the folder.
-            seconds: that it took.
-        """
+        """Return what the rows so far come to."""
         problem, config = self._problem, self._config
         table = [row for row in rows if isinstance(row, CosineRow)]
         tables = {name: [row for row in table if row.denoise == name] for name in (config.denoise, self._other)}
@@ -240,14 +214,11 @@ class _Measurements:
 
 
 def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAdvice:
-    """Say which denoiser makes the better gradients: the one that reaches the goal in all controls in less time.
+    """Say which denoiser makes the better gradients, by the cosines of each: the one that reaches the goal in all
+    controls in less time.
 
     A denoiser is part of the image formation, the same in search and verification, so that this is advice: another one
     is another question.
-
-    Args:
-        tables: denoiser to its measured cosines.
-        asked: the run's.
     """
 
     def rank(name: str) -> tuple[bool, float]:

@@ -80,9 +80,8 @@ def measured_gains(
 
     Returns:
         One row for each item, one for all, and where light transport can predict the pictures of a search one for that
-        too: against a rendered gradient, with a share of the making as large as the shortest search that predicts has,
-        its picture beside one of as many samples as its own.
-        What two seeds differ by is the root mean square of both with the item and both without.
+            too: against a rendered gradient, with a share of the making as large as the shortest search that predicts
+            has, its picture beside one of as many samples as its own.
     """
     scene = renderer.scene
     depth = scene.max_depth if depth is None else depth

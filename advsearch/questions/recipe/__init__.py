@@ -48,7 +48,5 @@ def _listed(as_json: bool) -> int:
 
 
 COMMAND = _Recipe(
-    "recipe",
-    about="recipe",
-    place=Positional("NAME", "a recipe, or list", "; list shows the recipes that there are"),
+    "recipe", about="recipe", place=Positional("NAME", "a recipe, or list", "; list shows the recipes that there are")
 )

@@ -100,11 +100,6 @@ def recipe_from_config(
 ) -> RecipeResult:
     """Carry out the recipe that a configuration names; parts that are done are not done again.
 
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: folder of the run to go on with.
-
     Raises:
         InputError: the recipe has a part or a figure that does not work; nothing is written where that is seen before.
     """
@@ -160,11 +155,8 @@ def _check(described: Recipe, config: RecipeConfig) -> None:
 
 
 def _check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
-    """Load everything that the runs name; a wrong name or label would end hours of rendering.
-
-    Returns:
-        For each part the parameters that its rows will have.
-    """
+    """Load everything that the runs name, as a wrong name or label would end hours of rendering; for each part the
+    parameters that its rows will have."""
     known: dict[str, set[str]] = {}
     columns: dict[str, set[str]] = {}
     searches = {one.name: one.config for one in runs}
@@ -215,14 +207,8 @@ def _photographed(described: Recipe, runs: Iterable[PlannedRun]) -> list[Planned
 def _carried_out(
     runs: Sequence[PlannedRun], run: RunDirectory, progress: Progress, notes: list[str]
 ) -> list[tuple[PlannedRun, Result]]:
-    """Carry out the runs that are not done, until one is interrupted; return all that there are.
-
-    Args:
-        runs: in their order.
-        run: of the recipe.
-        progress: told how far it is.
-        notes: gets a sentence for each run that cannot be carried out after another one's answer.
-    """
+    """Carry out the runs that are not done, until one is interrupted; return all that there are. `notes` gets a
+    sentence for each run that cannot be carried out after another one's answer."""
     results: list[tuple[PlannedRun, Result]] = []
     for number, one in enumerate(runs):
         path = run.path / PARTS / one.name
@@ -245,15 +231,11 @@ def _carried_out(
 
 
 def _around(config: SceneConfig, found: AnswerDistribution, searched: Mapping[str, FoundValue]) -> SceneConfig:
-    """Draw evenly from the distribution that a search answers with: mean and deviation are the same.
+    """Draw evenly from the distribution that a search answers with, over the ranges that it searched: mean and
+    deviation are the same.
 
-    An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's did; angles that go
-    all the way round may pass that end, and take the whole turn at most.
-
-    Args:
-        config: of the sweep that draws.
-        found: what the search answers with; its deviations are shares of the ranges.
-        searched: the ranges of its parameters.
+    An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's did; angles that go all
+    the way round may pass that end, and take the whole turn at most.
     """
     controls: dict[str, dict[str, object]] = {}
     for (name, mean), deviation in zip(found.mean.items(), found.deviation, strict=True):
@@ -277,11 +259,8 @@ def _range(name: str, mean: DescribedValue, searched: FoundValue, deviation: flo
 
 
 def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> Iterable[str]:
-    """Take the photographs in a folder into the runs that are compared with some; return what is missing.
-
-    Raises:
-        InputError: there are none at all, or one cannot be read.
-    """
+    """Take the photographs in a folder into the runs that are compared with some; return what is missing. An InputError
+    where there are none at all, or one cannot be read."""
     photographs, missing = Photographs(), list[str]()
     for one in wanted:
         inside = folder / Path(one.config.object).stem

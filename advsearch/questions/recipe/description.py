@@ -75,13 +75,7 @@ class Part(_Described):
 
 
 class Changes(_Described):
-    """What `quick` makes different.
-
-    Attributes:
-        settings: of all parts.
-        parts: settings of each.
-        without: parts that are left out.
-    """
+    """What `quick` makes different: settings of all parts, settings of each, and parts that are left out."""
 
     settings: Settings = Field(default_factory=dict)
     parts: dict[str, Settings] = Field(default_factory=dict)
@@ -156,11 +150,7 @@ def titles() -> dict[str, str]:
 
 
 def recipe_yaml(name: str) -> str:
-    """Return the YAML of a bundled recipe.
-
-    Raises:
-        UnknownNameError: there is no such recipe.
-    """
+    """Return the YAML of a bundled recipe."""
     if name not in recipe_names():
         raise UnknownNameError("recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path.")
     return str((_bundled() / f"{name}.yaml").read_text(encoding="utf-8"))
@@ -189,11 +179,7 @@ def is_file_name(name: str) -> bool:
 
 
 def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
-    """Return the recipe that a mapping describes.
-
-    Args:
-        data: as it stands in a YAML file.
-        where: that file, for messages.
+    """Return the recipe that a mapping describes, as it stands in the file `where`.
 
     Raises:
         FileFormatError: something is missing, unknown, or of another kind.
@@ -238,7 +224,6 @@ def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where:
     Raises:
         UnknownNameError: a figure names one; the message says which figure.
         InputError: a part that it shows has not the column that others have.
-        FileFormatError: as for `read_options`.
     """
     for number, described in enumerate(recipe.figures, start=1):
         kind, options = read_options(described, where)
@@ -272,14 +257,8 @@ MOST_RUNS = 1000
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run of a recipe.
-
-    Attributes:
-        name: of its folder.
-        part: that it belongs to.
-        config: what it does.
-        around: the folder of the run whose answer says what is drawn; None where the settings say it.
-    """
+    """One run of a recipe; `around` is the folder of the run whose answer says what is drawn, None where the settings
+    say it."""
 
     name: str
     part: str

@@ -28,11 +28,7 @@ class RecipeConfig(Config):
         "the experiment to run",
         "the name of a recipe, which advsearch recipe list shows, or a YAML file",
     )
-    quick: bool = setting(
-        False,
-        "recipe",
-        "few and small pictures, for a first look",
-    )
+    quick: bool = setting(False, "recipe", "few and small pictures, for a first look")
     photographs: str | None = setting(
         None,
         "recipe",

@@ -65,13 +65,8 @@ AT_CENTRE = 20
 
 @dataclass(frozen=True, eq=False)
 class Varied:
-    """The parameters in which the box grows.
-
-    Attributes:
-        names: of each.
-        places: (k,) where they lie in u.
-        groups: of numbers that they belong to.
-    """
+    """The parameters in which the box grows: their names, (k,) where they lie in u, and the groups of numbers that they
+    belong to."""
 
     names: tuple[str, ...]
     places: Tensor
@@ -94,11 +89,7 @@ def region(
 def region_from_config(
     config: RegionConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> RegionResult:
-    """Grow the region that a configuration describes and keep it in a run directory.
-
-    Raises:
-        InputError: the verdict at the centre depends on the noise, the parameters do not fit, and what a scene raises.
-    """
+    """Grow the region that a configuration describes and keep it in a run directory."""
     stages = Stages(progress or NullProgress())
     stages.begin("setup", LOADING)
     budget = {} if config.around is None else _budget(config.around)
@@ -256,11 +247,8 @@ def _varied(problem: Problem, config: RegionConfig) -> Varied:
 
 
 def _verdict(verifier: Verifier, centre: Tensor) -> bool:
-    """Whether the model is wrong at the centre.
-
-    Raises:
-        InputError: that depends on the noise, or the model's answer is not a number.
-    """
+    """Whether the model is wrong at the centre; an InputError where that depends on the noise, or the answer is not a
+    number."""
     verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
     wrong = nothing = 0
     for trial in verifier.trials("centre", dict.fromkeys(range(AT_CENTRE), centre), sought=False):

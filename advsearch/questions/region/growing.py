@@ -23,15 +23,8 @@ Same = Callable[[Tensor, int], bool]
 
 @dataclass(frozen=True, eq=False)
 class GrownBox:
-    """A box in which the answer stays the same.
-
-    Attributes:
-        centre: (d,) what it was grown around.
-        low, high: (d,) its corners, inside the unit box.
-        same: how many of the final samples had the centre's answer.
-        samples: how many there were.
-        renders: pictures in all.
-    """
+    """A box in the unit box in which the answer stays the same: the centre (d,) and its corners (d,), how many of the
+    final samples had the centre's answer, and pictures in all."""
 
     centre: Tensor
     low: Tensor
@@ -61,12 +54,7 @@ noise have taken."""
 
 
 def grow(
-    same: Same,
-    centre: Tensor,
-    *,
-    seed: int,
-    samples: int = 200,
-    on_check: Callable[[], None] = lambda: None,
+    same: Same, centre: Tensor, *, seed: int, samples: int = 200, on_check: Callable[[], None] = lambda: None
 ) -> GrownBox:
     """Grow a box around the centre, then check it with samples that nothing was fitted to.
 

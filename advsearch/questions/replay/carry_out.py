@@ -90,10 +90,7 @@ class Way:
 def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]) -> Iterator[Way]:
     """Yield every condition of a problem's answer but other models; the first changes nothing.
 
-    Args:
-        problem: as the run had it.
-        spp: samples a pixel of its verification.
-        sized: makes the same problem at another (height, width) in pixels.
+    `spp` is that of the run's verification, and `sized` makes the same problem at another (height, width) in pixels.
     """
     renderer = problem.renderer
     scene, formation = renderer.scene, renderer.formation
@@ -215,11 +212,7 @@ def replay_from_config(
     """Render an answer again as a configuration describes; every trial is stored at once, and a run goes on with the
     next.
 
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with.
-        parts: what the attack was asked with; None loads what its run names.
+    `parts` is what the attack was asked with; None loads what its run names.
 
     Raises:
         InputError: the run has no answer, or its scene is another one now.
@@ -272,18 +265,8 @@ def replay_from_config(
 
 @dataclass
 class _Table:
-    """The rows so far.
-
-    Attributes:
-        ways: the conditions of all rows.
-        u: (d,) the answer.
-        trials: of the answer in each row, and of the clean scene.
-        seed: root of theirs.
-        run: keeps them.
-        progress: told of every trial.
-        rows: by the place of their condition among `ways`.
-        renders: pictures that were rendered.
-    """
+    """The rows so far, by the place of their condition among all ways; the answer (d,), and the pictures that were
+    rendered."""
 
     ways: Sequence[Way]
     u: torch.Tensor
@@ -296,9 +279,7 @@ class _Table:
 
     def fill(self, batch: Sequence[int]) -> None:
         """Add the rows of some conditions that share their renders: the clean scene under all of them, then the answer.
-
-        A condition that cannot be had, or that Blender fails at, gets a row that says why.
-        """
+        A condition that cannot be had, or that Blender fails at, gets a row that says why."""
         ways = [self.ways[number] for number in batch]
         missing = next((way.missing for way in ways if way.missing), "")
         try:

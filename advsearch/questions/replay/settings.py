@@ -11,18 +11,7 @@ from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
 
-WAYS = (
-    "samples",
-    "resolution",
-    "depth",
-    "integrator",
-    "sampler",
-    "denoiser",
-    "curve",
-    "jpeg",
-    "sensor",
-    "blender",
-)
+WAYS = ("samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor", "blender")
 """What a replay may change beside the model."""
 
 REPLAY_TRIALS = 10

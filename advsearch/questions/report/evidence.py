@@ -56,12 +56,8 @@ def photo_claims(photos: PhotoAgreement) -> list[Claim]:
 
 
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
-    """Return what has to be known of runs together.
-
-    Args:
-        models: of each run.
-        digests: of each run's model files, one text a run; empty where none is known.
-    """
+    """Return what has to be known of runs together: their models, and the digests of each run's model files, one text a
+    run; empty where none is known."""
     said = []
     if len(set(models)) > 1:
         names = ", ".join(sorted(set(models)))
@@ -84,16 +80,8 @@ def evidence_of(
     made: Mapping[str, str],
     judged_by: Mapping[str, object] | None = None,
 ) -> EvidenceRun:
-    """Return a run with what a reader needs to judge its claims.
-
-    Args:
-        name: of the run.
-        result: what it answered.
-        claims: what it stands for.
-        settings: as its run.yaml has them.
-        made: versions and digests, as the run noted them; empty of older runs.
-        judged_by: the options of its task by name, such as thresholds.
-    """
+    """Return a run with what a reader needs to judge its claims: settings as its run.yaml has them, versions and
+    digests as it noted them (empty of older runs), and the options of its task, such as thresholds."""
     values = {field: getattr(result, field) for field in type(result).model_fields}
 
     objects = values.get("object") or ", ".join(values.get("objects") or ())

@@ -57,14 +57,6 @@ def stability_from_config(
     """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.
 
     A case that is done is stored at once: a run that was stopped goes on with the case that it was at.
-
-    Args:
-        config: which cases, and where the run is kept.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     cases, begun = chosen(config.cases, config.groups), time.perf_counter()
     with RunDirectory.of(config, resumed) as run:

@@ -31,13 +31,7 @@ OK, FELL_SHORT = "ok", "fell short"
 
 @dataclass(frozen=True)
 class Check:
-    """One number that decides, and the range that it has to be in (both ends included; NaN is in no range).
-
-    Attributes:
-        what: what was measured, with its unit.
-        value: the number.
-        least, most: the range.
-    """
+    """One number that decides, and the range that it has to be in (both ends included; NaN is in no range)."""
 
     what: str
     value: float
@@ -65,11 +59,10 @@ def holds(what: str, truth: bool) -> Check:
 
 
 class Outcome:
-    """What a case found.
+    """What a case found: the numbers that decide, and whether every picture and gradient was finite, and none had to be
+    made so.
 
-    Args:
-        checks: the numbers that decide.
-        finite: every picture and every gradient was finite, and none had to be made so.
+    Attributes:
         relative_error: of a gradient (or of what the case is about) against the reference; None where there is none.
         ending: how the case's search ended, "refused" where the input was, or empty.
         measured: further numbers that are worth printing.
@@ -115,12 +108,10 @@ class Case:
 
     Attributes:
         name: unique; what `--case` takes.
-        group: name of its group.
         holds: what must hold, in a sentence.
         rule: what handles it.
         control: the controls that it moves; empty where there is no scene.
         cheap: takes about a second or less on two quiet cores, so the tests run it every time.
-        find: does it.
     """
 
     name: str
@@ -134,12 +125,7 @@ class Case:
 
 @dataclass(frozen=True)
 class CaseGroup:
-    """Cases about one thing, in the order in which they run.
-
-    Attributes:
-        name: what `--group` takes.
-        cases: those that `case` has added.
-    """
+    """Cases about one thing, in the order in which they run; `name` is what `--group` takes."""
 
     name: str
     cases: list[Case] = field(default_factory=list)
@@ -171,8 +157,6 @@ class Toy:
     """An objective without a renderer, as a search wants it.
 
     Attributes:
-        value: the objective.
-        domain: where.
         scale: factor on the objective, as if it were in other units.
         disturb: what becomes of gradients.
         broken: numbers of evaluations whose objective is NaN, as is their gradient.
@@ -224,17 +208,8 @@ def valley(u: Tensor) -> Tensor:
 
 
 def hessian(value: Callable[[Tensor], float], u: Tensor, directions: Tensor, steps: Sequence[float]) -> Tensor:
-    """Estimate second derivatives by differences.
-
-    Args:
-        value: the objective; with common random numbers where it is noisy.
-        u: (d,) where.
-        directions: (k, d).
-        steps: k half-widths.
-
-    Returns:
-        (k, k) float64, symmetric: second derivatives along the directions.
-    """
+    """Estimate the second derivatives (k, k), float64, of an objective at u (d,) along directions (k, d), by
+    differences of k half-widths."""
     moves = [step * direction for step, direction in zip(steps, directions, strict=True)]
     here, found = value(u), torch.zeros(len(moves), len(moves), dtype=torch.float64)
     for i, one in enumerate(moves):
@@ -335,7 +310,7 @@ class Examined:
         inside: the picture is in [0, 1].
         compared: gradients beside their references; empty if that was not asked for.
         gradient: largest absolute entry of the gradient.
-        mean: mean of the picture.
+        mean: of the picture.
         result: of the short search.
     """
 
@@ -380,16 +355,8 @@ def examine_gradient(
     spp: int = SPP,
     seeds: tuple[int, int] = (3, 12),
 ) -> Examined:
-    """Render a configuration, differentiate it, compare the gradient with differences, and search from there.
-
-    Args:
-        renderer: the scene.
-        u: where; None for the start.
-        compare: whether to take references; they cost most of the time.
-        evaluations: of the search; each takes a gradient.
-        spp: samples a pixel of the picture and the gradient.
-        seeds: fewest and most seeds of a reference.
-    """
+    """Render a configuration, the start by default, differentiate it, compare the gradient with references of some
+    seeds (which cost most of the time), and search from there."""
     u = renderer.start if u is None else u
     loss = smooth_loss(renderer.formation.resolution)
     with torch.no_grad():

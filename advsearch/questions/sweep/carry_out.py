@@ -172,16 +172,7 @@ def sweep(
 def sweep_from_config(
     config: SweepConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> SweepResult:
-    """Do what a configuration describes and keep it in a run directory; see `sweep`.
-
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with: what is stored is not rendered again.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Do what a configuration describes and keep it in a run directory; see `sweep`."""
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
@@ -193,11 +184,7 @@ def sweep_from_config(
 
 
 def _folder(answer: str | Path | AttackResult | None) -> str | None:
-    """The run of an answer.
-
-    Raises:
-        InputError: the attack was not kept.
-    """
+    """The run of an answer; an InputError where the attack was not kept."""
     if isinstance(answer, AttackResult) and answer.run is None:
         raise InputError("answer_of: expected an attack that was kept, got one that was not; give it a `run`")
     kept = answer.run if isinstance(answer, AttackResult) else answer

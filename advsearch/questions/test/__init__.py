@@ -54,11 +54,7 @@ def _files(config: Config) -> dict[str, Path]:
 
 
 def _check_files(config: Config) -> None:
-    """Refuse files that cannot be written before anything is rendered.
-
-    Raises:
-        InputError: the folder of one is not there.
-    """
+    """Refuse, by an InputError, files that cannot be written before anything is rendered."""
     for name, path in _files(config).items():
         if path.is_dir() or not path.absolute().parent.is_dir():
             raise InputError(f"{name}: expected a file in a folder that is there, got {path}; make the folder first")

@@ -140,29 +140,16 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
 
 
 def right_reason(answer: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
-    """Return why a claim about a share is held, failed or undecided.
-
-    Args:
-        answer: one of these.
-        right: pictures that are right.
-        pictures: of so many.
-        interval: of the share, at all times together.
-        worst: what was seen where it was most wrong; empty where it never was.
-    """
+    """Return why a claim about a share is held, failed or undecided, with the interval at all times together. `worst`
+    is what was seen where it was most wrong; empty where it never was."""
     said = f"right in {right} of {pictures} (interval {interval_text(interval)})" if pictures else "no picture"
     more = f"; not decided after {count(pictures, 'picture')}" if answer == UNDECIDED else ""
     return said + more + (f"; {worst}" if worst else "")
 
 
 def difference_reason(answer: str, counts: tuple[int, int, int], interval: tuple[float, float], than: str) -> str:
-    """Return why a claim about two models is held, failed or undecided.
-
-    Args:
-        answer: one of these.
-        counts: pictures; those in which only the model is right, and those in which only the other one is.
-        interval: of the difference of shares.
-        than: the other model.
-    """
+    """Return why a claim about two models is held, failed or undecided. The counts are pictures; those in which only
+    the model is right, and those in which only the other one is."""
     pictures, ours, theirs = counts
     if not pictures:
         return "no picture"

@@ -16,7 +16,17 @@ from advsearch.engine.measuring import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.test.answer import FAILED, NOT_TRIED, STOPPED, TIME_OVER, UNDECIDED, ClaimAnswer, SuiteResult, statement, verdict
+from advsearch.questions.test.answer import (
+    FAILED,
+    NOT_TRIED,
+    STOPPED,
+    TIME_OVER,
+    UNDECIDED,
+    ClaimAnswer,
+    SuiteResult,
+    statement,
+    verdict,
+)
 from advsearch.questions.test.claims import Trial
 from advsearch.questions.test.counterexamples import (
     Counterexample,
@@ -58,13 +68,7 @@ class PlannedClaim:
 def test_from_config(
     config: SuiteConfig, *, progress: Progress | None = None, resumed: Path | None = None, suite: Suite | None = None
 ) -> SuiteResult:
-    """Try the claims of the suite that a configuration names; what is decided is not tried again.
-
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: folder of the run to go on with.
-        suite: in place of the file's.
+    """Try the claims of the suite that a configuration names, or of another one; what is decided is not tried again.
 
     Raises:
         InputError: the suite names something that is not there, contradicts itself, or could not be judged; nothing is
@@ -246,11 +250,8 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
 
 
 def _check(planned: Sequence[PlannedClaim], suite: Suite) -> None:
-    """Load everything that claims name; a wrong name would end minutes of rendering.
-
-    Raises:
-        InputError: something is not there, contradicts itself, or could not be judged.
-    """
+    """Load everything that claims name, and refuse what could not be judged; a wrong name would end minutes of
+    rendering."""
     known: list[AttackConfig] = []
     for one in planned:
         if one.one is not None:

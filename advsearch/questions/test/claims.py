@@ -25,7 +25,18 @@ from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.verifier import ladder_of
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.questions.test.answer import FAILED, HELD, TIME_OVER, UNDECIDED, ClaimAnswer, difference_reason, right_reason, search_answer, statement, tried_reason
+from advsearch.questions.test.answer import (
+    FAILED,
+    HELD,
+    TIME_OVER,
+    UNDECIDED,
+    ClaimAnswer,
+    difference_reason,
+    right_reason,
+    search_answer,
+    statement,
+    tried_reason,
+)
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
 from advsearch.questions.test.settings import AnyClaim, DrawnConfig, NoWorseClaim, RightClaim
 from advsearch.report.wording import number_text

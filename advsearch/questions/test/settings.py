@@ -272,20 +272,12 @@ class Suite(_Described):
 
 
 def read_suite(path: str | Path) -> Suite:
-    """Return the suite in a YAML file.
-
-    Raises:
-        FileFormatError: the file is missing or no YAML, or as for `suite_of`.
-    """
+    """Return the suite in a YAML file; a FileFormatError where it is missing or no YAML, or as for `suite_of`."""
     return suite_of(read_yaml(path), str(path))
 
 
 def suite_of(data: Mapping[str, object], where: str) -> Suite:
-    """Return the suite that a mapping describes.
-
-    Args:
-        data: as it stands in a YAML file.
-        where: that file, for messages.
+    """Return the suite that a mapping describes, as it stands in the file `where`.
 
     Raises:
         FileFormatError: something is missing, unknown, or of another kind; one sentence says what.

@@ -38,11 +38,8 @@ FIGURES: dict[str, FigureKind[Any, Any]] = {
 
 
 def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
-    """Return the kind of a figure, and its options.
-
-    Args:
-        described: as it stands in a recipe, with its kind as `figure`.
-        where: the recipe, for messages.
+    """Return the kind of a figure and its options, as they stand in a recipe, with its kind as `figure`; `where` is the
+    recipe.
 
     Raises:
         UnknownNameError: there is no such kind.
@@ -61,11 +58,8 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
 
 
 def compute(table: Table, kind: str, options: Options) -> list[RecipeFigure]:
-    """Return the numbers of a figure, and what they say; where it does not tell several models apart, of each model.
-
-    Raises:
-        InputError: it needs what the answers do not have.
-    """
+    """Return the numbers of a figure, and what they say; where it does not tell several models apart, of each model. An
+    InputError where it needs what the answers do not have."""
     shown = table.of(options.parts)
     together = FIGURES[kind].tells_models or MODEL in vars(options).values()
     if together or len({row.values.get(MODEL) for row in shown.rows}) < 2:

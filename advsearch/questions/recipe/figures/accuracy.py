@@ -74,13 +74,7 @@ def _draw_bars(made: BarsFigure, figure: Any, run: Path) -> None:
     axes.grid(True, axis="x")
 
 
-BARS = FigureKind(
-    BarsOptions,
-    BarsFigure,
-    _compute_bars,
-    _draw_bars,
-    lambda made: (6.0, 1.2 + 0.27 * len(made.bars)),
-)
+BARS = FigureKind(BarsOptions, BarsFigure, _compute_bars, _draw_bars, lambda made: (6.0, 1.2 + 0.27 * len(made.bars)))
 
 
 class PointsOptions(Options):
