@@ -22,9 +22,20 @@ from advsearch.errors import AdvsearchError, FileFormatError, InputError, Unknow
 from advsearch.explanations.observations import Answered
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult, figure_table, told_once
-from advsearch.questions.recipe.description import Recipe, check_figures, planned, read_recipe, recipe_names, titles
-from advsearch.questions.recipe.figures import FIGURES, accuracy, compute, draw_figure, read_options
-from advsearch.questions.recipe.figures.given import fitting
+from advsearch.questions.recipe.description import (
+    FIGURES,
+    Recipe,
+    accuracy,
+    check_figures,
+    compute,
+    draw_figure,
+    planned,
+    read_options,
+    read_recipe,
+    recipe_names,
+    titles,
+)
+from advsearch.questions.recipe.given import fitting
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, count_of
 from advsearch.runs.images import write_png

@@ -29,13 +29,15 @@ from advsearch.questions.recipe.description import (
     PlannedRun,
     Recipe,
     check_figures,
+    compute,
+    draw_figure,
     made_of,
     names_listed,
     planned,
+    read_options,
     read_recipe,
     recipe_of,
 )
-from advsearch.questions.recipe.figures import compute, draw_figure, read_options
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, photographs_of
 from advsearch.questions.sweep.carry_out import job_of

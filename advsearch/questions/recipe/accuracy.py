@@ -10,6 +10,7 @@ from pydantic import Field
 
 from advsearch.errors import InputError
 from advsearch.explanations.observations import Answered
+from advsearch.questions.recipe.along import COLOURS, MARKS
 from advsearch.questions.recipe.answer import (
     BarsFigure,
     CorruptionFigure,
@@ -21,7 +22,6 @@ from advsearch.questions.recipe.answer import (
     SurfaceOf,
     bare,
 )
-from advsearch.questions.recipe.figures.along import COLOURS, MARKS
 from advsearch.questions.recipe.table import (
     FigureKind,
     Options,
