@@ -14,7 +14,7 @@ from advsearch.interrupts import interruptible
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Fields, Result
 from advsearch.runs.summary import NAME, read_result
-from advsearch.viewer.pages import write_page
+from advsearch.viewer.pages import keep_answer
 
 Row = TypeVar("Row")
 Answer = TypeVar("Answer", bound=Result)
@@ -121,6 +121,4 @@ def kept_rows(
     if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
         before = read_result(run.path)
         return before if isinstance(before, type(answer)) else answer
-    run.write_summary(answer)
-    write_page(run.path, answer)
-    return answer
+    return keep_answer(run, answer)

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import losses
 from advsearch.api.keywords import AttackKeywords, asks
@@ -62,9 +63,6 @@ from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.tasks import AnyTask, Task, make_task
 from advsearch.tasks.own import OwnTask, function_of
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 PREPARING = "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""

@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
@@ -47,9 +49,6 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import CosineRow
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients import STEP_RANGE, Group, compared
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class CheckKeywords(PlanKeywords, total=False):

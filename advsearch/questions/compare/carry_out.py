@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import Named, Names, SampledKeywords, asks, configured
 from advsearch.api.studies import carry_out_part
@@ -28,10 +29,7 @@ from advsearch.runs.results.base import INTERRUPTED
 from advsearch.settings import split_names
 from advsearch.viewer import thumbnails
 from advsearch.viewer.columns import Column
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 SWEEP = "sweep"
 """The part that holds the sweep of models."""
@@ -111,9 +109,7 @@ def compare_from_config(
             seed=config.seed,
             command_line=config.command_line(),
         )
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _counted(first: Side, second: Side, seed: int, pictures: _Pictures) -> ComparedPair:

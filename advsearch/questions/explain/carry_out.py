@@ -6,7 +6,8 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
@@ -30,10 +31,7 @@ from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.summary import read_result
 from advsearch.settings import split_names
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
 class ExplainKeywords(RunKeywords, total=False):
@@ -115,9 +113,7 @@ def explain_from_config(
             seed=config.seed,
             command_line=config.command_line(),
         )
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _sweeps_of(folder: Path) -> list[Path]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import GapKeywords, asks, configured
 from advsearch.api.studies import StudyRun, carry_out_study
@@ -13,9 +14,6 @@ from advsearch.progress import Progress, Watched, watcher
 from advsearch.questions.gap.answer import GapResult, GapRow
 from advsearch.questions.gap.settings import GapConfig
 from advsearch.runs.results.attack import AttackSummary, AverageCase
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 @asks(GapConfig, GapKeywords)

@@ -10,9 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
@@ -64,10 +65,7 @@ from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.store import Row
 from advsearch.tasks import make_task
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
 class HardenKeywords(RunKeywords, total=False):
@@ -190,9 +188,7 @@ def _carry_out(
         result = work.result(ending, warnings, time.perf_counter() - begun)
         for suffix, data in hardened_figure(result).items():
             write_bytes(run.path / IMAGES / f"{config.command}.{suffix}", data)
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:

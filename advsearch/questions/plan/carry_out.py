@@ -7,10 +7,11 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, configured
@@ -45,9 +46,6 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import predicting, why_not
 from advsearch.scene.transport.renderer import SPP
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):

@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, Names, asks, configured
@@ -55,10 +56,7 @@ from advsearch.runs.results.base import Formation
 from advsearch.runs.summary import to_json
 from advsearch.scene.renderer import Renderer
 from advsearch.settings import split_names
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
 class PrecisionKeywords(DerivativeKeywords, NamedKeywords, total=False):
@@ -110,9 +108,7 @@ def precision_from_config(
         with RunDirectory.of(config, resumed) as run:
             report = _measured(config, run, progress)
             report = report.model_copy(update={"figures": _write(run.path / "images", report)})
-            run.write_summary(report)
-            write_page(run.path, report)
-            return report
+            return keep_answer(run, report)
     report, folder = _measured(config, None, progress), Path(config.out).expanduser()
     report = report.model_copy(update={"figures": _write(folder, report)})
     write_text(folder / NUMBERS, to_json(report) + "\n")

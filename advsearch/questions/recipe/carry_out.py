@@ -8,9 +8,10 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
 from advsearch.api.studies import carry_out_part
@@ -52,10 +53,7 @@ from advsearch.runs.store import Store
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import attack_of, read_result
 from advsearch.threads import cores
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
 class RecipeKeywords(RunKeywords, total=False):
@@ -124,9 +122,7 @@ def recipe_from_config(
         figures = [] if interrupted else list(_figures(described, config, results, run))
         seconds = time.perf_counter() - begun + (_seconds(run.path) if resumed is not None else 0.0)
         result = _result(described, config, run, results, figures, notes, seconds)
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _noted(path: Path) -> bool:

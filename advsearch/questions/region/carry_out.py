@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import NamedKeywords, Names, PictureKeywords, asks, configured
@@ -40,10 +41,7 @@ from advsearch.scene.surface import plan
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.seeds import stream
 from advsearch.settings import split_names
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
 class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
@@ -126,9 +124,7 @@ def region_from_config(
             seed=config.seed,
             command_line=config.command_line(),
         )
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:

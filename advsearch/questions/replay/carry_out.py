@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import Names, RunKeywords, asks, configured
@@ -38,11 +39,7 @@ from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import attack_of
 from advsearch.scene.exporting.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
+from advsearch.viewer.pages import keep_answer
 
 OWN = "as verified"
 """The way in which nothing is changed."""
@@ -258,9 +255,7 @@ def replay_from_config(
             seed=parts.config.seed,
             command_line=config.command_line(),
         )
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 @dataclass

@@ -10,7 +10,8 @@ import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import Names, RunKeywords, asks, configured
 from advsearch.engine.measuring import Results, kept_rows
@@ -26,9 +27,6 @@ from advsearch.questions.stability.searches import NOISE, OBJECTIVE
 from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.questions.stability.stiff import STIFF
 from advsearch.runs.directory import RunDirectory
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 _GROUPS = (RADIOMETRIC, MATERIALS, GEOMETRY, OBJECTIVE, STIFF, PRECISION, NOISE, TRANSPORT, SURFACE_LIGHT)
 GROUPS: tuple[str, ...] = tuple(group.name for group in _GROUPS)

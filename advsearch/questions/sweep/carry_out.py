@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.cluster.executor import Call
@@ -55,9 +56,6 @@ from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task
 from advsearch.tasks.own import OwnTask, function_of
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
 """Settings that a scene of the caller's own has."""

@@ -49,7 +49,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
-from advsearch.viewer.pages import write_page
+from advsearch.viewer.pages import keep_answer
 
 NOTE = "suite"
 """Under which a run's store keeps the suite with its seed, so that it goes on as it began."""
@@ -108,9 +108,7 @@ def test_from_config(
             remove(added)
             raise InputError(f"add: the answer of {config.add} is not kept: {suite_run.answers[0].reason}")
         result = suite_run.result(ending, time.perf_counter() - begun, added)
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 @dataclass
