@@ -10,7 +10,7 @@ from pydantic import Field
 from advsearch.report import wording
 from advsearch.report.claims import Claim, Extent
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent, percent_number
+from advsearch.report.phrases import percent, share_of_text
 from advsearch.report.shown import AnswerPart, Column, Picture, ShownAnswer
 from advsearch.report.wording import conditions_text
 from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
@@ -248,14 +248,8 @@ def rules_texts(pair: ComparedPair) -> list[str]:
 
 def _rule_text(rule: PairRule, number: int) -> str:
     rest = "elsewhere" if number == 0 else "in what no rule before covers"
-    return f"{conditions_text(rule.conditions)}, in {_share(rule)} pairs; {rest} in {_share(rule.elsewhere)}."
-
-
-def _share(counted: CountOf) -> str:
-    if not counted.total:
-        return "none of 0"
-    low, high = map(percent_number, counted.interval)
-    return f"{percent(counted.count / counted.total)} ({low} to {high}) of {counted.total:,}"
+    inside, outside = (share_of_text(one.count, one.total, one.interval) for one in (rule, rule.elsewhere))
+    return f"{conditions_text(rule.conditions)}, in {inside} pairs; {rest} in {outside}."
 
 
 def parts_of(pair: ComparedPair) -> dict[str, list[PairPart]]:

@@ -14,7 +14,6 @@ from advsearch.api.keywords import Named, Names, SampledKeywords, asks, configur
 from advsearch.api.studies import carry_out_part
 from advsearch.attacks import clopper_pearson
 from advsearch.engine.loading import Controls
-from advsearch.engine.sweeps.job import check_all
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import interruptible
@@ -22,7 +21,7 @@ from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult, PairPicture
 from advsearch.questions.compare.settings import CompareConfig
 from advsearch.questions.compare.sides import Side, compared, differing, far_apart, read_sides, varying
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED
@@ -124,16 +123,10 @@ def _counted(first: Side, second: Side, seed: int, pictures: _Pictures) -> Compa
 
 def _side(side: Side) -> ComparedSide:
     right, total = int(side.right.sum()), len(side)
-    return ComparedSide(
-        name=side.name,
-        run=str(side.folder),
-        **side.named,
-        configurations=total,
-        correct=right,
-        accuracy=right / total,
-        interval=clopper_pearson(right, total),
-        seconds=side.seconds,
-    )
+    counts = {"configurations": total, "correct": right, "accuracy": right / total}
+    interval = clopper_pearson(right, total)
+    named = {"name": side.name, "run": str(side.folder), **side.named}
+    return ComparedSide(**named, **counts, interval=interval, seconds=side.seconds)
 
 
 def _together(names: Sequence[str]) -> str:
@@ -179,7 +172,9 @@ class _Pictures:
         with suppress(KeyboardInterrupt), interruptible():
             self._make(numbers, sides, pair)
         for number in numbers:
-            names = [name for place in range(len(sides)) if self._file(name := _name(pair, number, place)).is_file()]
+            names = [
+                name for place in range(len(sides)) if (self.folder / (name := _name(pair, number, place))).is_file()
+            ]
             yield PairPicture(
                 number=number,
                 values={one.name: _value(one, number) for one in columns},
@@ -194,7 +189,7 @@ class _Pictures:
         missing: list[tuple[Side, int, Path]] = []
         for place, side in enumerate(sides):
             for number in numbers:
-                file = self._file(_name(pair, number, place))
+                file = self.folder / _name(pair, number, place)
                 kept = thumbnails.path_of(side.folder, int(side.numbers[number]))
                 if kept.is_file():
                     write_bytes(file, kept.read_bytes(), durable=False)
@@ -215,19 +210,13 @@ class _Pictures:
         if side.folder not in self.scenes:
             self.scenes[side.folder] = None
             try:
-                job = job_of(side.config)
-                check_all(job)
-                self.scenes[side.folder] = Scenes(job)
+                self.scenes[side.folder] = scenes_of(side.config)
             except (InputError, ModelError) as error:
                 self.warnings.append(f"Pictures of {side.folder.name} are not shown: {error}")
         return self.scenes[side.folder]
 
-    def _file(self, name: str) -> Path:
-        return self.folder / name
-
 
 def _name(pair: int, number: int, place: int) -> str:
-    """The file of a picture of a pair, in the folder of the run."""
     return f"images/pair-{pair}-{number}-{'ab'[place]}.jpg"
 
 

@@ -165,24 +165,23 @@ def _sides_of(folder: Path, *, alone: bool) -> list[Side]:
         for model in range(models):
             rows = order[numbers * models + model]
             columns = tuple(replace(one, data=one.data[rows]) for one in found.parameters)
-            named = {one.name: _together(one) for one in columns if one.name in OF_THE_SIDE}
-            named.setdefault("object", summary.object)
-            named.setdefault("model", config.models[model])
-            named.setdefault("answer", "")
-            side = Side(
-                name="",
-                folder=folder,
-                config=config,
-                summary=summary,
-                named=named,
-                numbers=numbers,
-                right=found.right[rows] == 1,
-                margin=found.margin[rows],
-                answers=np.array(found.answers)[found.answer[rows]],
-                columns=tuple(one for one in columns if one.name not in ("model", "answer")),
-                seconds=seconds,
+            named = {"object": summary.object, "model": config.models[model], "answer": ""}
+            named |= {one.name: _together(one) for one in columns if one.name in OF_THE_SIDE}
+            sides.append(
+                Side(
+                    name="",
+                    folder=folder,
+                    config=config,
+                    summary=summary,
+                    named=named,
+                    numbers=numbers,
+                    right=found.right[rows] == 1,
+                    margin=found.margin[rows],
+                    answers=np.array(found.answers)[found.answer[rows]],
+                    columns=tuple(one for one in columns if one.name not in ("model", "answer")),
+                    seconds=seconds,
+                )
             )
-            sides.append(side)
     return sides
 
 
@@ -341,5 +340,4 @@ def _rule(rule: CountedRule, factors: Sequence[Factor]) -> PairRule:
 
 
 def _count_of(count: int, total: int) -> CountOf:
-    interval = clopper_pearson(count, total) if total else (0.0, 1.0)
-    return CountOf(count=count, total=total, interval=interval)
+    return CountOf(count=count, total=total, interval=clopper_pearson(count, total) if total else (0.0, 1.0))

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from advsearch.report import wording
 from advsearch.report.claims import Claim, Extent, claim, nothing_claimed, share_text
-from advsearch.report.phrases import percent, percent_number
+from advsearch.report.phrases import percent, share_of_text
 from advsearch.report.shown import AnswerPart, Column, Picture, ShownAnswer
 from advsearch.report.wording import conditions_text, interval_text
 from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
@@ -220,10 +220,7 @@ def not_told_text(result: ExplainResult) -> str:
 
 def right_share_text(counted: RightOf) -> str:
     """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
-    if not counted.total:
-        return "none of 0"
-    low, high = map(percent_number, counted.interval)
-    return f"{percent(counted.right / counted.total)} ({low} to {high}) of {counted.total:,}"
+    return share_of_text(counted.right, counted.total, counted.interval)
 
 
 def envelope_text(result: ExplainResult) -> str:

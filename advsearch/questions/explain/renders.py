@@ -18,8 +18,6 @@ from advsearch import seeds
 from advsearch.api.studies import carry_out_part
 from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
-from advsearch.engine.sweeps.job import check_all
-from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.explanations.observations import Answered, Factor, Mask, Observations, figure_value, rows_of
 from advsearch.explanations.rules import CountedRule, RuleCondition, RuleConditions, covered
@@ -29,7 +27,7 @@ from advsearch.progress import Progress
 from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.explain.findings import find_clusters
 from advsearch.questions.explain.settings import ExplainConfig
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
@@ -359,15 +357,13 @@ def _sweep_of(index: int, asked: Sequence[AskedSweep]) -> AskedSweep:
 def pictures_again(config: SweepConfig, numbers: Sequence[int], progress: Progress) -> tuple[Tensor, Features]:
     """Return pictures (n, H, W, 3) of a sweep of one model, as the model saw them, and what reads its features; an
     InputError where the scene is not to be had any more, or the task is another than classification."""
-    job = job_of(config)
-    if job.tasks[0].varies:
+    scenes, pictures = scenes_of(config), []
+    if scenes.job.tasks[0].varies:
         raise InputError(f"task {config.task_name}: features are read of classifiers")
-    check_all(job)
-    scenes, pictures = Scenes(job), []
     for number in numbers:
         pictures.append(scenes.picture(number))
         progress.advance(1)
-    return torch.stack(pictures), features_of(job.models[0])
+    return torch.stack(pictures), features_of(scenes.job.models[0])
 
 
 def right_of(right: int, of: int) -> RightOf:

@@ -24,15 +24,13 @@ from advsearch.engine.metrics import judgements
 from advsearch.engine.naming import load_models, scene_of
 from advsearch.engine.retrial import kept_answer
 from advsearch.engine.rows import judged
-from advsearch.engine.sweeps.job import check_all
-from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.engine.turn import in_turn
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
 from advsearch.questions.photographs.answer import FOLDER, LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
 from advsearch.questions.photographs.serving import LARGEST, photo_name, rendering_file, sound_photo
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store
@@ -225,9 +223,8 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
 
 def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
     """Who judges by the configurations of a sweep."""
-    job = job_of(config)
-    check_all(job)
-    scenes = Scenes(job)
+    scenes = scenes_of(config)
+    job = scenes.job
 
     def truth(model: int, rendering: str, name: str) -> Truth:
         number = int(rendering)

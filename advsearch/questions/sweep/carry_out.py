@@ -38,7 +38,7 @@ from advsearch.engine.naming import (
 from advsearch.engine.sharing import answering
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
 from advsearch.engine.sweeps.drives import with_frames
-from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
+from advsearch.engine.sweeps.job import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
 from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.engine.sweeps.swept_scene import Scenes
@@ -252,6 +252,13 @@ def job_of(config: SweepConfig) -> Job:
     """Find and load everything that a configuration names."""
     job = _job(config, _places(config), config.models, config.task, config.controls)
     return replace(job, metrics=load_metrics(config.metrics))
+
+
+def scenes_of(config: SweepConfig) -> Scenes:
+    """Return what renders pictures of a sweep again; everything that it names is looked at first."""
+    job = job_of(config)
+    check_all(job)
+    return Scenes(job)
 
 
 def _job(
