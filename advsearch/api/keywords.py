@@ -53,24 +53,29 @@ class RunKeywords(TypedDict, total=False):
     overwrite: bool
 
 
-class PictureKeywords(TypedDict, total=False):
-    """Scene, pictures and machine, of every question that renders."""
+class RenderedKeywords(TypedDict, total=False):
+    """Light, pictures and machine, of every question that renders."""
 
     environment: Path | Names | None
-    up: Literal["y", "z"] | None
-    camera: str | None
     set: Mapping[str, float | str | Sequence[float]] | None
     exposure: float | None
     resolution: int | str | tuple[int, int] | None
     labels: Path | Names | None
     prompt: Names | None
-    label: int | np.integer[Any] | Names | None
     texture_resolution: int | None
     denoise: Literal["oidn", "none"]
     pixel_sampler: Literal["independent", "multijitter"]
     seed: int
     threads: int | None
     deterministic: bool
+
+
+class PictureKeywords(RenderedKeywords, total=False):
+    """And scene, of every question about one."""
+
+    up: Literal["y", "z"] | None
+    camera: str | None
+    label: int | np.integer[Any] | Names | None
 
 
 class NamedKeywords(RunKeywords, total=False):

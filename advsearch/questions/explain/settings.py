@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
-
-from pydantic import field_validator
+from typing import ClassVar
 
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 
 
 class ExplainConfig(Config):
@@ -55,16 +53,8 @@ class ExplainConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-explain-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("sweeps", "run", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any, info: Any) -> Any:
-        return as_text(value, several=info.field_name == "sweeps")
-
-    @field_validator("sweeps")
-    @classmethod
-    def _different(cls, value: str) -> str:
-        check_once(split_names(value), "sweeps")
-        return value
+    _named = texts("run", several=["sweeps"])
+    _different = each_once("sweeps")
 
     @property
     def title(self) -> tuple[str, ...]:

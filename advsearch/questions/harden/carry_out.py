@@ -16,7 +16,7 @@ import numpy as np
 from typing_extensions import Unpack
 
 from advsearch import seeds
-from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
+from advsearch.api.keywords import Named, Names, RenderedKeywords, RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.engine import run_settings
@@ -68,21 +68,9 @@ from advsearch.tasks import make_task
 from advsearch.viewer.pages import keep_answer
 
 
-class HardenKeywords(RunKeywords, total=False):
+class HardenKeywords(RenderedKeywords, RunKeywords, total=False):
     """Of `harden`."""
 
-    environment: Path | Names | None
-    set: Mapping[str, float | str | Sequence[float]] | None
-    exposure: float | None
-    resolution: int | str | tuple[int, int] | None
-    labels: Path | Names | None
-    prompt: Names | None
-    texture_resolution: int | None
-    denoise: Literal["oidn", "none"]
-    pixel_sampler: Literal["independent", "multijitter"]
-    seed: int
-    threads: int | None
-    deterministic: bool
     controls: Controls
     spp: int | Literal["auto"] | None
     epsilon: float | Mapping[str, float] | None

@@ -19,7 +19,6 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.engine.attack_parts import check_from_config
-from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
 from advsearch.explanations.observations import TRIAL, WORKERS, Answered, rows_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
@@ -41,7 +40,7 @@ from advsearch.questions.recipe.description import (
 )
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, photographs_of
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.report.phrases import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
@@ -176,8 +175,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
         check_from_config(config)
     if not isinstance(config, SweepConfig):
         return _declared_columns(config, trials=True)
-    job = job_of(config)
-    check_all(job)
+    job = scenes_of(config).job
     space = job.space(job.places[0], job.sizes[0])
     halfway = torch.full_like(space.start, 0.5)
     return {name for u in (space.start, halfway) for name in space.describe(u)}

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, resembling
-from advsearch.settings import Clash, Config, as_text, check_once, read_yaml, setting, setting_as_in, shown, split_names
+from advsearch.settings import Clash, Config, each_once, read_yaml, setting, setting_as_in, shown, split_names, texts
 from advsearch.settings.configuration import PLACE
 
 
@@ -86,16 +86,8 @@ class SuiteConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/SUITE-test-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("suite", "only", "add", "model", "junit", "sarif", "markdown", "run", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any, info: Any) -> Any:
-        return as_text(value, several=info.field_name == "only")
-
-    @field_validator("only")
-    @classmethod
-    def _once(cls, value: str | None) -> str | None:
-        check_once(() if value is None else split_names(value), "only")
-        return value
+    _named = texts("suite", "add", "model", "junit", "sarif", "markdown", "run", several=["only"])
+    _different = each_once("only")
 
     @property
     def chosen(self) -> tuple[str, ...]:
