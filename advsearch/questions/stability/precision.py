@@ -138,15 +138,12 @@ def many_steps(name: str) -> Outcome:
 
     times: list[float] = []
     begun = time.perf_counter()
-    result = search(
-        partial(map, Toy(value, domain)),
-        domain,
-        make_policy(name),
-        steps=LONG,
-        seed=0,
-        candidates=0,
-        on_step=lambda record, u, found: times.append(time.perf_counter()),
-    )
+
+    def note(record: object, u: Tensor, found: object) -> None:
+        times.append(time.perf_counter())
+
+    policy = make_policy(name)
+    result = search(partial(map, Toy(value, domain)), domain, policy, steps=LONG, seed=0, candidates=0, on_step=note)
     gap = float(value(best.double())) - result.best_objective
     late, early = times[-1] - times[-LONG // 5], times[LONG // 5] - begun
     return Outcome(

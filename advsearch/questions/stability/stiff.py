@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Policy, SearchResult, make_policy, search
+from advsearch.attacks import PGD, Domain, Policy, SearchResult, make_policy, search
 from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
 from advsearch.engine.gradients import smooth_loss
@@ -54,18 +54,16 @@ _BOX = "controls map their units to the unit box; policies know nothing else"
 _BLOCKS = "a step has the length of each block's own radius (Domain.steepest); adam divides by each number's own scale"
 
 
-def path(toy: Toy, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0) -> tuple[SearchResult, Tensor]:
+def path(
+    evaluate: Toy | Evaluator, domain: Domain, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0
+) -> tuple[SearchResult, Tensor]:
     """Search, and return the result and the configurations (n, d) that were evaluated."""
     seen: list[Tensor] = []
-    result = search(
-        partial(map, toy),
-        toy.domain,
-        policy,
-        steps=steps,
-        seed=seed,
-        candidates=0,
-        on_step=lambda record, u, found: seen.append(u),
-    )
+
+    def note(record: object, u: Tensor, found: object) -> None:
+        seen.append(u)
+
+    result = search(partial(map, evaluate), domain, policy, steps=steps, seed=seed, candidates=0, on_step=note)
     return result, torch.stack(seen)
 
 
@@ -83,7 +81,7 @@ def rescaled_units() -> Outcome:
         paths = []
         for watt, degree in ((1.0, 1.0), (1e3, math.pi / 180.0), (1e-6, 3600.0)):
             toy = _lamp_and_rotation(watt, degree)
-            result, seen = path(toy, make_policy(name), steps=60)
+            result, seen = path(toy, toy.domain, make_policy(name), steps=60)
             paths.append(seen)
             endings.add(result.ending.value)
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
@@ -121,7 +119,7 @@ def objective_units() -> Outcome:
         paths = []
         for scale in (1.0, 1e-6, 1e6):
             toy = Toy(quadratic([0.7, 0.4], [1.0, 30.0]), box_domain([0.1, 0.9]), scale=scale)
-            paths.append(path(toy, make_policy(name), steps=60)[1])
+            paths.append(path(toy, toy.domain, make_policy(name), steps=60)[1])
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
     return Outcome(Check("largest distance of two trajectories in u", worst, most=SAME), relative_error=worst)
 
@@ -134,17 +132,17 @@ def curvatures(ratio: float = RATIO) -> Outcome:
     """A search takes no more evaluations than where the curvatures are equal."""
     checks, measured, start, peak = [], {}, [0.15, 0.9], [0.63, 0.37]
     for name in FOLLOWERS:
-        worst = 0.0
-        alike = _until_there(name, quadratic(peak, [1.0, 1.0]), start, peak)
-        for pair in ([ratio, 1.0], [1.0, ratio]):
-            worst = max(worst, _until_there(name, quadratic(peak, pair), start, peak))
+        alike, *stiff = (
+            _until_there(name, quadratic(peak, pair), start, peak) for pair in ([1.0, 1.0], [ratio, 1.0], [1.0, ratio])
+        )
+        worst = max(stiff)
         measured[f"{name}: evaluations, equal"] = alike
         measured[f"{name}: evaluations, stiff"] = worst
         checks.append(
             Check(f"{name}: evaluations to the peak over those where it is round", worst / alike, most=SLOWER)
         )
-    stiff = quadratic(peak, [ratio, 1.0])
-    second = hessian(lambda u: float(stiff(u)), torch.tensor(peak).double(), torch.eye(2).double(), [1e-2, 1e-2])
+    value = quadratic(peak, [ratio, 1.0])
+    second = hessian(lambda u: float(value(u)), torch.tensor(peak).double(), torch.eye(2).double(), [1e-2, 1e-2])
     found = condition_number(second)
     measured["condition number"] = found
     checks.append(Check("estimated condition number over the true one", found / ratio, 0.95, 1.05))
@@ -163,7 +161,8 @@ def _until_there(name: str, value: Value, start: list[float], peak: list[float],
 
     counts = []
     for seed in range(SEEDS):
-        _, seen = path(Toy(value, box_domain(start), disturb=disturb), make_policy(name), seed=seed)
+        domain = box_domain(start)
+        _, seen = path(Toy(value, domain, disturb=disturb), domain, make_policy(name), seed=seed)
         near = ((seen - torch.tensor(peak)).abs().amax(dim=1) <= CLOSE).nonzero()
         counts.append(float(near[0]) + 1.0 if len(near) else math.inf)
     return sum(counts) / len(counts)
@@ -202,10 +201,9 @@ def curved_valley(steps: int = 400) -> Outcome:
     """
     start, measured = [0.2, 0.75], {}
     for name in ("random", "auto", "pgd", "adam", "cmaes"):
-        gaps = sorted(
-            -path(Toy(valley, box_domain(start)), make_policy(name), steps=steps, seed=seed)[0].best_objective
-            for seed in range(SEEDS)
-        )
+        toy = Toy(valley, box_domain(start))
+        searched = [path(toy, toy.domain, make_policy(name), steps=steps, seed=seed)[0] for seed in range(SEEDS)]
+        gaps = sorted(-one.best_objective for one in searched)
         measured[f"{name}: median gap"] = gaps[len(gaps) // 2]
     second = hessian(lambda u: float(valley(u)), torch.tensor([0.75, 0.75]).double(), torch.eye(2).double(), [1e-3] * 2)
     measured["condition number"] = condition_number(second)
@@ -233,12 +231,9 @@ def wide_box(width: float = 1e-3) -> Outcome:
 
     checks, measured = [], {}
     for name in ("auto", "pgd", "adam", "cmaes", "random"):
-        gaps = sorted(
-            float(
-                (path(Toy(value, box_domain(start)), make_policy(name), steps=150, seed=s)[0].best_u[1] - peak[1]).abs()
-            )
-            for s in range(SEEDS)
-        )
+        toy = Toy(value, box_domain(start))
+        searched = [path(toy, toy.domain, make_policy(name), steps=150, seed=seed)[0] for seed in range(SEEDS)]
+        gaps = sorted(abs(float(one.best_u[1] - peak[1])) for one in searched)
         measured[f"{name}: median distance"] = gaps[len(gaps) // 2]
     for name in ("pgd", "adam", "cmaes"):
         checks.append(
@@ -316,17 +311,6 @@ def light_rotation_texel() -> Outcome:
 
 
 def _walk(renderer: Renderer, u: Tensor, loss: Value, scale: float) -> tuple[SearchResult, Tensor]:
-    """Search from u for a larger loss, in units of `scale`; return the result and where it has been (n, d)."""
-    seen: list[Tensor] = []
-
-    def scaled(image: Tensor) -> Tensor:
-        return scale * loss(image)
-
-    def note(record: object, at: Tensor, found: object) -> None:
-        seen.append(at)
-
-    evaluate = Evaluator(renderer, scaled, 8)
-    result = search(
-        partial(map, evaluate), search_domain(renderer, u), PGD(), steps=18, seed=0, candidates=0, on_step=note
-    )
-    return result, torch.stack(seen)
+    """Search from u for a larger loss, in units of `scale`."""
+    evaluate = Evaluator(renderer, lambda image: scale * loss(image), 8)
+    return path(evaluate, search_domain(renderer, u), PGD(), steps=18)
