@@ -83,21 +83,19 @@ def plan_from_config(
     progress, begun = progress or NullProgress(), time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
         progress.stage(LOADING)
-        results = Results(run, config.seconds)
-        problem, _ = problem_from_config(config)
-        work = _Measurements(problem, config, results, progress)
+        work = _Measurements(problem_from_config(config)[0], config, Results(run, config.seconds), progress)
 
         def result(rows: Sequence[PlannedRow], ending: str) -> PlanResult:
             return work.result(rows, ending, str(run.path), time.perf_counter() - begun)
 
-        return kept_rows(run, results, work.rows(), result)
+        return kept_rows(run, work.results, work.rows(), result)
 
 
 class _Measurements:
     """What a plan measures, one after the other, what matters most first."""
 
     def __init__(self, problem: Problem, config: PlanConfig, results: Results, progress: Progress) -> None:
-        self._problem, self._config, self._results, self._progress = problem, config, results, progress
+        self._problem, self._config, self.results, self._progress = problem, config, results, progress
         self._other = "none" if config.denoise == "oidn" else "oidn"
         self._seed = seeds.stream(config.seed, "measure")
         self._plan = problem.renderer.plan
@@ -125,7 +123,7 @@ class _Measurements:
             self._left.pop(0)
         if not self._controls:
             return
-        self._results.check_time()
+        self.results.check_time()
         self._progress.stage("loading the scene for the other denoiser")
         other, _ = problem_from_config(self._config, denoise=self._other)
         other.plan = other.plan.with_estimator({one.name: one.estimator for one in self._plan.groups}, "as beside")
@@ -161,14 +159,13 @@ class _Measurements:
             gains=[row for row in rows if isinstance(row, GainRow)] or None,
             bounces=next((row for row in rows if isinstance(row, PathLength)), None),
             texels=[row for row in rows if isinstance(row, TexelRow)] if left_out else None,
-            limits=_limits() if "material" in used else [],
+            limits=[EstimatorLimit.of(one) for one in LIMITS] if "material" in used else [],
             seconds={"total": seconds},
             seed=config.seed,
             command_line=config.command_line(),
         )
 
     def _compare_estimators(self) -> None:
-        """Choose every contested estimator."""
         problem, renderer = self._problem, self._problem.renderer
         hint = f"{self._gradients} gradients of {count(problem.spp, 'sample')} a pixel; `resolution` shortens it"
         self._progress.stage("comparing ways to differentiate", self._gradients, hint=hint)
@@ -180,14 +177,14 @@ class _Measurements:
             spp=problem.spp,
             every=True,
             tick=lambda: self._progress.advance(1),
-            keep=self._results.get,
+            keep=self.results.get,
         )
 
     def _cosines(self, problem: Problem, control: str, title: str) -> Iterator[CosineRow]:
         renderer, only = problem.renderer, (control,)
 
         def kept(name: str, measure: Callable[[], Any]) -> Any:
-            return self._results.get(f"{renderer.formation.denoiser} {name}", measure)
+            return self.results.get(f"{renderer.formation.denoiser} {name}", measure)
 
         hint = "counted in samples a pixel; `resolution` shortens it, `seconds` ends it"
         self._progress.stage(title, cosine_samples(renderer.plan, controls=only), hint=hint, at_most=True)
@@ -200,7 +197,6 @@ class _Measurements:
             )
 
     def _leaving_out(self) -> Iterator[PlannedRow]:
-        """What leaving things out of a search's renders brings, and the proof that it is safe."""
         problem, renderer, progress = self._problem, self._problem.renderer, self._progress
         seed, u = seeds.stream(self._config.seed, "leaving out"), inside(renderer)
 
@@ -217,9 +213,9 @@ class _Measurements:
             return measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=depth, tick=tick)
 
         hint = "`specialise=false` leaves it out"
-        yield (length := self._results.row("bounces", PathLength, lengths))
-        yield from self._results.rows("gains", GainRow, gains)
-        yield from self._results.rows("texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
+        yield (length := self.results.row("bounces", PathLength, lengths))
+        yield from self.results.rows("gains", GainRow, gains)
+        yield from self.results.rows("texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
 
 
 def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAdvice:
@@ -253,23 +249,15 @@ def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAd
     return DenoiserAdvice(asked=asked, advised=advised, reason=why)
 
 
-def _limits() -> list[EstimatorLimit]:
-    """What the material form does not cover, as it states itself."""
-    return [EstimatorLimit.of(limit) for limit in LIMITS]
-
-
 def _left_out(problem: Problem, used: set[str]) -> list[str]:
     """What a search with these estimators does not compute, in sentences."""
-    sentences = []
-    if "material" not in used:
-        sentences.append("boundary terms: nothing that an adjoint differentiates moves an outline")
-    if not used & BY_ADJOINT:
-        sentences.append("adjoint renders: no coordinate needs one")
-    if not used & BY_DIFFERENCES:
-        sentences.append("renders for differences: every derivative is an adjoint or of the picture itself")
-    if not problem.renderer.scene.volumetric:
-        sentences.append("the volumetric integrator: there is no medium")
-    return sentences
+    known = {
+        "boundary terms: nothing that an adjoint differentiates moves an outline": "material" not in used,
+        "adjoint renders: no coordinate needs one": not used & BY_ADJOINT,
+        "renders for differences: every derivative is an adjoint or of the picture itself": not used & BY_DIFFERENCES,
+        "the volumetric integrator: there is no medium": not problem.renderer.scene.volumetric,
+    }
+    return [text for text, true in known.items() if true]
 
 
 ALL = "everything above"

@@ -23,7 +23,7 @@ from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.outcome import transport_of
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages
+from advsearch.engine.record import Stages
 from advsearch.engine.sharing import Shared
 from advsearch.engine.surface_light import COMPARED, LIGHTS, SurfaceLight
 from advsearch.engine.sweeps.surface_light import pays_from
@@ -91,7 +91,10 @@ def region_from_config(
     """Grow the region that a configuration describes and keep it in a run directory."""
     stages = Stages(progress or NullProgress())
     stages.begin("setup", LOADING)
-    budget = {} if config.around is None else _budget(config.around)
+    budget: dict[str, object] = {}
+    if config.around is not None:  # its answer has to lie within
+        theirs = AttackConfig.from_yaml(find_run(config.around) / CONFIG)
+        budget = {"epsilon": theirs.epsilon, "norm": theirs.norm}
     problem, warnings = problem_from_config(AttackConfig.of(config, **budget))
     for text in warnings:
         stages.progress.message(text)
@@ -119,7 +122,11 @@ def region_from_config(
             clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
             warnings=warnings,
             transport=transport_of(findings) if findings.transport or findings.rendered_because else None,
-            renders=_renders(findings),
+            renders={
+                "verification": findings.verification_renders
+                + (findings.transport.traced if findings.transport else 0),
+                **({"products": findings.predicted_trials} if findings.predicted_trials else {}),
+            },
             seconds={**stages.seconds, "total": stages.total},
             seed=config.seed,
             command_line=config.command_line(),
@@ -195,21 +202,7 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
     return None
 
 
-def _renders(findings: Findings) -> dict[str, int]:
-    """How many pictures were rendered, comparisons included, and how many were predicted."""
-    traced = findings.verification_renders + (findings.transport.traced if findings.transport else 0)
-    predicted = {"products": findings.predicted_trials} if findings.predicted_trials else {}
-    return {"verification": traced, **predicted}
-
-
-def _budget(around: str) -> dict[str, object]:
-    """How far a run's controls may go, so that its answer lies within."""
-    theirs = AttackConfig.from_yaml(find_run(around) / CONFIG)
-    return {"epsilon": theirs.epsilon, "norm": theirs.norm}
-
-
 def _centre(problem: Problem, config: RegionConfig) -> Tensor:
-    """The configuration that the box grows around."""
     if config.around is None:
         return problem.domain.start.clone()
     values = torch.from_numpy(read_answer(find_run(config.around)))
@@ -268,17 +261,15 @@ def _box(problem: Problem, grown: GrownBox, at: Any, varied: Varied) -> list[Box
     """The range of every parameter of the box in its unit."""
     ends = [problem.describe(at(values)) for values in (grown.low, grown.high, grown.centre)]
     rows = []
-    for name in varied.names:
+    for place, name in enumerate(varied.names):
         stem, _, number = name.rpartition(".")
         known = name if name in ends[0] else stem
-        if known not in ends[0]:  # one of many numbers, which nobody describes
-            place = varied.names.index(name)
-            sides = (grown.low, grown.high, grown.centre)
-            low, high, centre = (float(side[place]) for side in sides)
-            rows.append(BoxSide(name=name, unit="of the range", low=low, high=high, centre=centre))
-            continue
-        low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
-        unit = str(ends[0][known].get("unit", ""))
+        if known in ends[0]:
+            low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
+            unit = str(ends[0][known].get("unit", ""))
+        else:  # one of many numbers, which nobody describes
+            low, high, centre = (float(side[place]) for side in (grown.low, grown.high, grown.centre))
+            unit = "of the range"
         rows.append(BoxSide(name=name, unit=unit, low=low, high=high, centre=centre))
     return rows
 
@@ -420,9 +411,7 @@ def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float) -> 
     axis, up = divmod(face, 2)
     room = float(1.0 - high[axis] if up else low[axis])
     step = room if room < 4.0 * SHORTEST else share * room
-    if step < SHORTEST and room > 0.0 and step != room:
-        return False
-    if room <= 0.0:
+    if room <= 0.0 or (step < SHORTEST and step != room):
         return False
     bottom, top = low.clone(), high.clone()
     if up:
