@@ -20,12 +20,12 @@ from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.explanations.observations import Answered
+from advsearch.questions.recipe import accuracy
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult, told_once
 from advsearch.questions.recipe.description import (
     FIGURES,
     Recipe,
-    accuracy,
     check_figures,
     compute,
     draw_figure,

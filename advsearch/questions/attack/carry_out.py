@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,7 @@ from advsearch.models import Model
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.attack.several import matrix_from_config
+from advsearch.questions.attack.several import curve_from_config, matrix_from_config
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.tasks import AnyTask, Task, make_task
@@ -163,9 +163,7 @@ def attack(
         loaded = models_as_one(model, config, asked)
         measured = load_metrics(config.metrics, metrics)
         job = AttackParts(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
-        if folder is None:
-            return _carry_out(job, watcher(progress))
-        return _go_on(job, folder, watcher(progress))
+        return _carry_out(job, watcher(progress), folder)
 
 
 def attack_from_config(
@@ -175,9 +173,6 @@ def attack_from_config(
     if config.is_matrix:
         return matrix_from_config(config, progress=progress, resumed=resumed)
     if config.is_curve:
-        # a circle: several attacks are attacks
-        from advsearch.questions.attack.several import curve_from_config
-
         return curve_from_config(config, progress=progress, resumed=resumed)
     return attack_once(config, progress=progress, resumed=resumed)
 
@@ -198,7 +193,7 @@ def attack_once(
     progress = progress or NullProgress()
     progress.stage(LOADING)
     job = replace(parts_of(config), clean=clean or CleanMatrix())
-    return _carry_out(job, progress) if resumed is None else _go_on(job, resumed, progress)
+    return _carry_out(job, progress, resumed)
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
@@ -243,17 +238,20 @@ def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
     return fixed
 
 
-def _carry_out(job: AttackParts, progress: Progress, run: RunDirectory | None = None) -> AttackResult:
-    """Do it all, in a run directory of its own unless one is given that was begun already."""
-    stages = Stages(progress)
-    stages.begin("setup", PREPARING)
-    problem = problem_on(job)
-    own = job.scene.description
-    warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
-    for text in warnings:
-        progress.message(text)
-    policy = _policy(job, problem)
-    with _directory(job, run) as kept:
+def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None = None) -> AttackResult:
+    """Do it all, or what is left of a run, in a run directory if it is kept."""
+    with ExitStack() as stack:
+        kept = None if resumed is None else stack.enter_context(RunDirectory.of(job.config, resumed))
+        stages = Stages(progress)
+        stages.begin("setup", PREPARING)
+        problem = problem_on(job)
+        own = job.scene.description
+        warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
+        for text in warnings:
+            progress.message(text)
+        policy = _policy(job, problem)
+        if kept is None and job.keep:
+            kept = stack.enter_context(RunDirectory.of(job.config))
         if kept is not None:
             functions = {f"metric {name}": one for name, one in job.metrics.items()}
             objective = {"objective": job.objective} if callable(job.objective) else {}
@@ -287,18 +285,3 @@ def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
     if not isinstance(job.policy, str):
         return with_derivatives(job.policy, job.config)
     return with_derivatives(make_policy(job.policy, **job.config.policy_options), job.config)
-
-
-def _go_on(job: AttackParts, run: str | Path, progress: Progress) -> AttackResult:
-    """Carry out what is left of a run."""
-    with RunDirectory.of(job.config, run) as kept:
-        return _carry_out(job, progress, kept)
-
-
-@contextmanager
-def _directory(job: AttackParts, run: RunDirectory | None) -> Iterator[RunDirectory | None]:
-    if run is not None or not job.keep:
-        yield run
-        return
-    with RunDirectory.of(job.config) as made:
-        yield made

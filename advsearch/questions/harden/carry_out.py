@@ -27,7 +27,7 @@ from advsearch.engine.naming import AnyModel, check_not_spread, load_models, mod
 from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
 from advsearch.models.imported import split_weights
-from advsearch.models.trainable import Trainable, trainable
+from advsearch.models.trainable import trainable
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.harden.answer import HardenedControl, HardenResult, Share, SplitSide, hardened_figure
 from advsearch.questions.harden.lessons import FOLDER, Lesson
@@ -44,7 +44,6 @@ from advsearch.questions.harden.scenes import (
     Drawing,
     Looking,
     SceneWork,
-    Split,
     Wanted,
     check_disjoint,
     splits_of,
@@ -134,32 +133,28 @@ def harden(
     config = configured(HardenConfig, model=model_name(model), **settings)
     path = run_path(config.run) if resume and config.run is not None else None
     resumed = path if path is not None and is_run(path) else None
-    return _carry_out(config, model, optimiser, beside, watcher(progress), resumed)
+    return harden_from_config(
+        config, progress=watcher(progress), resumed=resumed, model=model, optimiser=optimiser, beside=beside
+    )
 
 
 def harden_from_config(
-    config: HardenConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> HardenResult:
-    """Do what a configuration describes, or go on with it; see `harden`."""
-    return _carry_out(config, config.model, None, None, progress or NullProgress(), resumed)
-
-
-def _carry_out(
     config: HardenConfig,
-    model: AnyModel,
-    optimiser: MakeOptimiser | None,
-    beside: Examples | None,
-    progress: Progress,
-    resumed: Path | None,
+    *,
+    progress: Progress | None = None,
+    resumed: Path | None = None,
+    model: AnyModel | None = None,
+    optimiser: MakeOptimiser | None = None,
+    beside: Examples | None = None,
 ) -> HardenResult:
-    begun = time.perf_counter()
+    """Do what a configuration describes, or go on with it; see `harden`. None takes the configuration's model."""
+    begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage(LOADING)
     run_settings.check(config)
     task = make_task(config.task)
-    (loaded, *_), warnings = load_models([model], task, config)
-    student = trainable(loaded, config.layers)
+    (loaded, *_), warnings = load_models([config.model if model is None else model], task, config)
+    course = Course(trainable(loaded, config.layers), loaded, config, optimiser, beside)
     splits = splits_of(config, loaded)
-    course = Course(student, loaded, config, optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
         _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None})
         check_made_of(run, [loaded])
@@ -210,21 +205,11 @@ class Hardening:
         self.clean: dict[str, Share] = {}
         self._executor: Executor = InProcess(self.scenes)
 
-    @property
-    def student(self) -> Trainable:
-        """What is trained."""
-        return self.course.student
-
-    @property
-    def splits(self) -> Mapping[str, Split]:
-        """The sides of the split by name."""
-        return self.scenes.splits
-
     # ---- the parts --------------------------------------------------------------------------------------------------
 
     def carry_out(self, executor: Executor) -> None:
         """Measure, train, and measure again; the executor does what there is to do with scenes."""
-        self._executor, sides = executor, self.splits
+        self._executor, sides = executor, self.scenes.splits
         check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)])
         gc.freeze()  # as of `scenes_of`
         try:
@@ -338,7 +323,7 @@ class Hardening:
         wanted = [Looking(number) for number in range(self._counts[HELD_OUT])]
         self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
         seen = [one for _, some in self._each(wanted) for one in some]
-        for which, model in (("before", self.scenes.model), ("after", self.student.model)):
+        for which, model in (("before", self.scenes.model), ("after", self.course.student.model)):
             self.clean[which] = _share(round(right_share(model, seen, "plain") * len(seen)), len(seen))
 
     # ---- what came out ----------------------------------------------------------------------------------------------
@@ -369,8 +354,8 @@ class Hardening:
         names, facts = list(config.controls), self._executor.facts
         return HardenResult(
             run=str(self.run.path),
-            environment=",".join(self.splits[TRAINING].environments),
-            objects=list(self.splits[TRAINING].objects),
+            environment=",".join(self.scenes.splits[TRAINING].environments),
+            objects=list(self.scenes.splits[TRAINING].objects),
             controls=names,
             model=config.model,
             task=config.task_name,
@@ -389,7 +374,7 @@ class Hardening:
                     scenes=self._counts[name],
                     views=views[name],
                 )
-                for name, one in self.splits.items()
+                for name, one in self.scenes.splits.items()
             },
             rounds=rounds,
             hardened=_loads(config.model, weights) if done else None,

@@ -45,7 +45,7 @@ from advsearch.report.phrases import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
-from advsearch.runs.results.base import INTERRUPTED, Result
+from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
@@ -120,7 +120,37 @@ def recipe_from_config(
             notes += _take(Path(config.photographs), _photographed(described, [one for one, _ in results]), run)
         figures = [] if interrupted else list(_figures(described, config, results, run))
         seconds = time.perf_counter() - begun + (_seconds(run.path) if resumed is not None else 0.0)
-        result = _result(described, config, run, results, figures, notes, seconds)
+        settings = made_of(described, config).settings
+        controls = [name for one, _ in results if isinstance(one.config, SceneConfig) for name in one.config.controls]
+        warnings = [*notes, *(text for _, one in results for text in getattr(one, "warnings", ()))]
+        result = RecipeResult(
+            run=str(run.path),
+            recipe=config.recipe,
+            title=described.title,
+            about=described.about,
+            quick=config.quick,
+            objects=names_listed(settings["object"]),
+            environment=",".join(names_listed(settings.get("environment") or DEFAULT_ENVIRONMENT)),
+            model=",".join(names_listed(settings.get("model") or "reference")),
+            controls=list(dict.fromkeys(controls)),
+            parts=[
+                RecipePart(
+                    name=one.name,
+                    part=one.part,
+                    command=one.config.command,
+                    object=one.config.object,
+                    ending=done.ending,
+                    renders=sum(done.renders.values()),
+                )
+                for one, done in results
+            ],
+            figures=figures,
+            ending=INTERRUPTED if interrupted else "done",
+            warnings=list(dict.fromkeys(warnings)),
+            seconds={"total": seconds},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
         return keep_answer(run, result)
 
 
@@ -200,12 +230,14 @@ def _photographed(described: Recipe, runs: Iterable[PlannedRun]) -> list[Planned
 # ---- the runs -------------------------------------------------------------------------------------------------------
 
 
-def _carried_out(
-    runs: Sequence[PlannedRun], run: RunDirectory, progress: Progress, notes: list[str]
-) -> list[tuple[PlannedRun, Result]]:
+DoneRun = tuple[PlannedRun, AttackSummary | SweepSummary]
+"""A run and its result."""
+
+
+def _carried_out(runs: Sequence[PlannedRun], run: RunDirectory, progress: Progress, notes: list[str]) -> list[DoneRun]:
     """Carry out the runs that are not done, until one is interrupted; return all that there are. `notes` gets a
     sentence for each run that cannot be carried out after another one's answer."""
-    results: list[tuple[PlannedRun, Result]] = []
+    results: list[DoneRun] = []
     for number, one in enumerate(runs):
         path = run.path / PARTS / one.name
         progress.message(f"run {number + 1} of {len(runs)}: {one.part}, {one.config.object}")
@@ -220,6 +252,7 @@ def _carried_out(
                 continue
             own = _around(own, search.distribution, search.configuration or {})
         done = carry_out_part(path, own, progress)
+        assert isinstance(done, (AttackSummary, SweepSummary))
         results.append((one, done))
         if done.goes_on:
             break
@@ -272,15 +305,14 @@ def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> Iter
 
 
 def _figures(
-    described: Recipe, config: RecipeConfig, results: Sequence[tuple[PlannedRun, Result]], run: RunDirectory
+    described: Recipe, config: RecipeConfig, results: Sequence[DoneRun], run: RunDirectory
 ) -> Iterable[RecipeFigure]:
     """Compute and draw the figures."""
     rows: list[Answered] = []
     for one, result in results:
-        if isinstance(result, (AttackSummary, SweepSummary)):
-            found = rows_of(one.part, run.path / PARTS / one.name, result)
-            count = getattr(one.config, WORKERS, None)
-            rows += found if count is None else [replace(row, values={**row.values, WORKERS: count}) for row in found]
+        found = rows_of(one.part, run.path / PARTS / one.name, result)
+        count = getattr(one.config, WORKERS, None)
+        rows += found if count is None else [replace(row, values={**row.values, WORKERS: count}) for row in found]
         if isinstance(result, SweepSummary):
             rows += photographs_of(run.path / PARTS / one.name, result)
     surfaces = {
@@ -292,47 +324,3 @@ def _figures(
         for suffix, data in draw_figure(made, run.path).items():
             write_bytes(run.path / IMAGES / f"figure-{number + 1}.{suffix}", data)
         yield made
-
-
-def _result(
-    described: Recipe,
-    config: RecipeConfig,
-    run: RunDirectory,
-    results: Sequence[tuple[PlannedRun, Result]],
-    figures: Sequence[RecipeFigure],
-    notes: Sequence[str],
-    seconds: float,
-) -> RecipeResult:
-    settings = made_of(described, config).settings
-    controls = [name for one, _ in results if isinstance(one.config, SceneConfig) for name in one.config.controls]
-    warnings = [*notes] + [text for _, one in results for text in getattr(one, "warnings", ())]
-    return RecipeResult(
-        run=str(run.path),
-        recipe=config.recipe,
-        title=described.title,
-        about=described.about,
-        quick=config.quick,
-        objects=names_listed(settings["object"]),
-        environment=",".join(names_listed(settings.get("environment") or DEFAULT_ENVIRONMENT)),
-        model=",".join(names_listed(settings.get("model") or "reference")),
-        controls=list(dict.fromkeys(controls)),
-        parts=[_part(one, result) for one, result in results],
-        figures=list(figures),
-        ending=INTERRUPTED if any(one.goes_on for _, one in results) else "done",
-        warnings=list(dict.fromkeys(warnings)),
-        seconds={"total": seconds},
-        seed=config.seed,
-        command_line=config.command_line(),
-    )
-
-
-def _part(one: PlannedRun, result: Result) -> RecipePart:
-    assert isinstance(result, (AttackSummary, SweepSummary))
-    return RecipePart(
-        name=one.name,
-        part=one.part,
-        command=one.config.command,
-        object=one.config.object,
-        ending=result.ending,
-        renders=sum(result.renders.values()),
-    )
