@@ -170,7 +170,6 @@ def _shown_attack(summary: AttackSummary) -> ShownAnswer:
 
 
 def _rates(summary: AttackSummary) -> list[list[str]]:
-    """A row for the clean scene, the answer, the random search and the average case."""
     clean, success, average = summary.clean, wording.success(summary), summary.average
     control = clean.control
     rated = _rate("right", control.correct, control) if control else NOT_VERIFIED
@@ -353,7 +352,6 @@ def plain_epsilon(value: EpsilonBudget) -> str:
 
 
 def _draw_curve(answer: CurveResult, axes: Any) -> None:
-    """Draw the robust accuracy with its interval over epsilon."""
     points = _points(answer)
     at, accuracy = [one.epsilon for one in points], [one.accuracy for one in points]
     low, high = ([one.interval[end] for one in points] for end in (0, 1))
@@ -448,7 +446,6 @@ def _cell(cell: MatrixCell) -> str:
 
 
 def _draw_matrix(answer: MatrixResult, axes: Any) -> None:
-    """Draw the share of trials in which each answer is a success on each model."""
     rows = [row for row in answer.table if row.tested]
     rates = [[cell.verified.rate for cell in row.tested] for row in rows]
     axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")

@@ -1,8 +1,4 @@
-"""Several attacks as one answer: robust accuracy against epsilon, and answers tried on other models.
-
-The curve attacks several objects with several epsilons. The matrix attacks several models, and tries each answer on all
-of them, in pictures that are the same for all.
-"""
+"""Several attacks as one answer: robust accuracy of objects against epsilon, and answers tried on other models."""
 
 from __future__ import annotations
 

@@ -97,7 +97,6 @@ READING = (
     "scatters more; reference unusable: the reference is too noisy to tell. adjoint: a second render that carries all "
     "derivatives back at once; differences, secant: two renders with the parameter moved by a step."
 )
-"""What the table shows, and how to read it."""
 
 SINGLE: Mapping[str, Column] = {
     "object": "{0.object}",
@@ -122,7 +121,6 @@ WHOLE_CONTROLS: Mapping[str, Column] = {
     "seconds": "{0.seconds:.2f}",
     "status": "{0.status}",
 }
-"""Columns of the tables of single parameters, and of whole controls."""
 
 LOSSES = {
     "linear": "Smooth linear loss of the raw picture",

@@ -126,9 +126,6 @@ def check_from_config(
         return kept_rows(run, results, rows(), result)
 
 
-# ---- what is measured, and what was ---------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class CheckedPart:
     """One scene with its controls and one loss ("linear" or "model"): what is checked in one go; numbered from 1."""
@@ -190,7 +187,6 @@ def _rows_of(part: CheckedPart, parts: int, results: Results, progress: Progress
 
 
 def _line(row: CheckedRow) -> str:
-    """A row in a line, for whoever waits."""
     how = f"cosine {row.cosine:.2f}" if isinstance(row, DirectionRow) else f"{row.gradient:.3g}"
     return f"{row.object}, {row.name} by {row.estimator}: {how}, {row.status}"
 
@@ -327,7 +323,6 @@ def _rows(
 
 
 def _key(part: CheckedPart, what: str, along: Sequence[Probe]) -> str:
-    """Under which a measurement is stored."""
     return f"{part.key} {what} {','.join(probe.name for probe in along)}"
 
 

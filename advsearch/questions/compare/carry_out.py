@@ -150,9 +150,6 @@ def _cautions(sides: Sequence[Side]) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-# ---- pictures -------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class _Pictures:
     """Small pictures of pairs in the folder of the run: those that sweeps kept, or rendered again."""

@@ -137,9 +137,6 @@ def observations(columns: Sequence[Column], right: Mask) -> Observations | None:
     return Observations(tuple(factors), np.stack(values, axis=1), right) if values else None
 
 
-# ---- reading --------------------------------------------------------------------------------------------------------
-
-
 def _sides_of(folder: Path, *, alone: bool) -> list[Side]:
     summary = read_result(folder)
     if not isinstance(summary, SweepSummary):
@@ -198,11 +195,7 @@ def _together(column: Column) -> str:
     return ",".join(levels[number] for number in dict.fromkeys(column.data.tolist()) if number < len(levels))
 
 
-# ---- comparing ------------------------------------------------------------------------------------------------------
-
-
 def _check_pair(first: Side, other: Side) -> None:
-    """Refuse sides whose pictures are no pairs."""
     if first.folder == other.folder:
         return
     where = f"{first.folder} and {other.folder}"
@@ -315,9 +308,6 @@ def _masks(column: Column) -> Iterator[tuple[AxisValue, Mask]]:
         values = np.unique(column.data)
         if len(values) <= MOST_VALUES:
             yield from ((float(f"{value:.6g}"), column.data == value) for value in values)
-
-
-# ---- rules ----------------------------------------------------------------------------------------------------------
 
 
 def _rules(columns: Sequence[Column], alone: Mask, seed: int) -> list[PairRule] | None:

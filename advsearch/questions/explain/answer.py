@@ -129,7 +129,6 @@ DECIDES = (
     "equally many rows: its first-order Sobol index, by parts. Two parameters stand together where they decide "
     "more than each by itself. What differs inside a part is not counted."
 )
-"""How the rules and the table are to be read."""
 MOST_WEIGHTS = 12
 """Rows of it that are shown."""
 MOST_ANSWERS = 3

@@ -145,9 +145,6 @@ def _cautions(rows: Sequence[Answered], importance: Sequence[FactorWeight]) -> l
     return []
 
 
-# ---- rows of the answer ---------------------------------------------------------------------------------------------
-
-
 def _told(rule: CountedRule, factors: Sequence[Factor]) -> dict[str, Any]:
     """What a rule is, and how often it holds."""
     elsewhere = right_of(rule.right_elsewhere, rule.of_elsewhere)

@@ -104,13 +104,10 @@ TRAINED = (
     "Round 0 is the model as it was. Weights are part of the way from those to the trained ones. Judged on scenes in "
     "the training's environments on which it was not trained."
 )
-"""How the tables are to be read."""
 
 HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
-"""Of the columns."""
 
 LINES = (("before", RED), ("after", BLUE))
-"""Names and colours of the figure."""
 
 
 def shown(result: HardenResult) -> ShownAnswer:

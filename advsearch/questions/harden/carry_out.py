@@ -311,7 +311,6 @@ class Hardening:
             self._note(which, wanted[place].control, wanted[place].number, ending)
 
     def _note(self, which: str, control: str, number: int, ending: str) -> None:
-        """Keep how an attack ended."""
         self.measured[f"{which} {control} {number}"] = ending
         self.run.store.set_note(MEASURED, json.dumps(self.measured))
         seed = seeds.stream(self.config.seed, f"measured {control}", number)
@@ -319,7 +318,6 @@ class Hardening:
         self.run.record(Row(f"{which} {control}", number, seed=seed, spp=self.config.verify_spp, success=wrong))
 
     def _look(self) -> None:
-        """Ask both models about plain pictures of held-out scenes."""
         wanted = [Looking(number) for number in range(self._counts[HELD_OUT])]
         self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
         seen = [one for _, some in self._each(wanted) for one in some]

@@ -164,7 +164,6 @@ def right_share(model: Model, chosen: Sequence[Lesson], which: str) -> float:
 
 WEIGHTS = "hardened.safetensors"
 ROUNDS = "rounds"
-"""The note under which the store keeps the scores."""
 FIRST_STEPS = 4
 """Steps of each texture before a training."""
 VALIDATION_VIEWS, JUDGED = 2, 168
@@ -261,7 +260,6 @@ class TrainingRounds:
         return found[best], best
 
     def _keep(self, number: int, new: Sequence[Lesson], found: Score, trained: int, part: float) -> None:
-        """Keep weights, what they came to, and the round's pictures."""
         model = self.course.student.model
         self._save(_file(number))
         save_pictures(self.run.path / ARTIFACTS / FOLDER, number, new, model.labels)
@@ -335,7 +333,6 @@ class Gradients:
         return list(self._pool.map(do, itertools.count(), self._twins, parts))
 
     def _slopes(self, chosen: Sequence[TextureLesson], seed: int) -> list[Tensor]:
-        """What `slopes` says."""
 
         def climb(number: int, twin: Trainable, part: Sequence[TextureLesson]) -> Sequence[Tensor]:
             return slopes(part, twin.quickly, lambda images: _changed(images, seed + number))

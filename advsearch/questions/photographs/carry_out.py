@@ -155,9 +155,6 @@ class Photographs:
         return photo_agreement(run)
 
 
-# ---- judging --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _PhotoJudge:
     """One of a run's models, and how it is shown pictures.
@@ -268,9 +265,6 @@ def _rendered(judge: _PhotoJudge, rendering: str, name: str, file: Path, row: Ro
         raise InputError(f"rendering: the results have no row for {file.stem}; it belongs to another run")
     judgement = judge.judgement(rendering, name, file.read_bytes())
     return judgement.right, judgement.answer.label
-
-
-# ---- counting -------------------------------------------------------------------------------------------------------
 
 
 def _agreement(rows: Sequence[Row]) -> PhotoAgreement:

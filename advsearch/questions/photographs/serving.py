@@ -271,7 +271,6 @@ KEY = "X-Advsearch-Key"
 """The header with which this server's page sends a photograph; another page could not send it."""
 
 Response = tuple[str, bytes]
-"""A media type, and the data."""
 
 
 class PhotoTaker(Protocol):

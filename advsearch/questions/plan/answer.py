@@ -94,7 +94,6 @@ READING = (
     "step (a share of its range). A cosine of 1 with the converged gradient means that a gradient points the right "
     "way."
 )
-"""What a plan shows, and how to read it."""
 
 COSINES: Mapping[str, Column] = {
     "control": "{0.control}",
@@ -113,7 +112,6 @@ GAINS: Mapping[str, Column] = {
     "gradient differs": lambda one: _agreement(one.gradient_difference),
     "": lambda one: "" if one.safe else "MORE THAN ITS NOISE",
 }
-"""Columns of the tables."""
 
 
 def shown(chosen: PlanResult) -> ShownAnswer:

@@ -352,7 +352,6 @@ GradientSamples = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], float]
 
 
 def _row(item: str, without: GradientSamples, having: GradientSamples) -> GainRow:
-    """Compare what is found with an item and without it."""
     (first, again, seconds), (first_with, again_with, seconds_with) = without, having
     picture, gradient = (
         _share(first_with[k] - first[k], again[k] - first[k], again_with[k] - first_with[k]) for k in range(2)
@@ -411,9 +410,6 @@ def _share(difference: Tensor, *noises: Tensor) -> float:
 def _ratio(above: Tensor, below: Tensor) -> float:
     size = float(below.norm())
     return float(above.norm()) / size if size > 0.0 else 1.0
-
-
-# ---- texels ---------------------------------------------------------------------------------------------------------
 
 
 PER_PIXEL = 2.0

@@ -166,7 +166,6 @@ READING = (
     "right one, in logits; a cosine of 1 means that a gradient points the right way. With a matrix of light "
     "transport or light on surfaces, `again` is what another one takes once the first one is there."
 )
-"""What the tables show, and how to read them."""
 
 OBJECTIVES: Mapping[str, Column] = {
     "policy": "{0.estimator}",
@@ -197,7 +196,6 @@ REFERENCES: Mapping[str, Column] = {
         "" if one.margin is None or one.margin_error is None else f"{one.margin:.3g} +- {100 * one.margin_error:.2g} %"
     ),
 }
-"""Columns of the tables."""
 
 
 def shown(result: PrecisionResult) -> ShownAnswer:
@@ -336,7 +334,6 @@ def _panels(report: PrecisionResult) -> list[tuple[str, str, PrecisionPoints]]:
 
 
 def _draw_errors(axes: Axes, points: PrecisionPoints, measure: str, report: PrecisionResult) -> None:
-    """Error against seconds, one line for each estimator."""
     usable = [one for one in points if 0.0 < one.error_by(measure).value < math.inf]
     for number, name in enumerate(dict.fromkeys(one.estimator for one in usable)):
         line = sorted((one for one in usable if one.estimator == name), key=lambda one: one.spp)
@@ -444,7 +441,6 @@ def _plain_axis(axis: Axis) -> None:
 
 
 def _draw_gains(axes: Axes, points: PrecisionPoints, kind: str, report: PrecisionResult) -> None:
-    """Objective against seconds, median and quartiles, one line for each policy."""
     for number, name in enumerate(dict.fromkeys(one.estimator for one in points)):
         line = sorted((one for one in points if one.estimator == name), key=lambda one: one.renders or 0)
         color = COLORS[number % len(COLORS)]
@@ -473,7 +469,6 @@ def _draw_gains(axes: Axes, points: PrecisionPoints, kind: str, report: Precisio
 
 
 def _explain(figure: Figure, report: PrecisionResult) -> None:
-    """Title, the machine, and how to read it."""
     machine, formation = report.machine, report.image_formation
     height, width = formation.resolution
     threads = ", ".join(f"{count} {name} thread" + "s" * (count != 1) for name, count in machine.threads.items())

@@ -173,8 +173,6 @@ class PictureBench:
         """The reference's own relative error for a setting."""
         return self._reference(self.variants[setting.series].family, measure).error
 
-    # ---- inside -----------------------------------------------------------------------------------------------------
-
     def _reference(self, family: str, measure: str) -> ReferenceValue:
         """What a family is compared with: its margins with its own, but pictures with and without denoiser alike."""
         if measure == "margin_error":
@@ -182,7 +180,6 @@ class PictureBench:
         return self.pictures["depth" if family == "depth" else "raw"]
 
     def _truth(self, family: str) -> Renderer:
-        """The renderer of a family's reference."""
         depths = [one.depth for one in self.variants.values() if one.family == family]
         denoiser = "oidn" if family == "oidn" else "none"
         return self._as(Variant(family, family, REFERENCE_SAMPLER, denoiser, max(depths)))

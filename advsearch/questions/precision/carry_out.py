@@ -203,7 +203,6 @@ count, and at most."""
 VERIFY_SPP, VERIFY_RENDERS = 64, 4
 """Samples a pixel, and fresh renders, that verify what a search held."""
 IMAGE = "image"
-"""The name of the picture's sitting."""
 
 
 class MeasuredPart(NamedTuple):
@@ -254,7 +253,6 @@ class Measurement:
         return seeds.stream(self.config.seed, "precision")
 
     def _image(self, budget: TimeBudget) -> Section:
-        """The picture and the model's margin."""
         self.section = Section(self.config.pixel_sampler)
         self.progress.stage("the picture: preparing every sampler and path length")
         bench = self._pictures
@@ -272,7 +270,6 @@ class Measurement:
 
     @cached_property
     def _pictures(self) -> PictureBench:
-        """The picture in every variant."""
         renderer, problem = self.problem.renderer, self.problem
         depths = [int(part) for part in split_names(self.config.depths)]
         chosen = variants(
@@ -301,21 +298,18 @@ class Measurement:
 
     @cached_property
     def _divided(self) -> list[GradientPart]:
-        """The parts of the space whose gradients are measured."""
         renderer, _ = self._differentiated
         linear = self.config.loss == "linear"
         ways = ways_to_predict(renderer)
         return estimated_parts(renderer.plan.groups, linear=linear, by_matrix=matrix_groups(renderer), ways=ways)
 
     def _bench(self, part: GradientPart) -> GradientBench:
-        """What takes the gradient of a part."""
         renderer, loss = self._differentiated
         elsewhere = partial(shared_parts, self.executor, _named(part))
         return GradientBench(renderer, loss, inside(renderer), part, self._exact, elsewhere)
 
     @cached_property
     def _differentiated(self) -> tuple[Renderer, Loss]:
-        """The renderer and the loss whose gradient is measured."""
         renderer, problem = self.problem.renderer, self.problem
         if self.config.loss == "model":
             return renderer, problem.loss
@@ -325,12 +319,10 @@ class Measurement:
 
     @cached_property
     def _exact(self) -> Renderer:
-        """The same with the sampler of references."""
         renderer, _ = self._differentiated
         return renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
 
     def _gradient(self, part: GradientPart, budget: TimeBudget) -> Section:
-        """The gradient of a part of the space."""
         self.section = Section(self.config.pixel_sampler)
         bench = self._bench(part)
         share = budget.share(REFERENCE_SHARE)
@@ -370,7 +362,6 @@ class Measurement:
             line.again = point_of(setting, samples, "error", floor)
 
     def _objective(self, budget: TimeBudget) -> Section:
-        """The best verified objective of each policy."""
         problem, config, policies = self.problem, self.config, self.policies
         self.section = Section(config.pixel_sampler)
         if any(policy.uses_gradient for policy in policies.values()):
@@ -416,8 +407,6 @@ class Measurement:
                 values.append(float(self.problem.loss(self.problem.picture(u, seed, VERIFY_SPP))))
         return sum(values) / len(values)
 
-    # ---- inside -----------------------------------------------------------------------------------------------------
-
     def _rounds(
         self, name: str, settings: Sequence[MeasuredSetting], measure: Any, budget: TimeBudget
     ) -> Rounds[dict[str, float]]:
@@ -441,7 +430,6 @@ class Measurement:
         theory: Callable[[str], Theory],
         families: Mapping[str, str] | None = None,
     ) -> None:
-        """Make points of what was measured."""
         lines: dict[tuple[str, str, str], list[Point]] = {}
         for setting, taken in measured.results.items():
             lines.setdefault(setting.line, []).append(point_of(setting, taken, measure, floor(setting, measure)))
@@ -465,5 +453,4 @@ class Measurement:
 
 
 def _named(part: GradientPart) -> str:
-    """The name of a gradient's sitting."""
     return f"gradient of {part.name}"

@@ -208,8 +208,6 @@ class GradientBench:
             f"differences {against.value:.3g} +- {against.noise:.1g}: its errors leave out that bias"
         )
 
-    # ---- inside -----------------------------------------------------------------------------------------------------
-
     def _cost(self, estimator: str) -> float:
         if estimator in COST_OF:
             return COST_OF[estimator]

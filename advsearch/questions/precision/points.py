@@ -314,9 +314,6 @@ def levels_off(points: Sequence[Point]) -> bool:
     return len(steps) >= 2 and steps[-1] > 0.5 * min(*steps[:-1], 0.0)
 
 
-# ---- the recommendation ---------------------------------------------------------------------------------------------
-
-
 def recommend(
     lines: Mapping[tuple[str, str, str], Sequence[Point]], goal: float, round_up: RoundUp | None = None
 ) -> Recommended | None:

@@ -140,9 +140,6 @@ def report_of(section: Section, goal: float, **asked: Any) -> PrecisionResult:
     )
 
 
-# ---- inside ---------------------------------------------------------------------------------------------------------
-
-
 def _points(section: Section) -> list[PrecisionPoint]:
     """One entry a setting; the margin's error stands beside the picture's."""
     found: dict[tuple[TableLine, int], dict[str, Point]] = {}
@@ -198,7 +195,6 @@ def _objective_points(section: Section) -> list[PrecisionPoint]:
 
 
 def _best(section: Section) -> float:
-    """The best median of any policy."""
     tops = [middle for _, curve in section.curves for _, middle, _ in curve.objective]
     return max((value for value in tops if math.isfinite(value)), default=math.nan)
 

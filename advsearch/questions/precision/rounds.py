@@ -1,7 +1,6 @@
-"""Measures settings in interleaved rounds inside a time budget, cheapest first (work-precision diagrams).
+"""Measures settings in interleaved rounds inside a time budget, cheapest first; nothing here knows how to render.
 
-What is measured is a function of a setting and a seed; nothing here knows how to render. Rounds are interleaved
-(every setting once, then every setting again), so that a machine that slows down meanwhile does so for all of them.
+Every setting is measured once, then every setting again, so that a machine that slows down does so for all of them.
 """
 
 from __future__ import annotations

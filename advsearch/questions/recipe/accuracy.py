@@ -39,11 +39,7 @@ from advsearch.runs.directory import IMAGES, PARTS
 
 
 class BarsOptions(Options):
-    """Options of bars.
-
-    Attributes:
-        by: what the bars differ in: object, environment, model, group, answer or a parameter.
-    """
+    """Options of bars; what they are says docs/recipes.md, as of the others."""
 
     by: str
 
@@ -78,13 +74,7 @@ BARS = FigureKind(BarsOptions, BarsFigure, _compute_bars, _draw_bars, lambda mad
 
 
 class PointsOptions(Options):
-    """Options of points.
-
-    Attributes:
-        by: what the rows differ in: object, environment, model, ...
-        series: what is side by side: part, trial, ...
-        names: what the series are called, where not by their values.
-    """
+    """Options of points."""
 
     by: str
     series: str
@@ -166,12 +156,7 @@ SHORT = 4
 
 
 class HeatMapOptions(Options):
-    """Options of a heat map.
-
-    Attributes:
-        rows: what rows differ in: object, environment, model, group, answer or a parameter.
-        columns: what columns differ in.
-    """
+    """Options of a heat map."""
 
     rows: str
     columns: str
@@ -249,12 +234,7 @@ HEAT_MAP = FigureKind(
 
 
 class CorruptionOptions(Options):
-    """Options of corruption errors.
-
-    Attributes:
-        which: the parameter that names the corruption.
-        clean: the part with pictures that have none.
-    """
+    """Options of corruption errors: the parameter that names one, and the part with pictures that have none."""
 
     which: str = "corruption.which"
     clean: str = Field(default="clean", max_length=40)

@@ -88,17 +88,8 @@ MARKS = ("o", "s", "^", "D", "v", "P")
 
 
 class CurveOptions(Options):
-    """Options of a curve.
-
-    Attributes:
-        along: a parameter with numbers.
-        by: what the lines differ in: object, group, model, trial, ...; one line where it is not given.
-        bins: parts of the range.
-        range: its ends; by default the least and the largest value.
-        names: what the lines are called, where not by their values.
-        away_from: a value; it is said whether accuracy falls with the distance from it.
-        turn: after how much the parameter comes round, for that distance: 360 for a heading in degrees.
-    """
+    """Options of a curve along a parameter with numbers, a line for each value of `by`; over a range, in bins. It is
+    said whether accuracy falls with the distance from `away_from`, which comes round after `turn`."""
 
     along: str
     by: str | None = None

@@ -17,7 +17,6 @@ from advsearch.runs.results.base import Fields, Interval, RunResult
 from advsearch.runs.results.sweep import CountedAnswers, SurfaceTable
 
 HeadsAndRows = tuple[list[str], list[list[str]]]
-"""Heads and rows of a table."""
 
 COUNT_HEADS = ["right", "accuracy", "95 % interval"]
 

@@ -75,10 +75,8 @@ class RecipeKeywords(RunKeywords, total=False):
 
 
 TURN = 360.0
-"""Degrees."""
 
 CUES = "cues"
-"""The figure of answers by shape and by texture."""
 
 NOTE = "recipe"
 """Under which a run's store keeps the recipe, so that it goes on as it began."""
@@ -227,11 +225,7 @@ def _photographed(described: Recipe, runs: Iterable[PlannedRun]) -> list[Planned
     return [one for one in own if isinstance(one.config, SweepConfig) and one.config.keep_pictures == "all"]
 
 
-# ---- the runs -------------------------------------------------------------------------------------------------------
-
-
 DoneRun = tuple[PlannedRun, AttackSummary | SweepSummary]
-"""A run and its result."""
 
 
 def _carried_out(runs: Sequence[PlannedRun], run: RunDirectory, progress: Progress, notes: list[str]) -> list[DoneRun]:
@@ -301,13 +295,9 @@ def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> Iter
     return missing
 
 
-# ---- what they come to ----------------------------------------------------------------------------------------------
-
-
 def _figures(
     described: Recipe, config: RecipeConfig, results: Sequence[DoneRun], run: RunDirectory
 ) -> Iterable[RecipeFigure]:
-    """Compute and draw the figures."""
     rows: list[Answered] = []
     for one, result in results:
         found = rows_of(one.part, run.path / PARTS / one.name, result)

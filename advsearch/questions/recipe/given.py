@@ -48,12 +48,7 @@ FEWEST_LETTERS = 4
 
 
 class AnswersOptions(Options):
-    """Options of the most frequent answers.
-
-    Attributes:
-        by: what the rows differ in: object, material.which, ...
-        most: answers of each row.
-    """
+    """Options of the most frequent answers."""
 
     by: str
     most: int = Field(default=4, ge=1, le=10)
@@ -128,13 +123,7 @@ FEWEST_CELLS = 4
 
 
 class CuesOptions(Options):
-    """Options of cues.
-
-    Attributes:
-        texture: what has the texture.
-        shape: what has the shape.
-        classes: for a texture, the answers that name it: ``{zebra: [zebra]}``.
-    """
+    """Options of cues; for a texture, `classes` are the answers that name it."""
 
     texture: str = "material.which"
     shape: str = "object"
@@ -300,13 +289,8 @@ AnswerPair = tuple[Answered, Answered]
 
 
 class AgreementOptions(Options):
-    """Options of agreements.
-
-    Attributes:
-        of: the part whose renderings are compared with photographs, and parts that picture the same configurations
-            under other conditions.
-        names: what the others are called in sentences, where not by their part.
-    """
+    """Options of agreements: the part whose renderings are compared with photographs, and parts that picture the same
+    configurations under other conditions."""
 
     of: tuple[str, ...] = Field(min_length=1)
     names: dict[str, str] = Field(default_factory=dict)

@@ -141,15 +141,10 @@ FigureType = TypeVar("FigureType", bound=RecipeFigure)
 
 @dataclass(frozen=True)
 class FigureKind(Generic[Chosen, FigureType]):
-    """One kind of figure.
+    """One kind of figure: the options that it takes, its numbers, what makes these from the answers, and what draws
+    them on a figure of matplotlib, which may look into the recipe's folder, of a size in inches.
 
-    Attributes:
-        options: that it takes.
-        result: its numbers.
-        compute: makes these from the answers.
-        draw: draws them on a figure of matplotlib; it may look into the recipe's folder.
-        size: of that, width and height in inches.
-        tells_models: whether it tells several models apart by itself; of others each model has one.
+    With `tells_models` it tells several models apart by itself; of others each model has one.
     """
 
     options: type[Chosen]

@@ -258,7 +258,6 @@ def _verdict(verifier: Verifier, centre: Tensor) -> bool:
 
 
 def _box(problem: Problem, grown: GrownBox, at: Any, varied: Varied) -> list[BoxSide]:
-    """The range of every parameter of the box in its unit."""
     ends = [problem.describe(at(values)) for values in (grown.low, grown.high, grown.centre)]
     rows = []
     for place, name in enumerate(varied.names):
@@ -282,7 +281,6 @@ def _number(described: Any, number: str) -> float:
 def _map(
     verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory, light: SurfaceLight | None
 ) -> MarginMap:
-    """The margin on a grid over two parameters, as numbers and as a picture."""
     hint = f"{side * side} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])

@@ -54,7 +54,6 @@ RESULT = ReplayResult
 
 
 HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "answer")
-"""Of the columns."""
 
 
 def shown(result: ReplayResult) -> ShownAnswer:

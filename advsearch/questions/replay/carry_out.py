@@ -1,7 +1,4 @@
-"""`replay`: the answer of a run under other conditions than it was searched and verified under.
-
-These are other pictures of the same configuration.
-"""
+"""`replay`: the answer of a run under other conditions than it was searched and verified under, in other pictures."""
 
 from __future__ import annotations
 
@@ -48,7 +45,6 @@ OWN_LIGHT = "own"
 """What conditions share whose pictures come of the radiance that the run itself would render."""
 
 QUALITIES = (90, 75, 50)
-"""Of JPEG files."""
 
 SENSORS: dict[str, dict[str, float]] = {
     "a good camera": {"shot": 0.02, "read": 0.005, "mosaic": 1.0},

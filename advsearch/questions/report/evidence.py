@@ -36,7 +36,6 @@ RULES = (
     "`nothing claimed`: the run does not carry a claim, for the reason that it gives.",
     "Renderings are not photographs: a claim is about reality only as far as photographs were compared.",
 )
-"""How claims are to be read."""
 
 QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; no result."
 

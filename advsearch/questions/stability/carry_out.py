@@ -1,8 +1,4 @@
-"""`stability`: extreme scenes, objectives and arithmetic, and whether each of them holds.
-
-A case is data (`Case`): a name, a group, what must hold, what handles it, and a function that returns findings. The
-registry is `CASES`; nothing is found by its name.
-"""
+"""`stability`: extreme scenes, objectives and arithmetic, and whether each of them holds."""
 
 from __future__ import annotations
 
@@ -30,7 +26,6 @@ from advsearch.runs.directory import RunDirectory
 
 _GROUPS = (RADIOMETRIC, MATERIALS, GEOMETRY, OBJECTIVE, STIFF, PRECISION, NOISE, TRANSPORT, SURFACE_LIGHT)
 GROUPS: tuple[str, ...] = tuple(group.name for group in _GROUPS)
-"""Every group, in the order in which they run."""
 CASES: tuple[Case, ...] = tuple(case for group in _GROUPS for case in group.cases)
 """Every case, in the order in which they run."""
 

@@ -227,9 +227,6 @@ for name in ("pose.yaw", "camera.azimuth", "environment.rotation"):
     )(partial(full_turn, {name.partition(".")[0]: {name.partition(".")[2]: [0.0, 360.0]}}))
 
 
-# ---- inside ---------------------------------------------------------------------------------------------------------
-
-
 def _shown(u: Tensor, renderer: object) -> Tensor:
     with torch.no_grad():
         picture: Tensor = renderer(u, seed=0, spp=16)  # type: ignore[operator]
@@ -237,7 +234,6 @@ def _shown(u: Tensor, renderer: object) -> Tensor:
 
 
 def _difference(one: Mesh, other: Mesh) -> float:
-    """Mean difference of the pictures of two meshes with the same seed."""
     shown = []
     for made in (one, other):
         renderer = small(thing(made), PAINTED, settings=FRONT)

@@ -392,7 +392,6 @@ def compared(
 
 
 def _together(renderer: Renderer, loss: Loss, u: Tensor, spp: int) -> list[list[Probe]]:
-    """Probes that one gradient answers."""
     sets: dict[tuple[str, str], list[Probe]] = {}
     for probe in probes(renderer, loss, u, 0, spp):
         sets.setdefault((probe.group.control, probe.group.estimator), []).append(probe)

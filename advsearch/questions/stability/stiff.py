@@ -43,7 +43,6 @@ RATIO = 1e6
 CLOSE = 0.01
 """How near to the peak, as a share of the range, counts as there, in every number."""
 FOLLOWERS = ("pgd", "adam")
-"""Policies that follow a gradient."""
 SAME = 1e-5
 """Distance in u that rounding may bring about between two trajectories."""
 SLOWER = 1.5
@@ -65,9 +64,6 @@ def path(
 
     result = search(partial(map, evaluate), domain, policy, steps=steps, seed=seed, candidates=0, on_step=note)
     return result, torch.stack(seen)
-
-
-# ---- units ----------------------------------------------------------------------------------------------------------
 
 
 @STIFF.case("rescaled-units", _BOX)
@@ -122,9 +118,6 @@ def objective_units() -> Outcome:
             paths.append(path(toy, toy.domain, make_policy(name), steps=60)[1])
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
     return Outcome(Check("largest distance of two trajectories in u", worst, most=SAME), relative_error=worst)
-
-
-# ---- curvatures -----------------------------------------------------------------------------------------------------
 
 
 @STIFF.case("curvatures-1e6", _BLOCKS)
@@ -183,9 +176,6 @@ def scaled_block() -> Outcome:
         worst = max(counts.values()) / counts[1.0]
         checks.append(Check(f"{name}: evaluations over those of the unscaled gradient", worst, most=SLOWER))
     return Outcome(*checks, measured=measured)
-
-
-# ---- valleys and boxes ----------------------------------------------------------------------------------------------
 
 
 @STIFF.case(
@@ -262,9 +252,6 @@ def wide_range() -> Outcome:
         relative_error=error,
         measured={"step in u": wide.plan.groups[0].step, "step in object sizes": wide.plan.groups[0].step * 2e4},
     )
-
-
-# ---- a scene --------------------------------------------------------------------------------------------------------
 
 
 @STIFF.case("light-rotation-texel", _BLOCKS, "light, pose, texture", cheap=False)

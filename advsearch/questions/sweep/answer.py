@@ -26,7 +26,6 @@ RESULT = SweepSummary
 
 
 READING = "How often it is right at each value, over all others, with the 95 % interval:"
-"""What the tables show."""
 
 BAR = 20
 """Width of a bar in characters."""
@@ -63,7 +62,6 @@ def _verdict(summary: SweepSummary) -> str:
 
 
 def _beside(summary: SweepSummary) -> list[AnswerPart]:
-    """Both rates side by side, of each model."""
     if summary.beside is None or summary.ending == INTERRUPTED:
         return []
     return [AnswerPart(rows=_rates(pair, summary.beside.answer)) for pair in summary.beside.pairs]
@@ -91,7 +89,6 @@ def _tables(summary: SweepSummary) -> list[AnswerPart]:
 
 
 def _table(name: str, rows: Sequence[AxisRow]) -> AnswerPart:
-    """One axis: a bar and a rate for each value."""
     listed, title = list(rows), name + (f", {rows[0].unit}" if rows[0].unit not in ("", "name", "1") else "")
     if len(rows) > MOST_ROWS:
         worst = sorted(range(len(rows)), key=lambda number: rows[number].accuracy or 0.0)[: MOST_ROWS // 2]

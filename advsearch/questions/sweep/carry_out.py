@@ -336,9 +336,6 @@ def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tupl
     return load_models(models, task, config)
 
 
-# ---- where it is kept -----------------------------------------------------------------------------------------------
-
-
 def _stopped(config: SweepConfig) -> Path | None:
     """The folder of a sweep of the same settings that was stopped, if `run` names one."""
     if config.run is None or config.overwrite or not is_run(run_path(config.run)):
@@ -355,9 +352,6 @@ def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | Non
         functions = {f"metric {name}": one for name, one in job.metrics.items()}
         check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
         return carry_out(job, run, progress, executor)
-
-
-# ---- who does it ----------------------------------------------------------------------------------------------------
 
 
 def sweep_answers(settings: JsonObject) -> Call:

@@ -219,13 +219,11 @@ def _noted(path: Path) -> Suite | None:
 
 
 def _seeded(suite: Suite, config: SuiteConfig) -> Suite:
-    """The suite with the seed that the command says, or a fresh one."""
     seed = secrets.randbelow(2**31) if config.fresh else suite.seed if config.seed is None else config.seed
     return suite.model_copy(update={"seed": seed})
 
 
 def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[PlannedClaim]:
-    """What is tried, counterexamples first."""
     changes = {"model": config.model, "threads": config.threads, "deterministic": config.deterministic or None}
     kept = counterexamples(config.suite) if added is None else [added]
     first = [PlannedClaim(one.name, "counterexample", one.config_for(suite, changes), one) for one in kept]

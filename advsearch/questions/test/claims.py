@@ -92,8 +92,6 @@ class Trial:
             found = self._not_broken(asked, config)
         return found.model_copy(update={"seconds": time.perf_counter() - begun})
 
-    # ---- a share ----------------------------------------------------------------------------------------------------
-
     def _right(self, asked: ClaimAnswer, claim: RightClaim, config: SceneConfig) -> ClaimAnswer:
         problem, shared = self._problem(config), self._shared(config)
         sequence, right = ConfidenceSequence(self.confidence), 0
@@ -120,8 +118,6 @@ class Trial:
             picture = self._picture(asked.name, problem, query)
         reason = right_reason(answer, right, sequence.count, sequence.interval, worst)
         return self._decided(asked, answer, reason, sequence, config, picture, (0.0, 1.0))
-
-    # ---- two models -------------------------------------------------------------------------------------------------
 
     def _no_worse(self, asked: ClaimAnswer, claim: NoWorseClaim, config: SceneConfig) -> ClaimAnswer:
         problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
@@ -170,8 +166,6 @@ class Trial:
         picture = None if first is None else self._picture(asked.name, problem, first)
         return self._decided(asked, answer, reason, sequence, config, picture, (-1.0, 2.0))
 
-    # ---- a search ---------------------------------------------------------------------------------------------------
-
     def _not_broken(self, asked: ClaimAnswer, config: AttackConfig) -> ClaimAnswer:
         seconds = min(self.left(), config.seconds or math.inf)
         own = config.model_copy(
@@ -197,8 +191,6 @@ class Trial:
                 "part": asked.name,
             }
         )
-
-    # ---- a counterexample -------------------------------------------------------------------------------------------
 
     def counterexample(self, one: Counterexample, config: AttackConfig) -> ClaimAnswer:
         """Try a counterexample: the model should be right on it."""
@@ -243,8 +235,6 @@ class Trial:
             }
         )
 
-    # ---- parts ------------------------------------------------------------------------------------------------------
-
     def _problem(self, config: SceneConfig) -> Problem:
         whole = AttackConfig.of(config)
         parts = parts_of(whole)
@@ -268,7 +258,6 @@ class Trial:
         return 1 if journal.traced.executor is None else AHEAD * (self.workers or 8)
 
     def _picture(self, name: str, problem: Problem, query: Query) -> str:
-        """Render the picture of a query again, and return its file in the run."""
         self.run.save_image(name, problem.picture(query.u, query.seed, query.spp, drawn=query.drawn))
         return f"{IMAGES}/{name}.png"
 

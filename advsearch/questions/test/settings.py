@@ -138,14 +138,11 @@ EXPECTED = {
     "settings": "settings with their values, such as `object: mug`",
     "title": "a text of 1 to 200 letters",
 }
-"""What each name of a suite takes."""
 
 A_CLAIM = "a claim such as {claim: right, at_least: 0.9}"
-"""What a name among the claims takes."""
 
 
 NUMBERS = ("at_least", "points", "pictures", "confidence", "seconds", "seed")
-"""Names that take numbers."""
 
 
 class _Described(BaseModel):
