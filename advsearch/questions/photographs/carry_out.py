@@ -22,15 +22,13 @@ from advsearch.engine.attack_parts import judged_alone, problem_from_config
 from advsearch.engine.judging import facts_of, judgements
 from advsearch.engine.naming import in_turn, load_models, scene_of
 from advsearch.engine.record import judged
-from advsearch.engine.sweeps import check_all
-from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
-from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
-from advsearch.questions.photographs.files import FOLDER, LARGEST, photo_name, rendering_file, sound_photo
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.photographs.answer import FOLDER, LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
+from advsearch.questions.photographs.serving import LARGEST, photo_name, rendering_file, sound_photo
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store
@@ -155,17 +153,13 @@ class Photographs:
         return photo_agreement(run)
 
 
-# ---- judging --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _PhotoJudge:
     """One of a run's models, and how it is shown pictures.
 
     Attributes:
         object: what a rendering shows that says nothing else.
-        model: loaded.
-        task: on it.
+        task: on the model.
         size: (height, width) of the run's renderings, in pixels.
         several: models that the run has.
         truth: what is true of a photograph, by the rendering that it was aligned with and the object.
@@ -224,9 +218,8 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
 
 def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
     """Who judges by the configurations of a sweep."""
-    job = job_of(config)
-    check_all(job)
-    scenes = Scenes(job)
+    scenes = scenes_of(config)
+    job = scenes.job
 
     def truth(model: int, rendering: str, name: str) -> Truth:
         number = int(rendering)
@@ -270,9 +263,6 @@ def _rendered(judge: _PhotoJudge, rendering: str, name: str, file: Path, row: Ro
         raise InputError(f"rendering: the results have no row for {file.stem}; it belongs to another run")
     judgement = judge.judgement(rendering, name, file.read_bytes())
     return judgement.right, judgement.answer.label
-
-
-# ---- counting -------------------------------------------------------------------------------------------------------
 
 
 def _agreement(rows: Sequence[Row]) -> PhotoAgreement:

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from advsearch.errors import InputError
 from advsearch.explanations import Answered
+from advsearch.questions.recipe.along import COLOURS, MARKS
 from advsearch.questions.recipe.answer import (
     BarsFigure,
     CorruptionFigure,
@@ -19,8 +20,8 @@ from advsearch.questions.recipe.answer import (
     PointsFigure,
     SurfaceFigure,
     SurfaceOf,
+    bare,
 )
-from advsearch.questions.recipe.figures.along import COLOURS, MARKS
 from advsearch.questions.recipe.table import (
     FigureKind,
     Options,
@@ -32,18 +33,13 @@ from advsearch.questions.recipe.table import (
     plural,
     rate_with_interval,
 )
-from advsearch.questions.recipe.words import bare
 from advsearch.report.figures import BLUE
 from advsearch.report.sweeps import surface_sentences
 from advsearch.runs.directory import IMAGES, PARTS
 
 
 class BarsOptions(Options):
-    """Options of bars.
-
-    Attributes:
-        by: what the bars differ in: object, environment, model, group, answer or a parameter.
-    """
+    """Options of bars; what they are says docs/recipes.md, as of the others."""
 
     by: str
 
@@ -74,23 +70,11 @@ def _draw_bars(made: BarsFigure, figure: Any, run: Path) -> None:
     axes.grid(True, axis="x")
 
 
-BARS = FigureKind(
-    BarsOptions,
-    BarsFigure,
-    _compute_bars,
-    _draw_bars,
-    lambda made: (6.0, 1.2 + 0.27 * len(made.bars)),
-)
+BARS = FigureKind(BarsOptions, BarsFigure, _compute_bars, _draw_bars, lambda made: (6.0, 1.2 + 0.27 * len(made.bars)))
 
 
 class PointsOptions(Options):
-    """Options of points.
-
-    Attributes:
-        by: what the rows differ in: object, environment, model, ...
-        series: what is side by side: part, trial, ...
-        names: what the series are called, where not by their values.
-    """
+    """Options of points."""
 
     by: str
     series: str
@@ -172,12 +156,7 @@ SHORT = 4
 
 
 class HeatMapOptions(Options):
-    """Options of a heat map.
-
-    Attributes:
-        rows: what rows differ in: object, environment, model, group, answer or a parameter.
-        columns: what columns differ in.
-    """
+    """Options of a heat map."""
 
     rows: str
     columns: str
@@ -255,12 +234,7 @@ HEAT_MAP = FigureKind(
 
 
 class CorruptionOptions(Options):
-    """Options of corruption errors.
-
-    Attributes:
-        which: the parameter that names the corruption.
-        clean: the part with pictures that have none.
-    """
+    """Options of corruption errors: the parameter that names one, and the part with pictures that have none."""
 
     which: str = "corruption.which"
     clean: str = Field(default="clean", max_length=40)

@@ -13,14 +13,17 @@ from torch import Tensor
 
 from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.questions.stability.scene import (
     BARE,
     SPP,
+    CaseGroup,
+    Check,
     ControlSettings,
+    Outcome,
     compared,
     dark,
     examine_gradient,
+    holds,
     mesh_of,
     search_domain,
     small,
@@ -38,7 +41,7 @@ SAME_PICTURE = 2e-3
 """Mean difference of two pictures that should be one: an 8-bit level is 4e-3."""
 FAR = 1e4
 
-GROUP = CaseGroup("geometry")
+GEOMETRY = CaseGroup("geometry")
 _SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
 _IMPORT = "the import removes faces without area and says so; the renderer never hits one"
 _NORMAL = "the import brings every object to size 1 at the origin, in 64-bit numbers"
@@ -51,15 +54,9 @@ def mesh(made: Mesh) -> Outcome:
     return examine_gradient(small(thing(made), PAINTED, settings=FRONT)).findings()
 
 
-@GROUP.case(
-    "degenerate-triangles",
-    "Faces without area change neither the picture nor the gradient.",
-    _IMPORT,
-    "texture, pose",
-    cheap=False,
-)
+@GEOMETRY.case("degenerate-triangles", _IMPORT, "texture, pose", cheap=False)
 def degenerate() -> Outcome:
-    """A square with faces that have no area: a repeated corner, three points on a line, one point three times."""
+    """Faces without area change neither the picture nor the gradient."""
     line = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
     faces = [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]]
     same = _difference(mesh_of(QUAD + line, faces), mesh_of(QUAD, HALVES))
@@ -68,51 +65,36 @@ def degenerate() -> Outcome:
         path = Path(folder) / "degenerate.obj"
         path.write_text(text)
         asset = import_object(path)
-    found = mesh(mesh_of(QUAD + line, faces))
-    more = (
+    return mesh(mesh_of(QUAD + line, faces)).with_checks(
         Check("mean difference from the square alone", same, most=SAME_PICTURE),
         Check("faces left after the import", float(len(asset.mesh.faces)), 2.0, 2.0),
         holds("the import says what it removed", any("without area" in note for note in asset.warnings)),
     )
-    return Outcome((*found.checks, *more), found.finite, found.relative_error, found.ending, found.measured)
 
 
-@GROUP.case(
-    "sliver-triangles",
-    "A triangle a million times as long as wide leaves everything finite and right.",
-    _SCENE,
-    "texture, pose",
-    cheap=False,
-)
+@GEOMETRY.case("sliver-triangles", _SCENE, "texture, pose", cheap=False)
 def sliver() -> Outcome:
-    """A square with a triangle across it that is a million times as long as wide."""
+    """A triangle a million times as long as wide leaves everything finite and right."""
     return mesh(mesh_of([*QUAD, [0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]], [*HALVES, [4, 5, 6]]))
 
 
-@GROUP.case("coincident-faces", "Two faces in one place look like one.", _SCENE, "texture, pose", cheap=False)
+@GEOMETRY.case("coincident-faces", _SCENE, "texture, pose", cheap=False)
 def coincident() -> Outcome:
-    """Two squares in one place: which is hit is chance, but not what the picture is."""
+    """Two faces in one place look like one."""
     twice = mesh_of(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]])
-    found = mesh(twice)
-    same = Check("mean difference from one square", _difference(twice, mesh_of(QUAD, HALVES)), most=SAME_PICTURE)
-    return Outcome((*found.checks, same), found.finite, found.relative_error, found.ending, found.measured)
+    apart = _difference(twice, mesh_of(QUAD, HALVES))
+    return mesh(twice).with_checks(Check("mean difference from one square", apart, most=SAME_PICTURE))
 
 
-@GROUP.case("one-triangle", "Finite, and both gradients are right.", _SCENE, "texture, pose", cheap=False)
+@GEOMETRY.case("one-triangle", _SCENE, "texture, pose", cheap=False)
 def one_triangle() -> Outcome:
-    """A mesh of one triangle."""
+    """Finite, and both gradients are right."""
     return mesh(mesh_of([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
 
 
-@GROUP.case(
-    "million-triangles",
-    "Finite, right, and like the coarse mesh of the same shape.",
-    _SCENE,
-    "texture, pose",
-    cheap=False,
-)
+@GEOMETRY.case("million-triangles", _SCENE, "texture, pose", cheap=False)
 def million() -> Outcome:
-    """A sphere of a million triangles: painted, and moved once each way."""
+    """Finite, right, and like the coarse mesh of the same shape."""
     fine, rough = (normalised(sphere(*counts)) for counts in ((501, 1000), (64, 128)))
     found = examine_gradient(small(thing(fine), {"texture": {"resolution": 8}}), evaluations=2)
     coarse, renderer = (small(thing(one), {"pose": {"x": [-0.3, 0.3]}}) for one in (rough, fine))
@@ -134,7 +116,7 @@ def sized(scale: float) -> Outcome:
 
 
 for scale in (0.01, 100.0):
-    GROUP.case(f"scale-{scale:g}", "Picture and gradient are finite.", _SCENE, "pose")(partial(sized, scale))
+    GEOMETRY.case(f"scale-{scale:g}", _SCENE, "pose", holds="Picture and gradient are finite.")(partial(sized, scale))
 
 
 def file_units(scale: float, shift: float = 0.0) -> Outcome:
@@ -155,25 +137,20 @@ def file_units(scale: float, shift: float = 0.0) -> Outcome:
 
 
 for scale in (0.01, 100.0):
-    GROUP.case(f"file-in-units-of-{scale:g}", "A file in other units gives the same picture.", _NORMAL, "pose")(
-        partial(file_units, scale)
-    )
-GROUP.case(
+    GEOMETRY.case(
+        f"file-in-units-of-{scale:g}", _NORMAL, "pose", holds="A file in other units gives the same picture."
+    )(partial(file_units, scale))
+GEOMETRY.case(
     "file-10000-sizes-off",
-    "A mesh that its file puts 10,000 sizes from the origin gives the same picture.",
     _NORMAL,
     "pose",
+    holds="A mesh that its file puts 10,000 sizes from the origin gives the same picture.",
 )(partial(file_units, 1.0, FAR))
 
 
-@GROUP.case(
-    "translation-10000",
-    "The picture is that of the scene without the object, and the gradient is zero.",
-    _SCENE,
-    "pose",
-)
+@GEOMETRY.case("translation-10000", _SCENE, "pose")
 def far_away() -> Outcome:
-    """The object 10,000 sizes away: gone from the picture, and so is its derivative."""
+    """The picture is that of the scene without the object, and the gradient is zero."""
     renderer = small("mug", {"pose": {"y": [9e3, FAR]}})
     found = examine_gradient(renderer, torch.tensor([1.0]))
     empty = small("mug", {"pose": {"z": [-3.0, -2.0]}}, settings={"pose.x": 9e3})
@@ -190,29 +167,23 @@ def extreme_view(controls: ControlSettings, u: Sequence[float], *, black: bool =
     return examine_gradient(renderer, torch.tensor(u, dtype=torch.float32), compare=compare).findings()
 
 
-GROUP.case("grazing-view", "Looking along the ground, the gradient by the elevation is right.", _PIXEL, "camera")(
-    partial(extreme_view, {"camera": {"elevation": [-10.0, 10.0]}}, [0.5])
-)
-GROUP.case("near-plane", "With the camera inside the object, picture and gradient are finite.", _SCENE, "camera")(
-    partial(extreme_view, {"camera": {"distance": [0.05, 0.2]}}, [0.5], black=False, compare=False)
-)
-GROUP.case("object-fills-the-frame", "Finite where nothing but the object is seen.", _SCENE, "camera")(
+GEOMETRY.case(
+    "grazing-view", _PIXEL, "camera", holds="Looking along the ground, the gradient by the elevation is right."
+)(partial(extreme_view, {"camera": {"elevation": [-10.0, 10.0]}}, [0.5]))
+GEOMETRY.case(
+    "near-plane", _SCENE, "camera", holds="With the camera inside the object, picture and gradient are finite."
+)(partial(extreme_view, {"camera": {"distance": [0.05, 0.2]}}, [0.5], black=False, compare=False))
+GEOMETRY.case("object-fills-the-frame", _SCENE, "camera", holds="Finite where nothing but the object is seen.")(
     partial(extreme_view, {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, [0.5], black=False, compare=False)
 )
-GROUP.case("object-leaves-the-frame", "Half outside, the gradient by the shift is right.", _PIXEL, "pose")(
+GEOMETRY.case("object-leaves-the-frame", _PIXEL, "pose", holds="Half outside, the gradient by the shift is right.")(
     partial(extreme_view, {"pose": {"x": [0.0, 2.0]}}, [0.5])
 )
 
 
-@GROUP.case(
-    "gimbal-angles",
-    "At a pitch of 90 degrees the gradients by angles and by the rotation vector are right.",
-    "differences of each number; the rotation vector does not lock",
-    "pose",
-    cheap=False,
-)
+@GEOMETRY.case("gimbal-angles", "differences of each number; the rotation vector does not lock", "pose", cheap=False)
 def gimbal() -> Outcome:
-    """At a pitch of 90 degrees yaw and roll turn about one axis: angles lock, the rotation vector does not."""
+    """At a pitch of 90 degrees the gradients by angles and by the rotation vector are right."""
     angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
     locked = small(dark(), angles, settings=BARE)
     u = torch.tensor([0.7, 0.5, 0.5])
@@ -248,15 +219,12 @@ def full_turn(controls: ControlSettings) -> Outcome:
 
 
 for name in ("pose.yaw", "camera.azimuth", "environment.rotation"):
-    GROUP.case(
+    GEOMETRY.case(
         f"full-turn-{name.replace('.', '-')}",
-        "0 and 360 degrees give one picture and one gradient, and a step goes on across the seam.",
         _WRAP,
         name.partition(".")[0],
+        holds="0 and 360 degrees give one picture and one gradient, and a step goes on across the seam.",
     )(partial(full_turn, {name.partition(".")[0]: {name.partition(".")[2]: [0.0, 360.0]}}))
-
-
-# ---- inside ---------------------------------------------------------------------------------------------------------
 
 
 def _shown(u: Tensor, renderer: object) -> Tensor:
@@ -266,7 +234,6 @@ def _shown(u: Tensor, renderer: object) -> Tensor:
 
 
 def _difference(one: Mesh, other: Mesh) -> float:
-    """Mean difference of the pictures of two meshes with the same seed."""
     shown = []
     for made in (one, other):
         renderer = small(thing(made), PAINTED, settings=FRONT)

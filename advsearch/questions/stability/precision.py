@@ -23,8 +23,7 @@ from advsearch.attacks.domain import project_l2_box
 from advsearch.attacks.evaluation import one_thread
 from advsearch.engine.gradients import smooth_loss
 from advsearch.models import load_model
-from advsearch.questions.stability.case import CaseGroup, Check, Outcome, Toy, holds
-from advsearch.questions.stability.scene import SIZE, ControlSettings, small
+from advsearch.questions.stability.scene import SIZE, CaseGroup, Check, ControlSettings, Outcome, Toy, holds, small
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.formation import to_8_bit
@@ -40,16 +39,12 @@ BISECTIONS = 24
 TEXTURE: ControlSettings = {"texture": {"resolution": 16}}
 SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
 
-GROUP = CaseGroup("precision")
+PRECISION = CaseGroup("precision")
 
 
-@GROUP.case(
-    "verdicts-in-single-precision",
-    "The model's answers in single and double precision differ only where the margin is under 0.001 logits.",
-    "20 trials with fresh noise, which moves margins a thousand times more",
-)
+@PRECISION.case("verdicts-in-single-precision", "20 trials with fresh noise, which moves margins a thousand times more")
 def verdicts() -> Outcome:
-    """The reference model in single and in double precision, on pictures on its own decision boundaries.
+    """The model's answers in single and double precision differ only where the margin is under 0.001 logits.
 
     Between two pictures with different answers the boundary is found by bisection in single precision; there the two
     may disagree, and what matters is how far from the boundary they still do.
@@ -87,23 +82,17 @@ def verdicts() -> Outcome:
         flips += int(wrong.sum())
         farthest = max(farthest, float(((top[:, 0] - top[:, 1]) * wrong).max()))
     return Outcome(
-        (
-            Check("boundaries that were found", float(pairs), least=2.0),
-            Check("largest margin at which the answers differ, logits", farthest, most=LOGITS),
-            Check("largest difference of a logit", apart, most=LOGITS),
-        ),
+        Check("boundaries that were found", float(pairs), least=2.0),
+        Check("largest margin at which the answers differ, logits", farthest, most=LOGITS),
+        Check("largest difference of a logit", apart, most=LOGITS),
         relative_error=apart,
         measured={"answers that differ on a boundary": float(flips)},
     )
 
 
-@GROUP.case(
-    "bytes-in-single-precision",
-    "The 8-bit picture is the same but for ties, and the model does not notice.",
-    "values on the edge of two levels take either",
-)
+@PRECISION.case("bytes-in-single-precision", "values on the edge of two levels take either")
 def picture_bytes() -> Outcome:
-    """The tone curve and the rounding to 8 bits in single and in double precision, and what that does to the model."""
+    """The 8-bit picture is the same but for ties, and the model does not notice."""
     model = load_model("reference")
     radiance = 1.2 * torch.rand(*model.input_size, 3, generator=torch.Generator().manual_seed(1))
     single, double = to_8_bit(linear_to_srgb(radiance)), to_8_bit(linear_to_srgb(radiance.double()))
@@ -112,22 +101,16 @@ def picture_bytes() -> Outcome:
         apart = float((model(single) - model(double.float())).abs().max())
     other = float((off > 0.0).double().mean())
     return Outcome(
-        (
-            Check("largest difference in 8-bit levels", float(off.max()), most=1.0),
-            Check("share of bytes that differ", other, most=1e-4),
-            Check("what they do to a logit", apart, most=LOGITS),
-        ),
+        Check("largest difference in 8-bit levels", float(off.max()), most=1.0),
+        Check("share of bytes that differ", other, most=1e-4),
+        Check("what they do to a logit", apart, most=LOGITS),
         relative_error=other,
     )
 
 
-@GROUP.case(
-    "ball-of-a-million-numbers",
-    "A projection in single precision lies inside the ball in double precision.",
-    "Domain.TOLERANCE: 2e-6 of the radius",
-)
+@PRECISION.case("ball-of-a-million-numbers", "Domain.TOLERANCE: 2e-6 of the radius")
 def large_ball(size: int = 1_000_000) -> Outcome:
-    """The projection of a million numbers onto an L2 ball, its norm in double precision."""
+    """A projection in single precision lies inside the ball in double precision."""
     generator = torch.Generator().manual_seed(0)
     start = torch.rand(size, generator=generator)
     radius = 0.1 * math.sqrt(size)
@@ -135,10 +118,8 @@ def large_ball(size: int = 1_000_000) -> Outcome:
     projected = project_l2_box(start + torch.randn(size, generator=generator), start, radius, 0.0, 1.0)
     norm = float((projected.double() - start.double()).norm())
     return Outcome(
-        (
-            Check("norm over the radius, in double precision", norm / radius, most=1.0 + 1e-5),
-            Check("excess that the domain sees", domain.violation(projected), most=2e-6),
-        ),
+        Check("norm over the radius, in double precision", norm / radius, most=1.0 + 1e-5),
+        Check("excess that the domain sees", domain.violation(projected), most=2e-6),
         relative_error=max(0.0, norm / radius - 1.0),
     )
 
@@ -157,47 +138,38 @@ def many_steps(name: str) -> Outcome:
 
     times: list[float] = []
     begun = time.perf_counter()
-    result = search(
-        partial(map, Toy(value, domain)),
-        domain,
-        make_policy(name),
-        steps=LONG,
-        seed=0,
-        candidates=0,
-        on_step=lambda record, u, found: times.append(time.perf_counter()),
-    )
+
+    def note(record: object, u: Tensor, found: object) -> None:
+        times.append(time.perf_counter())
+
+    policy = make_policy(name)
+    result = search(partial(map, Toy(value, domain)), domain, policy, steps=LONG, seed=0, candidates=0, on_step=note)
     gap = float(value(best.double())) - result.best_objective
     late, early = times[-1] - times[-LONG // 5], times[LONG // 5] - begun
     return Outcome(
-        (
-            Check("evaluations", float(len(result.history)), LONG, LONG),
-            Check("distance outside the budget", domain.violation(result.best_u), most=2e-6),
-            Check("gap to the optimum", gap, most=1e-3),
-            Check("steps that were not finite", float(result.non_finite_objectives), 0.0, 0.0),
-        ),
-        bool(torch.isfinite(result.best_u).all()),
-        gap,
-        result.ending.value,
-        {"time of the last fifth over the first": late / early},
+        Check("evaluations", float(len(result.history)), LONG, LONG),
+        Check("distance outside the budget", domain.violation(result.best_u), most=2e-6),
+        Check("gap to the optimum", gap, most=1e-3),
+        Check("steps that were not finite", float(result.non_finite_objectives), 0.0, 0.0),
+        finite=bool(torch.isfinite(result.best_u).all()),
+        relative_error=gap,
+        ending=result.ending.value,
+        measured={"time of the last fifth over the first": late / early},
     )
 
 
 for name in ("pgd", "adam"):
-    GROUP.case(
+    PRECISION.case(
         f"ten-thousand-steps-{name}",
-        "The search stays inside its budget and at its peak.",
         "momentum forgets; each step is projected anew",
+        holds="The search stays inside its budget and at its peak.",
         cheap=False,
     )(partial(many_steps, name))
 
 
-@GROUP.case(
-    "ten-thousand-turns",
-    "An angle that goes round in small steps does not drift, and no two steps have one seed.",
-    "wrapped at every step, so it stays small",
-)
+@PRECISION.case("ten-thousand-turns", "wrapped at every step, so it stays small")
 def accumulation() -> Outcome:
-    """10,000 small steps of an angle around its circle, in single against double precision, and 10,000 seeds."""
+    """An angle that goes round in small steps does not drift, and no two steps have one seed."""
     domain = Domain(torch.zeros(1), (Block(1, periodic=True, name="angle"),))
     u, exact, step = torch.zeros(1), 0.0, 0.000_731
     for _ in range(LONG):
@@ -207,10 +179,8 @@ def accumulation() -> Outcome:
     drift = min(drift, 1.0 - drift)
     different = len({seeds.stream(0, "search", index) for index in range(LONG)})
     return Outcome(
-        (
-            Check("drift of the angle, in turns", drift, most=1e-3),
-            Check("different seeds of 10,000 steps", float(different), least=LONG - 1),
-        ),
+        Check("drift of the angle, in turns", drift, most=1e-3),
+        Check("different seeds of 10,000 steps", float(different), least=LONG - 1),
         relative_error=drift,
     )
 
@@ -233,15 +203,9 @@ def rendered(path: str, count: int) -> None:
     np.savez(path, allow_pickle=False, **{name: one.numpy() for name, one in found.items()})
 
 
-@GROUP.case(
-    "one-and-two-threads",
-    "The same bits every time with one thread; with two, adjoints may differ in the last.",
-    "box filter; `deterministic` takes one thread",
-    "texture, pose",
-    cheap=False,
-)
+@PRECISION.case("one-and-two-threads", "box filter; `deterministic` takes one thread", "texture, pose", cheap=False)
 def one_and_two_threads() -> Outcome:
-    """Pictures, pictures of a moved mesh and an adjoint: twice with one thread and once with two, in processes each.
+    """The same bits every time with one thread; with two, adjoints may differ in the last.
 
     A moved mesh is sorted anew by all threads, which could decide which of two triangles a ray meets on their common
     edge (seen in no picture so far); so the limit is `BITS` there.
@@ -252,25 +216,23 @@ def one_and_two_threads() -> Outcome:
             path = str(Path(folder) / f"{number}.npz")
             status, said = _in_a_process(f"from {__name__} import rendered; rendered({path!r}, {count})")
             if status:
-                return Outcome((Check(f"exit status with {count} threads ({said})", float(status), 0.0, 0.0),))
+                return Outcome(Check(f"exit status with {count} threads ({said})", float(status), 0.0, 0.0))
             with np.load(path) as arrays:
                 found.append(dict(arrays))
     one, again, two = found
     moved = float(np.abs(one["moved"] - two["moved"]).max())
     error = float(np.abs(one["adjoint"] - two["adjoint"]).max() / np.abs(one["adjoint"]).max())
     return Outcome(
-        (
-            *(holds(f"{name}: the same bits with 1 thread each time", _equal(one[name], again[name])) for name in one),
-            holds("adjoint: the same bits each time with 1 thread", _equal(one["adjoint"], one["again"])),
-            *(
-                holds(f"{name}: the same bits with 1 and 2 threads", _equal(one[name], two[name]))
-                for name in ("raw", "denoised")
-            ),
-            Check("adjoint: relative difference between 1 and 2 threads", error, most=BITS),
-            Check("pictures of a moved mesh: largest difference between 1 and 2 threads", moved, most=BITS),
+        *(holds(f"{name}: the same bits with 1 thread each time", _equal(one[name], again[name])) for name in one),
+        holds("adjoint: the same bits each time with 1 thread", _equal(one["adjoint"], one["again"])),
+        *(
+            holds(f"{name}: the same bits with 1 and 2 threads", _equal(one[name], two[name]))
+            for name in ("raw", "denoised")
         ),
-        all(bool(np.isfinite(array).all()) for made in found for array in made.values()),
-        error,
+        Check("adjoint: relative difference between 1 and 2 threads", error, most=BITS),
+        Check("pictures of a moved mesh: largest difference between 1 and 2 threads", moved, most=BITS),
+        finite=all(bool(np.isfinite(array).all()) for made in found for array in made.values()),
+        relative_error=error,
         measured={"moved mesh, 1 against 2 threads": moved, "adjoint, 1 against 2 threads": error},
     )
 
@@ -289,18 +251,17 @@ def changed_threads(counts: Sequence[int] = (2, 1, 2, 1, 2, 1)) -> None:
             renderer(renderer.start, 0, 8)
 
 
-@GROUP.case(
+@PRECISION.case(
     "threads-change-under-a-scene",
-    "Changing the number of threads while a scene is in use does not end the process.",
     "a recorded kernel is made anew when the number of threads changes",
     "pose",
     cheap=False,
 )
 def threads_under_a_scene() -> Outcome:
-    """A scene that lives while the number of threads is changed, as a deterministic second search does."""
+    """Changing the number of threads while a scene is in use does not end the process."""
     status, said = _in_a_process(f"from {__name__} import changed_threads; changed_threads()")
     return Outcome(
-        (Check("exit status of the process" + (f" ({said})" if said else ""), float(status), 0.0, 0.0),),
+        Check("exit status of the process" + (f" ({said})" if said else ""), float(status), 0.0, 0.0),
         ending="survived" if status == 0 else "crashed",
     )
 

@@ -7,36 +7,33 @@ each number there: its curvatures, whose ratio (the condition number) is printed
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Policy, SearchResult, make_policy, search
+from advsearch.attacks import PGD, Domain, Policy, SearchResult, make_policy, search
 from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
 from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.case import (
+from advsearch.questions.stability.scene import (
+    SHARPNESS,
     CaseGroup,
     Check,
+    ControlSettings,
+    Evaluator,
     Outcome,
     Toy,
     Value,
     box_domain,
     condition_number,
+    examine_gradient,
     hessian,
     quadratic,
-    valley,
-)
-from advsearch.questions.stability.scene import (
-    SHARPNESS,
-    ControlSettings,
-    Evaluator,
-    examine_gradient,
     search_domain,
     small,
+    valley,
 )
 from advsearch.scene.renderer import Renderer
 
@@ -46,42 +43,32 @@ RATIO = 1e6
 CLOSE = 0.01
 """How near to the peak, as a share of the range, counts as there, in every number."""
 FOLLOWERS = ("pgd", "adam")
-"""Policies that follow a gradient."""
 SAME = 1e-5
 """Distance in u that rounding may bring about between two trajectories."""
 SLOWER = 1.5
 """Factor by which a rate may depend on the scale."""
 
-GROUP = CaseGroup("stiff")
+STIFF = CaseGroup("stiff")
 _BOX = "controls map their units to the unit box; policies know nothing else"
 _BLOCKS = "a step has the length of each block's own radius (Domain.steepest); adam divides by each number's own scale"
 
 
-def path(toy: Toy, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0) -> tuple[SearchResult, Tensor]:
+def path(
+    evaluate: Toy | Evaluator, domain: Domain, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0
+) -> tuple[SearchResult, Tensor]:
     """Search, and return the result and the configurations (n, d) that were evaluated."""
     seen: list[Tensor] = []
-    result = search(
-        partial(map, toy),
-        toy.domain,
-        policy,
-        steps=steps,
-        seed=seed,
-        candidates=0,
-        on_step=lambda record, u, found: seen.append(u),
-    )
+
+    def note(record: object, u: Tensor, found: object) -> None:
+        seen.append(u)
+
+    result = search(partial(map, evaluate), domain, policy, steps=steps, seed=seed, candidates=0, on_step=note)
     return result, torch.stack(seen)
 
 
-# ---- units ----------------------------------------------------------------------------------------------------------
-
-
-@GROUP.case(
-    "rescaled-units",
-    "A search in milliwatts and radians goes through the same configurations as in watts and degrees.",
-    _BOX,
-)
+@STIFF.case("rescaled-units", _BOX)
 def rescaled_units() -> Outcome:
-    """A lamp and a rotation, in watts and degrees or in milliwatts and radians: the same search.
+    """A search in milliwatts and radians goes through the same configurations as in watts and degrees.
 
     The ranges are read and mapped as those of any control are.
     """
@@ -90,12 +77,14 @@ def rescaled_units() -> Outcome:
         paths = []
         for watt, degree in ((1.0, 1.0), (1e3, math.pi / 180.0), (1e-6, 3600.0)):
             toy = _lamp_and_rotation(watt, degree)
-            result, seen = path(toy, make_policy(name), steps=60)
+            result, seen = path(toy, toy.domain, make_policy(name), steps=60)
             paths.append(seen)
             endings.add(result.ending.value)
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
     return Outcome(
-        (Check("largest distance of two trajectories in u", worst, most=SAME),), True, worst, ", ".join(sorted(endings))
+        Check("largest distance of two trajectories in u", worst, most=SAME),
+        relative_error=worst,
+        ending=", ".join(sorted(endings)),
     )
 
 
@@ -118,46 +107,39 @@ def _lamp_and_rotation(watt: float, degree: float) -> Toy:
     return Toy(value, box_domain(start))
 
 
-@GROUP.case(
-    "rescaled-objective",
-    "A search of the objective times a million goes through the same configurations.",
-    "steps are normalised, ranks and standardised values have no unit",
-)
+@STIFF.case("rescaled-objective", "steps are normalised, ranks and standardised values have no unit")
 def objective_units() -> Outcome:
-    """The same objective times a millionth and a million: the same search."""
+    """A search of the objective times a million goes through the same configurations."""
     worst = 0.0
     for name in ("pgd", "adam", "cmaes", "nes", "auto"):
         paths = []
         for scale in (1.0, 1e-6, 1e6):
             toy = Toy(quadratic([0.7, 0.4], [1.0, 30.0]), box_domain([0.1, 0.9]), scale=scale)
-            paths.append(path(toy, make_policy(name), steps=60)[1])
+            paths.append(path(toy, toy.domain, make_policy(name), steps=60)[1])
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
-    return Outcome((Check("largest distance of two trajectories in u", worst, most=SAME),), True, worst)
+    return Outcome(Check("largest distance of two trajectories in u", worst, most=SAME), relative_error=worst)
 
 
-# ---- curvatures -----------------------------------------------------------------------------------------------------
-
-
-@GROUP.case("curvatures-1e6", "A search takes no more evaluations than where the curvatures are equal.", _BLOCKS)
+@STIFF.case("curvatures-1e6", _BLOCKS)
 def curvatures(ratio: float = RATIO) -> Outcome:
-    """Two numbers whose curvatures differ by a million: evaluations until both are at the peak, against equal ones."""
+    """A search takes no more evaluations than where the curvatures are equal."""
     checks, measured, start, peak = [], {}, [0.15, 0.9], [0.63, 0.37]
     for name in FOLLOWERS:
-        worst = 0.0
-        alike = _until_there(name, quadratic(peak, [1.0, 1.0]), start, peak)
-        for pair in ([ratio, 1.0], [1.0, ratio]):
-            worst = max(worst, _until_there(name, quadratic(peak, pair), start, peak))
+        alike, *stiff = (
+            _until_there(name, quadratic(peak, pair), start, peak) for pair in ([1.0, 1.0], [ratio, 1.0], [1.0, ratio])
+        )
+        worst = max(stiff)
         measured[f"{name}: evaluations, equal"] = alike
         measured[f"{name}: evaluations, stiff"] = worst
         checks.append(
             Check(f"{name}: evaluations to the peak over those where it is round", worst / alike, most=SLOWER)
         )
-    stiff = quadratic(peak, [ratio, 1.0])
-    second = hessian(lambda u: float(stiff(u)), torch.tensor(peak).double(), torch.eye(2).double(), [1e-2, 1e-2])
+    value = quadratic(peak, [ratio, 1.0])
+    second = hessian(lambda u: float(value(u)), torch.tensor(peak).double(), torch.eye(2).double(), [1e-2, 1e-2])
     found = condition_number(second)
     measured["condition number"] = found
     checks.append(Check("estimated condition number over the true one", found / ratio, 0.95, 1.05))
-    return Outcome(tuple(checks), True, abs(found / ratio - 1.0), measured=measured)
+    return Outcome(*checks, relative_error=abs(found / ratio - 1.0), measured=measured)
 
 
 def _until_there(name: str, value: Value, start: list[float], peak: list[float], scale: float = 1.0) -> float:
@@ -172,15 +154,16 @@ def _until_there(name: str, value: Value, start: list[float], peak: list[float],
 
     counts = []
     for seed in range(SEEDS):
-        _, seen = path(Toy(value, box_domain(start), disturb=disturb), make_policy(name), seed=seed)
+        domain = box_domain(start)
+        _, seen = path(Toy(value, domain, disturb=disturb), domain, make_policy(name), seed=seed)
         near = ((seen - torch.tensor(peak)).abs().amax(dim=1) <= CLOSE).nonzero()
         counts.append(float(near[0]) + 1.0 if len(near) else math.inf)
     return sum(counts) / len(counts)
 
 
-@GROUP.case("scaled-derivative", "One control's derivative times a million changes nothing about the rate.", _BLOCKS)
+@STIFF.case("scaled-derivative", _BLOCKS)
 def scaled_block() -> Outcome:
-    """The gradient of one number times a million or a millionth, the objective as it is: the rate has to stay.
+    """One control's derivative times a million changes nothing about the rate.
 
     So it is where one control's derivative comes in other units than another's.
     """
@@ -192,30 +175,25 @@ def scaled_block() -> Outcome:
             measured[f"{name}: evaluations at x {scale:g}"] = counts[scale]
         worst = max(counts.values()) / counts[1.0]
         checks.append(Check(f"{name}: evaluations over those of the unscaled gradient", worst, most=SLOWER))
-    return Outcome(tuple(checks), measured=measured)
+    return Outcome(*checks, measured=measured)
 
 
-# ---- valleys and boxes ----------------------------------------------------------------------------------------------
-
-
-@GROUP.case(
+@STIFF.case(
     "curved-valley",
-    "auto, adam and cmaes are no worse than random search, auto or cmaes reaches the peak, pgd the valley.",
     "auto models the objective, cmaes learns the valley's shape; pgd steps by signs and is slow",
     cheap=False,
 )
 def curved_valley(steps: int = 400) -> Outcome:
-    """Rosenbrock's valley: what policies have left to its peak after 400 renders, beside random search.
+    """auto, adam and cmaes are no worse than random search, auto or cmaes reaches the peak, pgd the valley.
 
     PGD steps by signs in numbers that are blocks of their own, so it has to go round the bend in small steps: it gets
     down into the valley, and no further than random search does in two dimensions. That is measured, not required.
     """
     start, measured = [0.2, 0.75], {}
     for name in ("random", "auto", "pgd", "adam", "cmaes"):
-        gaps = sorted(
-            -path(Toy(valley, box_domain(start)), make_policy(name), steps=steps, seed=seed)[0].best_objective
-            for seed in range(SEEDS)
-        )
+        toy = Toy(valley, box_domain(start))
+        searched = [path(toy, toy.domain, make_policy(name), steps=steps, seed=seed)[0] for seed in range(SEEDS)]
+        gaps = sorted(-one.best_objective for one in searched)
         measured[f"{name}: median gap"] = gaps[len(gaps) // 2]
     second = hessian(lambda u: float(valley(u)), torch.tensor([0.75, 0.75]).double(), torch.eye(2).double(), [1e-3] * 2)
     measured["condition number"] = condition_number(second)
@@ -229,17 +207,12 @@ def curved_valley(steps: int = 400) -> Outcome:
     best = min(measured[f"{name}: median gap"] for name in ("auto", "cmaes"))
     checks.append(Check("smallest gap of auto and cmaes", best, most=1e-3))
     checks.append(Check("condition number over 2508", measured["condition number"] / 2508.0, 0.9, 1.1))
-    return Outcome(tuple(checks), measured=measured)
+    return Outcome(*checks, measured=measured)
 
 
-@GROUP.case(
-    "badly-scaled-box",
-    "A peak a thousandth of the range wide is found by what converges.",
-    "step sizes fall until the peak is resolved",
-    cheap=False,
-)
+@STIFF.case("badly-scaled-box", "step sizes fall until the peak is resolved", cheap=False)
 def wide_box(width: float = 1e-3) -> Outcome:
-    """A box a thousand times as wide as the objective's own scale in one number, and just right in the other."""
+    """A peak a thousandth of the range wide is found by what converges."""
     peak, start = [0.63, 0.3712], [0.2, 0.9]
 
     def value(u: Tensor) -> Tensor:
@@ -248,28 +221,24 @@ def wide_box(width: float = 1e-3) -> Outcome:
 
     checks, measured = [], {}
     for name in ("auto", "pgd", "adam", "cmaes", "random"):
-        gaps = sorted(
-            float(
-                (path(Toy(value, box_domain(start)), make_policy(name), steps=150, seed=s)[0].best_u[1] - peak[1]).abs()
-            )
-            for s in range(SEEDS)
-        )
+        toy = Toy(value, box_domain(start))
+        searched = [path(toy, toy.domain, make_policy(name), steps=150, seed=seed)[0] for seed in range(SEEDS)]
+        gaps = sorted(abs(float(one.best_u[1] - peak[1])) for one in searched)
         measured[f"{name}: median distance"] = gaps[len(gaps) // 2]
     for name in ("pgd", "adam", "cmaes"):
         checks.append(
             Check(f"{name}: distance to the peak in its widths", measured[f"{name}: median distance"] / width, most=3.0)
         )
-    return Outcome(tuple(checks), measured=measured)
+    return Outcome(*checks, measured=measured)
 
 
-@GROUP.case(
+@STIFF.case(
     "badly-scaled-range",
-    "The derivative does not depend on how wide the searched range is.",
     "a difference is as wide as moves the outline by a pixel, but at least 1e-6 of the range",
     "pose",
 )
 def wide_range() -> Outcome:
-    """A shift searched over 20,000 object sizes: its derivative has to be that of a sensible range."""
+    """The derivative does not depend on how wide the searched range is."""
     wide, narrow = (small("mug", {"pose": {"x": [-reach, reach]}}) for reach in (1e4, 0.3))
     loss = smooth_loss(wide.formation.resolution)
     slopes = [
@@ -278,25 +247,16 @@ def wide_range() -> Outcome:
     ]
     error = float((slopes[0] / slopes[1] - 1.0).abs())
     found = examine_gradient(wide, compare=False)
-    return replace(
-        found.findings(Check("error of the derivative per object size", error, most=0.2)),
+    return found.findings(
+        Check("error of the derivative per object size", error, most=0.2),
         relative_error=error,
         measured={"step in u": wide.plan.groups[0].step, "step in object sizes": wide.plan.groups[0].step * 2e4},
     )
 
 
-# ---- a scene --------------------------------------------------------------------------------------------------------
-
-
-@GROUP.case(
-    "light-rotation-texel",
-    "All three move, the condition number is printed, and the objective's unit does not matter.",
-    _BLOCKS,
-    "light, pose, texture",
-    cheap=False,
-)
+@STIFF.case("light-rotation-texel", _BLOCKS, "light, pose, texture", cheap=False)
 def light_rotation_texel() -> Outcome:
-    """A lamp's power beside a rotation beside texels, rendered: how stiff it is, and whether each of them moves."""
+    """All three move, the condition number is printed, and the objective's unit does not matter."""
     controls: ControlSettings = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
         "pose": {"yaw": [0.0, 360.0]},
@@ -334,21 +294,10 @@ def light_rotation_texel() -> Outcome:
             most=1e-3,
         ),
     )
-    return replace(found.findings(*checks), ending=result.ending.value, measured=measured)
+    return found.findings(*checks, ending=result.ending.value, measured=measured)
 
 
 def _walk(renderer: Renderer, u: Tensor, loss: Value, scale: float) -> tuple[SearchResult, Tensor]:
-    """Search from u for a larger loss, in units of `scale`; return the result and where it has been (n, d)."""
-    seen: list[Tensor] = []
-
-    def scaled(image: Tensor) -> Tensor:
-        return scale * loss(image)
-
-    def note(record: object, at: Tensor, found: object) -> None:
-        seen.append(at)
-
-    evaluate = Evaluator(renderer, scaled, 8)
-    result = search(
-        partial(map, evaluate), search_domain(renderer, u), PGD(), steps=18, seed=0, candidates=0, on_step=note
-    )
-    return result, torch.stack(seen)
+    """Search from u for a larger loss, in units of `scale`."""
+    evaluate = Evaluator(renderer, lambda image: scale * loss(image), 8)
+    return path(evaluate, search_domain(renderer, u), PGD(), steps=18)

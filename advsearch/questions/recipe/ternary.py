@@ -11,24 +11,16 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.explanations import Answered
-from advsearch.questions.recipe.answer import MixtureLead, TernaryAnswer, TernaryCell, TernaryFigure
+from advsearch.questions.recipe.answer import MixtureLead, TernaryAnswer, TernaryCell, TernaryFigure, bare
 from advsearch.questions.recipe.table import CONFIDENCE, FigureKind, Options, Table, count_of, extremes, most_frequent
-from advsearch.questions.recipe.words import bare
 from advsearch.report.phrases import percent
 
 Shares = tuple[float, float, float]
 
 
 class TernaryOptions(Options):
-    """Options of ternary diagrams.
-
-    Attributes:
-        shares: three parameters, the ingredients, of which each picture has a mixture.
-        normalised: whether the colours of each answer end at its own largest share, or all at 1; the colours of leads
-            begin at the smallest, or at 0.
-        most: answers, the most frequent first.
-        side: triangles along a side.
-    """
+    """Options of ternary diagrams of three shares. Of normalised ones the colours of each answer end at its own largest
+    share, and those of leads begin at the smallest; `side` is triangles along a side."""
 
     shares: tuple[str, str, str]
     normalised: bool = False

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
+from advsearch.errors import InputError
 from advsearch.explanations import Answered
-from advsearch.questions.recipe.answer import AnswersFigure, AnswersRow, CuesFigure, CuesRow, GivenAnswer, NamedCount
+from advsearch.questions.recipe.along import COLOURS, MARKS
+from advsearch.questions.recipe.answer import (
+    AgreementCount,
+    AgreementFigure,
+    AgreementSeries,
+    AnswersFigure,
+    AnswersRow,
+    CuesFigure,
+    CuesRow,
+    GivenAnswer,
+    NamedCount,
+)
 from advsearch.questions.recipe.table import (
     FigureKind,
     Options,
@@ -36,12 +48,7 @@ FEWEST_LETTERS = 4
 
 
 class AnswersOptions(Options):
-    """Options of the most frequent answers.
-
-    Attributes:
-        by: what the rows differ in: object, material.which, ...
-        most: answers of each row.
-    """
+    """Options of the most frequent answers."""
 
     by: str
     most: int = Field(default=4, ge=1, le=10)
@@ -116,13 +123,7 @@ FEWEST_CELLS = 4
 
 
 class CuesOptions(Options):
-    """Options of cues.
-
-    Attributes:
-        texture: what has the texture.
-        shape: what has the shape.
-        classes: for a texture, the answers that name it: ``{zebra: [zebra]}``.
-    """
+    """Options of cues; for a texture, `classes` are the answers that name it."""
 
     texture: str = "material.which"
     shape: str = "object"
@@ -276,3 +277,136 @@ def _draw_cues(made: CuesFigure, figure: Any, run: Path) -> None:
 
 
 CUES = FigureKind(CuesOptions, CuesFigure, _compute_cues, _draw_cues, lambda made: (6.0, 1.7 + 0.27 * len(made.rows)))
+
+
+NO_PHOTOGRAPHS = (
+    "There are no photographs yet: nothing is said about reality here. Take some with advsearch dashboard and the "
+    "runs in parts/, or name a folder of them (photographs=FOLDER), and let advsearch resume go on with this run."
+)
+ALL = "all objects"
+
+AnswerPair = tuple[Answered, Answered]
+
+
+class AgreementOptions(Options):
+    """Options of agreements: the part whose renderings are compared with photographs, and parts that picture the same
+    configurations under other conditions."""
+
+    of: tuple[str, ...] = Field(min_length=1)
+    names: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Those, and photographs."""
+        return (*self.of, PHOTOGRAPHS)
+
+
+def _compute_agreement(table: Table, options: AgreementOptions) -> AgreementFigure:
+    shown = [row for row in table.rows if row.part == options.of[0]]
+    if not shown:
+        raise InputError(f"figures: agreement: expected answers of a part {options.of[0]!r}, got none")
+    series = [_series(shown, table.rows, part, options) for part in (PHOTOGRAPHS, *options.of[1:])]
+    known = [one for one in series if one.total.agreeing.configurations or one.alone]
+    said = [] if known and known[0].part == PHOTOGRAPHS else [NO_PHOTOGRAPHS]
+    return AgreementFigure(
+        figure="agreement",
+        title=options.title or "Renderings and other pictures of the same",
+        text=said + [text for one in known for text in _said_of_series(one)],
+        renderings=options.of[0],
+        series=known,
+    )
+
+
+def _series(
+    shown: Sequence[Answered], rows: Sequence[Answered], part: str, options: AgreementOptions
+) -> AgreementSeries:
+    """Pair the pictures of a part with the renderings whose values they have."""
+    names = list(shown[0].values)
+    by_values = {_key(row, names): row for row in shown}
+    others = [row for row in rows if row.part == part]
+    pairs = [(found, row) for row in others if (found := by_values.get(_key(row, names))) is not None]
+    if part != PHOTOGRAPHS and len(pairs) < len(others):
+        raise InputError(f"figures: agreement: expected {part} to have the configurations of {options.of[0]}")
+    objects = list(dict.fromkeys(str(row.values["object"]) for row in shown))
+    by_object = {name: [pair for pair in pairs if pair[0].values["object"] == name] for name in objects}
+    return AgreementSeries(
+        part=part,
+        name=options.names.get(part, part),
+        alone=len(others) - len(pairs),
+        total=_count(ALL, pairs),
+        rows=[_count(name, inside) for name, inside in by_object.items()],
+    )
+
+
+def _key(row: Answered, names: Sequence[str]) -> Hashable:
+    """The values that renderings have; other pictures may have more."""
+    return tuple(row.values.get(name) for name in names)
+
+
+def _count(name: str, pairs: Sequence[AnswerPair]) -> AgreementCount:
+    counts = {
+        (a, b): sum((x.correct, y.correct) == (a, b) for x, y in pairs) for a in (True, False) for b in (True, False)
+    }
+    return AgreementCount(
+        name=name,
+        right_right=counts[True, True],
+        right_wrong=counts[True, False],
+        wrong_right=counts[False, True],
+        wrong_wrong=counts[False, False],
+        same_answer=sum(x.answer == y.answer for x, y in pairs),
+        agreeing=count_of(name, counts[True, True] + counts[False, False], len(pairs)),
+    )
+
+
+def _said_of_series(one: AgreementSeries) -> list[str]:
+    total, said = one.total, []
+    if total.agreeing.configurations:
+        said.append(
+            f"Renderings and {one.name}: {rate_with_interval(total.agreeing, 'right about both or wrong about both')}. "
+            f"{_share('right', total.right_right, total.right_wrong)} "
+            f"{_share('wrong', total.wrong_wrong, total.wrong_right)} The answer is the same in "
+            f"{total.same_answer} of {total.agreeing.configurations} "
+            f"({percent(total.same_answer / total.agreeing.configurations)})."
+        )
+    if one.part == PHOTOGRAPHS and total.agreeing.configurations:
+        said.append("The intervals take photographs as independent.")
+    if one.alone:
+        belong = "belongs" if one.alone == 1 else "belong"
+        said.append(f"{one.alone} of the photographs {belong} to no rendering and so to no pair.")
+    return said
+
+
+def _share(verb: str, same: int, other: int) -> str:
+    if not same + other:
+        return f"It is {verb} about none of the renderings."
+    counted = rate_with_interval(count_of("", same, same + other), verb)
+    return f"Where it is {verb} about the rendering, it is {counted} about the other."
+
+
+def _draw_agreement(made: AgreementFigure, figure: Any, run: Path) -> None:
+    axes = figure.subplots()
+    names = [ALL, *[row.name for row in made.series[0].rows][::-1]] if made.series else []
+    for number, one in enumerate(made.series):
+        shift = (number - (len(made.series) - 1) / 2) * 0.22
+        colour, label = COLOURS[number % len(COLOURS)], one.name
+        for row in [one.total, *one.rows]:
+            share, place = row.agreeing, names.index(row.name) - shift
+            if share.interval:
+                axes.plot(share.interval, [place] * 2, color=colour, alpha=0.45, linewidth=3)
+                axes.plot(share.accuracy, place, MARKS[number % len(MARKS)], color=colour, ms=5, label=label)
+                label = "_"
+    axes.set_yticks(range(len(names)), names)
+    axes.set(xlabel="share that agrees, with 95 % interval", xlim=(-0.03, 1.03), ylim=(-0.6, max(len(names), 1) - 0.4))
+    axes.set_title(made.title)
+    axes.grid(True, axis="x")
+    figure.legend(loc="outside lower center", ncols=1)
+
+
+AGREEMENT = FigureKind(
+    AgreementOptions,
+    AgreementFigure,
+    _compute_agreement,
+    _draw_agreement,
+    lambda made: (6.0, 1.7 + 0.2 * len(made.series) + 0.34 * len(made.series[0].rows if made.series else [])),
+    tells_models=True,
+)

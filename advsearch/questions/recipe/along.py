@@ -21,14 +21,8 @@ from advsearch.runs.results.base import Interval
 
 @dataclass(frozen=True)
 class Fall:
-    """By how much less often the model is right far from a value than near it.
-
-    Attributes:
-        near: answers no farther than halfway.
-        far: the others.
-        fall: share of right answers near less that far.
-        interval: of it, 95 %.
-    """
+    """By how much less often the model is right far from a value than near it: answers no farther than halfway, the
+    others, the difference of both shares and its 95 % interval."""
 
     near: NamedCount
     far: NamedCount
@@ -39,16 +33,8 @@ class Fall:
 def fall_of(
     name: str, rows: Sequence[Answered], values: Sequence[float], middle: float, turn: float | None, halfway: float
 ) -> Fall | None:
-    """Compare the answers near a value with those far from it; None where there are none of one kind.
-
-    Args:
-        name: of the line.
-        rows: its answers.
-        values: of the parameter, one for each row.
-        middle: the value that others are near to or far from.
-        turn: after how much values come round; None where they do not.
-        halfway: the distance up to which a value is near.
-    """
+    """Compare the answers of a line within `halfway` of a value with those beyond; None where there are none of one
+    kind. `turn` is after how much values come round."""
     counts = {True: [0, 0], False: [0, 0]}
     for row, value in zip(rows, values, strict=True):
         count = counts[distance(value, middle, turn) <= halfway]
@@ -75,13 +61,8 @@ def _apart(one: float, own: Interval, other: float, others: Interval) -> Interva
 
 
 def said(falls: Sequence[Fall], along: str, near: str) -> list[str]:
-    """Say of each line whether accuracy falls, and of two lines whether it does so more for one.
-
-    Args:
-        falls: of the lines.
-        along: the parameter.
-        near: what near means: ``within 90 degrees of 0``.
-    """
+    """Say of each line whether accuracy falls along a parameter, and of two lines whether it does so more for one.
+    `near` is what near means: ``within 90 degrees of 0``."""
     told = [f"{one.near.name}: {_fall(one, along, near)}" for one in falls]
     if len(falls) == 2:
         more, less = sorted(falls, key=lambda one: -one.fall)
@@ -107,17 +88,8 @@ MARKS = ("o", "s", "^", "D", "v", "P")
 
 
 class CurveOptions(Options):
-    """Options of a curve.
-
-    Attributes:
-        along: a parameter with numbers.
-        by: what the lines differ in: object, group, model, trial, ...; one line where it is not given.
-        bins: parts of the range.
-        range: its ends; by default the least and the largest value.
-        names: what the lines are called, where not by their values.
-        away_from: a value; it is said whether accuracy falls with the distance from it.
-        turn: after how much the parameter comes round, for that distance: 360 for a heading in degrees.
-    """
+    """Options of a curve along a parameter with numbers, a line for each value of `by`; over a range, in bins. It is
+    said whether accuracy falls with the distance from `away_from`, which comes round after `turn`."""
 
     along: str
     by: str | None = None

@@ -1,20 +1,32 @@
-"""Error of the picture, and of the model's margin on it, against run time."""
+"""Error of the picture and of the model's margin, and the best verified objective of each policy, against run time."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.questions.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
-from advsearch.questions.precision.gradient import COST_OF, COUNTS_OF, predicting
-from advsearch.questions.precision.points import Array, MeasuredSetting, ReferenceValue, reference_through
-from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
+from advsearch import seeds
+from advsearch.attacks import Domain, Evaluate, Evaluation, Policy, StepRecord, search
+from advsearch.questions.precision.gradient import COST_OF, COUNTS_OF, flat, predicting
+from advsearch.questions.precision.points import (
+    INDEPENDENT,
+    STRATIFIED,
+    UNKNOWN,
+    Array,
+    MeasuredSetting,
+    ReferenceValue,
+    Theory,
+    quartiles,
+    reference_through,
+)
+from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples, seconds_a_sample
 from advsearch.scene.renderer import Renderer
 
 Margin = Callable[[Tensor], float]
@@ -47,10 +59,7 @@ class Variant:
     Attributes:
         series: its name in the diagram.
         family: what it is compared with and recommended among: "raw", "oidn", "depth" or `PREDICTED`.
-        sampler: Mitsuba's name.
-        denoiser: as of the image formation.
         depth: longest light path in segments.
-        integrator: Mitsuba's name.
         theory: slope of its error against samples.
     """
 
@@ -79,14 +88,9 @@ def variants(
     samplers: Sequence[str], depths: Sequence[int], own: int, *, volumetric: bool = False, predicted: Sequence[str] = ()
 ) -> list[Variant]:
     """Return what is compared: samplers, some with the denoiser, path depths beside the run's own, an integrator, and
-    what predicts pictures.
+    what predicts pictures (see `ways_to_predict`).
 
-    Args:
-        samplers: Mitsuba's names.
-        depths: longest light paths; the deepest of them and `own` is the truth for all of these.
-        own: the run's own depth.
-        volumetric: whether there is a medium, which leaves no choice of integrator.
-        predicted: what predicts pictures; see `ways_to_predict`.
+    The deepest of the depths and `own` is the truth for all of these. A medium leaves no choice of integrator.
     """
     theories = {"independent": INDEPENDENT}
     found = [Variant(one, "raw", one, "none", own, theory=theories.get(one, STRATIFIED)) for one in samplers]
@@ -161,15 +165,13 @@ class PictureBench:
             radiance = self._radiance(self.renderers[setting.series], seed, setting.spp)
             seconds = time.perf_counter() - begun
         picture = self._picture(radiance)
-        error = self._reference(variant.family, "error").relative_error(_flat(picture))
-        margin = self._reference(variant.family, "margin_error").relative_error(_one(self._margin(picture)))
+        error = self._reference(variant.family, "error").relative_error(flat(picture))
+        margin = self._reference(variant.family, "margin_error").relative_error(np.array([self._margin(picture)]))
         return {"error": error, "margin_error": margin, **later}, seconds
 
     def floor(self, setting: MeasuredSetting, measure: str) -> float:
         """The reference's own relative error for a setting."""
         return self._reference(self.variants[setting.series].family, measure).error
-
-    # ---- inside -----------------------------------------------------------------------------------------------------
 
     def _reference(self, family: str, measure: str) -> ReferenceValue:
         """What a family is compared with: its margins with its own, but pictures with and without denoiser alike."""
@@ -178,33 +180,22 @@ class PictureBench:
         return self.pictures["depth" if family == "depth" else "raw"]
 
     def _truth(self, family: str) -> Renderer:
-        """The renderer of a family's reference."""
         depths = [one.depth for one in self.variants.values() if one.family == family]
         denoiser = "oidn" if family == "oidn" else "none"
         return self._as(Variant(family, family, REFERENCE_SAMPLER, denoiser, max(depths)))
 
     def part(self, family: str, spp: int, seed: int) -> Array:
         """Return a part of a family's reference: its radiance, flat."""
-        return _flat(self._radiance(self._truth(family), seed, spp))
+        return flat(self._radiance(self._truth(family), seed, spp))
 
     def _refer(self, family: str, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
-        renderer, pilot = self._truth(family), 16
-        for number in range(3):
-            begun = time.perf_counter()
-            self._radiance(renderer, number, pilot)
-            rate = (time.perf_counter() - begun) / pilot
-        spp = part_samples(rate, budget.left)
-
-        parts = gather(
-            self.elsewhere(family, spp) or one_by_one(partial(self.part, family, spp)),
-            budget,
-            seed=seed,
-            name=f"precision reference {family}",
-            on_done=on_done,
-        )
+        renderer = self._truth(family)
+        spp = part_samples(seconds_a_sample(partial(self._radiance, renderer, 0), calls=3), budget.left)
+        parts = self.elsewhere(family, spp) or one_by_one(partial(self.part, family, spp))
+        parts = gather(parts, budget, seed=seed, name=f"precision reference {family}", on_done=on_done)
         self.part_spp[family] = spp
-        self.pictures[family] = reference_through(lambda mean: _flat(self._shown(mean)), parts)
-        self.margins[family] = reference_through(lambda mean: _one(self._margin(self._shown(mean))), parts)
+        self.pictures[family] = reference_through(lambda mean: flat(self._shown(mean)), parts)
+        self.margins[family] = reference_through(lambda mean: np.array([self._margin(self._shown(mean))]), parts)
 
     def _as(self, variant: Variant) -> Renderer:
         key = (variant.sampler, variant.depth, variant.integrator)
@@ -226,11 +217,125 @@ class PictureBench:
         return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(self._size))
 
 
-def _flat(picture: Tensor) -> Array:
-    found: Array = picture.detach().to(torch.float64).reshape(-1).numpy().copy()
-    return found
+Verified = Callable[[Tensor], float]
+"""From a configuration to its objective in fresh renders with enough samples."""
 
 
-def _one(value: float) -> Array:
-    found: Array = torch.tensor([value], dtype=torch.float64).numpy()
-    return found
+class SearchMark(NamedTuple):
+    """How far one search had come: the renders that it could spend until then, the seconds that it had taken without
+    verification, and the verified objective of the best configuration until then."""
+
+    renders: int
+    seconds: float
+    objective: float
+
+
+@dataclass(frozen=True)
+class PolicyCurve:
+    """How a policy does, over seeds: at each mark renders, median seconds, and quartiles of the objective."""
+
+    policy: str
+    renders: tuple[int, ...]
+    seconds: tuple[float, ...]
+    objective: tuple[tuple[float, float, float], ...]
+    repeats: int
+
+
+def marks_at(steps: int) -> tuple[int, ...]:
+    """Return the numbers of renders at which a search is looked at: powers of two, and all of them."""
+    return (*(2**power for power in range(steps.bit_length()) if 2**power < steps), steps)
+
+
+@dataclass(frozen=True)
+class ObjectiveBench:
+    """Runs searches and verifies what they held at each mark; `noise` is the root seed of their renders, and `budget`
+    ends one that takes longer."""
+
+    evaluate: Evaluate
+    noise: int
+    domain: Domain
+    policies: Mapping[str, Policy[Any]]
+    steps: int
+    verified: Verified
+    budget: TimeBudget
+
+    def settings(self, spp: int) -> list[MeasuredSetting]:
+        """One setting a policy."""
+        return [MeasuredSetting("objective", name, spp, 1.0) for name in self.policies]
+
+    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[list[SearchMark], float]:
+        """Run one search; its marks, verified, and the seconds of search and verification together."""
+        begun = time.perf_counter()
+        held = self._search(setting.series, seed)
+        objectives = {u.numpy().tobytes(): u for _, _, u in held}
+        verified = {key: self.verified(u) for key, u in objectives.items()}
+        marks = [SearchMark(renders, seconds, verified[u.numpy().tobytes()]) for renders, seconds, u in held]
+        return marks, time.perf_counter() - begun
+
+    def _search(self, policy: str, seed: int) -> list[tuple[int, float, Tensor]]:
+        """The best configuration at each mark, with the seconds until then. Nothing is rendered again at the end."""
+        held: list[tuple[int, float, Tensor]] = []
+        best: tuple[float, Tensor] = (float("-inf"), self.domain.start)
+        wanted = list(marks_at(self.steps))
+        begun = time.perf_counter()
+
+        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            nonlocal best
+            seconds = time.perf_counter() - begun
+            while wanted and record.renders > wanted[0]:  # what a mark holds was found before this step
+                held.append((wanted.pop(0), seconds, best[1]))
+            if evaluation.objective > best[0]:
+                best = (evaluation.objective, u.detach().clone())
+            if wanted and record.renders == wanted[0]:
+                held.append((wanted.pop(0), seconds, best[1]))
+
+        search(
+            self.evaluate,
+            self.domain,
+            self.policies[policy],
+            steps=self.steps,
+            seed=seeds.stream(seed, "policy"),
+            candidates=0,
+            on_step=on_step,
+            kind=f"precision {policy} {seed}",
+            noise=self.noise,
+            seconds=max(1e-9, self.budget.left),
+        )
+        if time.perf_counter() - begun < self.budget.left:
+            held += [(mark, time.perf_counter() - begun, best[1]) for mark in wanted]  # it stopped by itself
+        return held
+
+
+def curve_of(policy: str, searches: Sequence[Sequence[SearchMark]]) -> PolicyCurve:
+    """Return medians and quartiles over searches, at the marks that all of them have reached."""
+    common = min((len(marks) for marks in searches), default=0)
+    columns = [[marks[number] for marks in searches] for number in range(common)]
+    return PolicyCurve(
+        policy,
+        tuple(column[0].renders for column in columns),
+        tuple(quartiles([mark.seconds for mark in column])[1] for column in columns),
+        tuple(quartiles([mark.objective for mark in column]) for column in columns),
+        len(searches),
+    )
+
+
+def missing(curve: PolicyCurve, best: float, start: float) -> tuple[float, ...]:
+    """Return the share of the possible gain, from `start` to the best median of any policy, that a policy's median
+    misses at each mark."""
+    gain = best - start
+    return tuple(0.0 if gain <= 0.0 else max(0.0, (best - middle) / gain) for _, middle, _ in curve.objective)
+
+
+def sooner(curves: Sequence[PolicyCurve], goal: float, best: float, start: float) -> tuple[str, int, float] | None:
+    """Return the policy whose median reaches a share of the possible gain in the least time: its name, renders and
+    seconds; None where none does."""
+    reached = [
+        (seconds, renders, curve.policy)
+        for curve in curves
+        for share, renders, seconds in zip(missing(curve, best, start), curve.renders, curve.seconds, strict=True)
+        if share <= goal
+    ]
+    if not reached or best <= start:
+        return None
+    seconds, renders, policy = min(reached)
+    return policy, renders, seconds
