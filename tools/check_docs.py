@@ -37,7 +37,6 @@ from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region import carry_out as mapping
-from advsearch.questions.region import growing as region
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs import directory, export, store
 from advsearch.runs.results.attack import AttackSummary
@@ -259,8 +258,8 @@ MADE_BY_HAND = [
     ("questions.md", f"**Verified** on up to {TRIALS_OVER} conditions"),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
-    ("questions.md", {8: "as long as eight random pictures"}[region.PROBES]),
-    ("questions.md", {4: "with other seeds, up to four times"}[region.ATTEMPTS]),
+    ("questions.md", {8: "as long as eight random pictures"}[mapping.PROBES]),
+    ("questions.md", {4: "with other seeds, up to four times"}[mapping.ATTEMPTS]),
     ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
     ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
     ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),

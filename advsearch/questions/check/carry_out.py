@@ -28,7 +28,6 @@ from advsearch.engine.gradients import (
     smooth_loss,
 )
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.naming import AnyModel, settings_alone
 from advsearch.engine.planning import CONVERGED, COUNTS, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem

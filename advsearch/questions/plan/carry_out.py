@@ -39,13 +39,13 @@ from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import CosineRow, Formation, PathLength
 from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
-from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import predicting, why_not
-from advsearch.scene.transport.renderer import SPP
+from advsearch.scene.transport.matrix import SPP
 
 
 class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):

@@ -42,7 +42,7 @@ from advsearch.engine.naming import (
     scene_of,
     several,
 )
-from advsearch.engine.sweeps import Job, NamedScene, check_scenes
+from advsearch.engine.sweeps import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
 from advsearch.engine.sweeps.drives import with_frames
 from advsearch.engine.sweeps.loop import carry_out

@@ -13,7 +13,7 @@ import torch
 from advsearch.scene.camera_model import NUMBERS, CameraModel
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
-common = mi.ad.integrators.common
+common: Any = mi.ad.integrators.common
 
 PHASE = 1.0 / (4.0 * math.pi)
 """Isotropic phase function, per steradian."""
