@@ -1,4 +1,4 @@
-"""The answer of a run: `summary.json` as plain JSON (docs/design.md, "summary.json"), and `artifacts/answer.npy`.
+"""The answer of a run: `summary.json` as plain JSON (docs/answers.md), and `artifacts/answer.npy`.
 
 The latter is the configuration that a run answers with, so that it can be rendered again elsewhere.
 """
