@@ -217,7 +217,8 @@ class SweepSummary(CountedAnswers, RunResult):
     )
     surface: SurfaceMap | None = Field(
         default=None,
-        description="which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong answers; absent unless asked",
+        description="which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong answers; absent "
+        "unless asked",
     )
     shared: SharedWork | None = Field(
         default=None, description="how [workers](cluster.md) did that shared the work; absent without"
