@@ -298,7 +298,7 @@ def every_answer(record: Record) -> str:
     """The fields that all results have."""
     asked = ", ".join(f"`{name}`" for name in ("schema", "command", *ASKED))
     rows = [[f"`{name}`", _field(one)] for name, one in EVERYWHERE.items() if one is not None and name not in ASKED]
-    return table(["field", "holds"], [[asked, "what was asked for, and of what"], *rows])
+    return _wrapped(f"What was asked for, and of what: {asked}.") + "\n" + table(["field", "holds"], rows)
 
 
 def several_answers(record: Record) -> str:
