@@ -145,7 +145,10 @@ class Photographs:
             rows = []
             for judge in self._judges(run):
                 if judge.varies:
-                    raise InputError("the task asks where the object is; name the file rendering-NUMBER.jpg after one")
+                    raise InputError(
+                        "the task asks where the object is, and only a rendering says that; name the file "
+                        "rendering-NUMBER.jpg by the rendering that it was aligned with, or take it out"
+                    )
                 values: dict[str, Value] = {"model": {"value": judge.model.name, "unit": ""}}
                 sound = sound_photo(data, judge.size[::-1])
                 row = judged(Row(LOOSE_PHOTO, number, values=values), judge.judgement("", judge.object, sound))
