@@ -283,7 +283,7 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
 ASKED = "environment controls object objects model policy objective".split()
 EVERYWHERE = {**StudyResult.described(), **SceneResult.described(), "objective": None}
 """Fields that are told once for all results: ASKED, and those that say how the run went."""
-PARTS_OF_SEVERAL = {
+PARTS_OF_SEVERAL: dict[str, type[Fields]] = {
     "image_formation": Formation,
     "clean": CleanScene,
     "conditions": VariedValue,
