@@ -179,7 +179,7 @@ def names() -> Iterator[str]:
     for target in re.findall(r"^([a-z-]+):.*?## ", read(ROOT / "Makefile"), re.M):
         if f"`{target}`" not in text and f"make {target}" not in text:
             yield f"docs/development.md: expected the target {target}"
-    yield from absent("design.md", [f"| [`{path.name}`]" for path in (ROOT / "benchmarks").glob("[!_]*.py")])
+    yield from absent("development.md", [f"| [`{path.name}`]" for path in (ROOT / "benchmarks").glob("[!_]*.py")])
 
 
 PLAIN = set(

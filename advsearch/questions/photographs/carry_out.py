@@ -33,7 +33,7 @@ from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
-from advsearch.tasks import Judgement, Task, make_task
+from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
 
@@ -59,10 +59,21 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         return _agreement(list(store.rows(PHOTO)))
 
 
-def photographs_in(folder: Path) -> list[Path]:
-    """Return the files in a folder that are photographs by their names; none where there is no such folder."""
+def photographs_in(folder: Path, task: AnyTask) -> list[Path]:
+    """Return the files in a folder that are photographs by their names; none where there is no such folder.
+
+    Raises:
+        InputError: the task asks where the object is, and one of them was aligned with no rendering.
+    """
     files = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+    found = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+    loose = [file for file in found if not _ALIGNED.fullmatch(file.stem)]
+    if loose and (made := make_task(task)) and (made.varies or made.looks):
+        raise InputError(
+            f"{loose[0].name}: the task asks where the object is, and only a rendering says that; name the file "
+            "rendering-NUMBER.jpg by the rendering that it was aligned with, or take it out"
+        )
+    return found
 
 
 class Photographs:
@@ -140,8 +151,6 @@ class Photographs:
             number = held.store.last_step(LOOSE_PHOTO) + 1
             rows = []
             for judge in self._judges(run):
-                if judge.varies:
-                    raise InputError("the task asks where the object is; name the file rendering-NUMBER.jpg after one")
                 values: dict[str, Value] = {"model": {"value": judge.model.name, "unit": ""}}
                 sound = sound_photo(data, judge.size[::-1])
                 row = judged(Row(LOOSE_PHOTO, number, values=values), judge.judgement("", judge.object, sound))
@@ -163,7 +172,6 @@ class _PhotoJudge:
         size: (height, width) of the run's renderings, in pixels.
         several: models that the run has.
         truth: what is true of a photograph, by the rendering that it was aligned with and the object.
-        varies: whether that differs between renderings of one object.
     """
 
     object: str
@@ -172,7 +180,6 @@ class _PhotoJudge:
     size: tuple[int, int]
     several: int
     truth: Callable[[str, str], Truth]
-    varies: bool = True
 
     def judgement(self, rendering: str, name: str, data: bytes) -> Judgement:
         """What is to be said of a picture, (any size), of an object; it is made as large as the run's renderings are.
@@ -209,9 +216,7 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
             return task.truth(facts_of(scene_of(config, name), name, config.label, dict))
 
         judges.append(
-            _PhotoJudge(
-                config.objects[0], model, task, config.resolution or model.input_size, len(models), truth, varies=False
-            )
+            _PhotoJudge(config.objects[0], model, task, config.resolution or model.input_size, len(models), truth)
         )
     return judges
 
