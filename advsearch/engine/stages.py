@@ -48,7 +48,7 @@ from advsearch.engine.planning import (
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason_against, remark
+from advsearch.engine.transport import WORTH, CleanMatrix, Predictor, Transport, reason_against, remark
 from advsearch.engine.verifier import Verifier, check_failures, ladder_of
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
@@ -293,7 +293,7 @@ class Attack:
         if matrix is None:
             self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
             return
-        self._renders_because(matrix if surface == surface_light.NO_CAMERA else surface)
+        self._renders_because(matrix if surface == surface_light.NO_CAMERA or steps < WORTH else surface)
 
     def against_surface_light(self) -> str | None:
         """Why light on surfaces does not predict the search, in words; None if it may."""

@@ -259,6 +259,7 @@ def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_wit
     ("options", "reason"),
     [
         ({}, "pays from 16"),
+        ({"over": ["camera"], "denoise": "none"}, "pays from 16"),
         ({"specialise": False}, "nothing is left out"),
     ],
 )
