@@ -247,8 +247,7 @@ class _Log:
         ]
         for proposal, query, raw in zip(proposals, queries, self.evaluate(queries), strict=True):
             seconds = time.perf_counter() - begun
-            _check_gradient(raw, proposal)
-            _check_cost(raw, proposal, self.domain)
+            _check_answer(raw, proposal, self.domain)
             evaluation = usable(raw)
             self.gradients += bool(proposal.gradient)
             self.renders += raw.cost
@@ -390,25 +389,23 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
         raise RuntimeError(f"policy {name!r} left its budget by {outside:.3g}; it must project what it proposes")
 
 
-def _check_cost(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
-    """Raise RuntimeError unless an evaluation cost what the domain said it would; a budget rests on that."""
-    least, most = proposal.samples, proposal.cost(domain)
+def _check_answer(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
+    """Raise RuntimeError unless a gradient came as it was asked for, at the cost that the domain said: the budget rests
+    on that."""
+    gradient, least, most = evaluation.gradient, proposal.samples, proposal.cost(domain)
+    if proposal.gradient and gradient is None:
+        raise RuntimeError("evaluate returned no gradient although one was asked for")
+    if (
+        proposal.gradient
+        and gradient is not None
+        and (gradient.shape, gradient.dtype) != (proposal.u.shape, proposal.u.dtype)
+    ):
+        raise RuntimeError(
+            f"evaluate returned a gradient of {gradient.dtype}, shape {tuple(gradient.shape)}; expected "
+            f"{proposal.u.dtype}, shape {tuple(proposal.u.shape)}"
+        )
     if not least <= evaluation.cost <= most:
         raise RuntimeError(
             f"evaluate took {evaluation.cost} renders; expected {least} to {most}, by the proposal's samples and the "
             "domain's gradient_cost"
-        )
-
-
-def _check_gradient(evaluation: Evaluation, proposal: Proposal) -> None:
-    """Raise RuntimeError unless a gradient came exactly as it was asked for."""
-    gradient = evaluation.gradient
-    if not proposal.gradient:
-        return
-    if gradient is None:
-        raise RuntimeError("evaluate returned no gradient although one was asked for")
-    if gradient.shape != proposal.u.shape or gradient.dtype != proposal.u.dtype:
-        raise RuntimeError(
-            f"evaluate returned a gradient of {gradient.dtype}, shape {tuple(gradient.shape)}; expected "
-            f"{proposal.u.dtype}, shape {tuple(proposal.u.shape)}"
         )

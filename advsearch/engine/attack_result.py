@@ -274,16 +274,22 @@ def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, show
     kind = "verification" if findings.beaten is None else "baseline verification"
     for number in range(min(KEPT, len(checked.adversarial_trials) if checked else 0)):
         assert checked is not None
-        seed, name = seeds.stream(problem.seed, "verification", number), f"verification-{number:02d}"
-        picture = findings.pictures.get((kind, number))
-        picture = problem.picture(checked.u, seed, findings.spp) if picture is None else picture
-        run.save_image(name, picture)
-        save_marked(run, name, picture, problem.marks(picture, problem.whole(checked.u, seed)))
+        save_trial(run, problem, findings, (kind, number), f"verification-{number:02d}", checked.u)
     if findings.frames:
         last = shown["adversarial"].picture
         if problem.conditions is not None and findings.search is not None:  # the frames see the scene as it comes
             last = KeptPicture.of(problem, findings, problem.domain.project(findings.search.best_u), None).picture
         run.save_animation("search", [*findings.frames, last.numpy()])
+
+
+def save_trial(
+    run: RunDirectory, problem: Problem, findings: Findings, trial: tuple[str, int], name: str, u: Tensor
+) -> None:
+    """Write the picture of a trial, by kind and number, as the model saw it, and with its answer."""
+    seed, picture = seeds.stream(problem.seed, "verification", trial[1]), findings.pictures.get(trial)
+    picture = problem.picture(u, seed, findings.spp) if picture is None else picture
+    run.save_image(name, picture)
+    save_marked(run, name, picture, problem.marks(picture, problem.whole(u, seed)))
 
 
 def save_marked(run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]) -> None:

@@ -28,7 +28,7 @@ from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.trials import LADDER, margins_of, most_samples
 from advsearch.cluster import Executor
 from advsearch.config.scene import SceneConfig
-from advsearch.engine.attack_result import save_marked
+from advsearch.engine.attack_result import save_trial
 from advsearch.engine.journal import Journal, Shared, digest
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages, verified_rate
@@ -256,11 +256,7 @@ def check_failures(verifier: Verifier, found: SearchResult) -> None:
 def write_failures(run: RunDirectory, problem: Problem, findings: Findings) -> None:
     """Write a picture of each failure that was tried, as the model saw it in its first trial."""
     for number, checked in enumerate(findings.failures):
-        seed, name = seeds.stream(problem.seed, "verification", 0), _picture(number)
-        seen = findings.pictures.get((f"failure {number}", 0))
-        seen = problem.picture(checked.u, seed, findings.spp) if seen is None else seen
-        run.save_image(name, seen)
-        save_marked(run, name, seen, problem.marks(seen, problem.whole(checked.u, seed)))
+        save_trial(run, problem, findings, (f"failure {number}", 0), _picture(number), checked.u)
 
 
 def described_failures(problem: Problem, findings: Findings) -> DifferentFailures | None:

@@ -413,15 +413,16 @@ def import_library(name: str) -> Any:
 
 def condition_rows(conditions: RuleConditions, factors: Sequence[Factor]) -> list[ConditionRow]:
     """Return conditions with the names of their factors."""
-    return [_condition_row(one, factors[one.place]) for one in conditions]
-
-
-def _condition_row(one: RuleCondition, factor: Factor) -> ConditionRow:
-    return ConditionRow(
-        parameter=factor.name,
-        unit=factor.unit,
-        over=one.low if np.isfinite(one.low) else None,
-        at_most=one.high if np.isfinite(one.high) else None,
-        options=[factor.options[number] for number in sorted(one.options or ())],
-        text=one.text(factor),
-    )
+    rows = []
+    for one in conditions:
+        factor = factors[one.place]
+        row = ConditionRow(
+            parameter=factor.name,
+            unit=factor.unit,
+            over=one.low if np.isfinite(one.low) else None,
+            at_most=one.high if np.isfinite(one.high) else None,
+            options=[factor.options[number] for number in sorted(one.options or ())],
+            text=one.text(factor),
+        )
+        rows.append(row)
+    return rows

@@ -21,9 +21,6 @@ from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed,
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
-NARROWEST, WIDEST = 1e-4, 2.0
-"""Bounds of the deviations, in half ranges."""
-
 
 @dataclass(frozen=True, eq=False)
 class NESState:
