@@ -184,16 +184,9 @@ class FoundFailure:
 
 @dataclass(frozen=True, eq=False)
 class Failures:
-    """What a search knows of different failures.
-
-    Attributes:
-        listed: at most `MOST`.
-        over: positions in u of what tells cells apart; none where there are no cells.
-        found: how many failing cells there are; without cells, failing draws.
-        seen: how many cells, or draws, were looked at, failing or not.
-        places: how many cells there are; None without cells.
-        share: how large a part of all configurations fails, where that can be told.
-    """
+    """What a search knows of different failures: at most `MOST` of them; the positions in u of what tells cells apart;
+    how many cells fail, were seen and are there (without cells, draws, and None); and how large a part of all
+    configurations fails, where that can be told."""
 
     listed: tuple[FoundFailure, ...]
     over: tuple[int, ...]
@@ -260,15 +253,9 @@ Likely = Callable[[Tensor], bool]
 
 @dataclass(frozen=True, eq=False)
 class Bracket:
-    """Where the smallest scale lies.
-
-    Attributes:
-        low: at this scale a search found nothing; 0 where none has failed.
-        high: at this scale `u` passes; infinity where nothing passed at all.
-        u: (d,) a configuration within `high`; None where nothing passed.
-        found_by: number of the search that found `u`, or the longer change that it is the end of.
-        confirmed: whether `u` has passed again, with new seeds (see `confirmed`).
-    """
+    """Where the smallest scale lies: a search found nothing at `low` (0 where none has failed), and `u` (d,) passes at
+    `high`, infinity where nothing did; it is of the search `found_by`, and has passed again, with new seeds, if
+    `confirmed`."""
 
     low: float
     high: float

@@ -248,16 +248,9 @@ def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, sought: bool = True,
 
 @dataclass(frozen=True)
 class Rung:
-    """The margins of one configuration at one sample count.
-
-    Attributes:
-        name: which configuration, e.g. "clean".
-        mean: mean margin over the seeds.
-        half_width: how far the mean may lie on the other side of the true one (Student's t), in 5 % of all cases, after
-            all looks together.
-        drift: mean here minus mean at the rung below; NaN at the first.
-        settled: whether more samples would leave the margin on its side of zero; see `choose_spp`.
-    """
+    """The margins of one configuration at one sample count: their mean, how far it may lie on the other side of the
+    true one (Student's t) in 5 % of all cases, after all looks together, its drift from the rung below, NaN at the
+    first, and whether more samples would leave it on its side of zero; see `choose_spp`."""
 
     name: str
     spp: int

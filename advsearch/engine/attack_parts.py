@@ -55,17 +55,10 @@ SEARCHED_WITH = ("the objective", "the policy", "the metric")
 
 @dataclass
 class AttackParts:
-    """Everything that was asked for, found and loaded.
-
-    Attributes:
-        loaded: the model, and what was said of it.
-        task: not yet on the model.
-        controls: what is searched.
-        over: what varies by chance.
-        objective: a name, or a function of the caller's.
-        keep: whether the run is kept in a folder.
-        clean: the matrix of light transport of the clean scene, which attacks may share.
-    """
+    """Everything that was asked for, found and loaded: the model and what was said of it, a task that is not yet on the
+    model, the controls that are searched and those `over` that vary by chance; objective and policy may be the caller's
+    own. Attacks may share `clean`, the matrix of light transport of the clean scene. A run is kept in a folder, or
+    (`keep`) not."""
 
     config: AttackConfig
     scene: Scene

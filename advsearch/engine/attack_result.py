@@ -206,14 +206,9 @@ PICTURE_SPP = 16
 
 @dataclass(frozen=True, eq=False)
 class KeptPicture:
-    """The picture of a configuration that is kept, and what is true of this picture alone.
-
-    Attributes:
-        whole: the configuration of the whole space, with the conditions of this picture.
-        radiance: (H, W, 3) linear.
-        picture: (H, W, 3) sRGB as the model sees it, 8-bit values in [0, 1].
-        trial: number of the trial that it is of; None where nothing was tried.
-    """
+    """The picture of a configuration of the whole space that is kept, as the model sees it: (H, W, 3) sRGB, 8-bit
+    values in [0, 1], and its linear radiance; what is said of it, and the number of its trial, None where nothing was
+    tried."""
 
     whole: Tensor
     radiance: Tensor

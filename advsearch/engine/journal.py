@@ -257,14 +257,8 @@ PLAN = "gradient plan"
 
 @dataclass
 class Journal:
-    """What a run has asked and was answered. Without a run directory it is kept in memory.
-
-    Attributes:
-        traced: answers what nothing predicts.
-        rows: what was written, where there is no run directory.
-        lost: queries that nobody could answer.
-        machines: on which answers were made that are not like this one.
-    """
+    """What a run has asked and was answered, without a run directory kept in `rows`; `traced` answers what nothing
+    predicts. It counts queries that nobody could answer (`lost`), and knows the machines that are not like this one."""
 
     run: RunDirectory | None
     traced: Shared

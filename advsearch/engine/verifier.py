@@ -320,15 +320,9 @@ def unchanged(picture: Tensor, seed: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class RetrialCondition:
-    """What an answer is tried under.
-
-    Attributes:
-        name: in tables and in the kinds of rows.
-        source: conditions with equal sources are shown the same picture before it is changed.
-        change: what happens to a picture (H, W, 3) sRGB in [0, 1] before the model sees it, by the seed of its trial.
-        light: conditions with equal lights get their pictures from one linear radiance: their scenes are the same, only
-            tone curves or models differ. None: this one renders by itself.
-    """
+    """What an answer is tried under. Conditions of equal source are shown the same picture before it is changed: (H, W,
+    3) sRGB in [0, 1], by the seed of its trial; those of equal light get theirs from one linear radiance, as their
+    scenes are the same and only tone curves or models differ (None: this one renders by itself)."""
 
     name: str
     problem: Problem
@@ -339,15 +333,9 @@ class RetrialCondition:
 
 
 class Retrials:
-    """Tries the clean scene and answers under conditions; what the run has stored already is read back.
-
-    Trial k has the same seed for the clean scene, for every answer and under every condition.
-
-    Args:
-        trials: of each answer under each condition.
-        seed: root of these trials, which nothing else uses.
-        executor: of workers that hold the problems by the names of their conditions; None makes pictures here.
-    """
+    """Tries the clean scene and answers under conditions, each in so many trials; what the run has stored already is
+    read back. Trial k has the same seed, of a root that nothing else uses, for all of them. An executor's workers hold
+    the problems by the names of their conditions; without, pictures are made here."""
 
     def __init__(
         self,

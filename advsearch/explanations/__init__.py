@@ -47,16 +47,9 @@ OTHERS = "other objects"
 
 @dataclass(frozen=True)
 class Answered:
-    """What a model said of one picture.
-
-    Attributes:
-        part: of the recipe.
-        values: what the picture shows: object, environment, model, and parameters in their units.
-        units: of the parameters.
-        answer: in words.
-        time: when it was stored, seconds since 1970.
-        margin: of the task; over 0 where the answer is wrong.
-    """
+    """What a model said of one picture of a part of the recipe: what it shows, object, environment, model, and
+    parameters in their units; the answer in words, whether it is right, and its margin; and when it was stored, seconds
+    since 1970."""
 
     part: str
     values: Mapping[str, float | str]

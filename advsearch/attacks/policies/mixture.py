@@ -92,14 +92,9 @@ class Components:
 
 @dataclass(frozen=True, eq=False)
 class MixtureState:
-    """Where the search stands.
-
-    Attributes:
-        learnt: the mixtures of the generations in the window, this one's last; None of an even one.
-        points: (n, d) this generation's draws in shares of each range.
-        seen: (m, d) the draws that were evaluated, the latest `WINDOW` of them.
-        log: (all draws, 5) of these objective, failed, unknown, weight and largest weight; see `failure_share`.
-    """
+    """Where the search stands: the mixtures of the generations in the window (None of an even one), this generation's
+    draws (n, d) and the latest `WINDOW` that were evaluated (m, d), in shares of each range, and of all draws
+    objective, failed, unknown, weight and largest weight; see `failure_share`."""
 
     domain: Domain
     seed: int

@@ -119,18 +119,9 @@ class Cells:
 
 
 class Tally:
-    """What has been counted so far.
-
-    Args:
-        outer: name and values of the axes outside the scene: object, environment, model.
-        drawn: what the table shows of the draws.
-        pairs: configurations without an answer, each of which comes again with it, so many numbers later; 0 for none.
-
-    Attributes:
-        not_finite: those whose margin was not a number; they count as not right.
-        worst: the number of the configuration with the largest margin, with what was seen there; the first of equals.
-        answers: how often each wrong answer was given.
-    """
+    """What has been counted so far, by the axes outside the scene (object, environment, model), those of the grid, and
+    what is drawn. Each of so many pairs without an answer comes again with it, so many numbers later. The first
+    configuration of the largest margin is the worst; a margin that is no number counts as not right."""
 
     def __init__(
         self, outer: Sequence[tuple[str, Sequence[str]]], axes: Sequence[Axis], drawn: Sequence[Drawn], pairs: int = 0

@@ -69,15 +69,9 @@ class PartCounts:
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """What n parts have to do with the answers. Numbers are NaN where a part was not compared.
-
-    Attributes:
-        compared: (n,) bool.
-        difference: (n,) share of wrong answers where the part holds less that where it does not, in [-1, 1].
-        low: (n,) lower end of its 95 % interval, for the part by itself.
-        high: (n,) upper end.
-        p: (n,) how likely it is that by chance any part stands out as far, in (0, 1].
-    """
+    """What n parts have to do with the answers, (n,) each, NaN where a part was not compared: the share of wrong
+    answers where it holds less that where it does not, both ends of the 95 % interval for the part by itself, and how
+    likely it is that by chance any part stands out as far."""
 
     compared: npt.NDArray[np.bool_]
     difference: Doubles
