@@ -23,19 +23,8 @@ from typing import Any, Protocol, final
 import torch
 from torch import Tensor, nn
 
-from advsearch.attacks.objective_functions import (
-    ReadFeatures,
-    cosine_distance,
-    cross_entropy,
-    dlr,
-    feature_distance,
-    log_odds,
-    margin,
-    targeted_cross_entropy,
-    targeted_dlr,
-    targeted_log_odds,
-    targeted_margin,
-)
+from advsearch.attacks import objective_functions as functions
+from advsearch.attacks.objective_functions import ReadFeatures
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import told
 from advsearch.registry import Registry
@@ -191,13 +180,6 @@ def _part(asked: Mapping[str, Any], picture: int) -> More:
     return more
 
 
-__all__ = [
-    "OBJECTIVES", "OBJECTIVE_KINDS", "Objective", "ObjectiveKind", "asked_by", "check_objective", "checked",
-    "cross_entropy", "dlr", "feature_distance", "get_objective", "log_odds", "margin", "objective_summaries",
-    "targeted_margin",
-]  # fmt: skip
-
-
 @final
 @dataclass(frozen=True)
 class ObjectiveKind:
@@ -257,29 +239,22 @@ def _score_of(task: Task) -> Objective:
 _OWN = {
     kind.name: kind
     for kind in (
-        ObjectiveKind(
-            "margin", "the largest wrong logit minus the largest right one", "logits (log-odds)", margin,
-            targeted_margin,
-        ),
-        ObjectiveKind(
-            "log_odds", "the log-odds of a wrong answer, over all classes", "logits (log-odds)", log_odds,
-            targeted_log_odds,
-        ),
-        ObjectiveKind(
-            "cross_entropy", "minus the logarithm of the probability of the right answers", "nats", cross_entropy,
-            targeted_cross_entropy,
-        ),
-        ObjectiveKind(
-            "dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)", dlr,
-            targeted_dlr,
+        *(
+            ObjectiveKind(name, summary, unit, getattr(functions, name), getattr(functions, f"targeted_{name}"))
+            for name, summary, unit in (
+                ("margin", "the largest wrong logit minus the largest right one", "logits (log-odds)"),
+                ("log_odds", "the log-odds of a wrong answer, over all classes", "logits (log-odds)"),
+                ("cross_entropy", "minus the logarithm of the probability of the right answers", "nats"),
+                ("dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)"),
+            )
         ),
         ObjectiveKind(
             "feature_distance", "how far the features lie from those of the clean picture",
-            "lengths of the clean features", of_features=feature_distance,
+            "lengths of the clean features", of_features=functions.feature_distance,
         ),
         ObjectiveKind(
             "distance", "how far the features lie from those of the clean picture, by the angle", "1 - cosine",
-            task=Similarity.name, of_features=cosine_distance,
+            task=Similarity.name, of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
             "score", "the task's own score, over 0 where an answer is what is sought; in classification the margin",

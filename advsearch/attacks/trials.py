@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -72,7 +73,7 @@ def paired_difference(both: int, first: int, second: int, neither: int) -> tuple
     if n < 1 or min(both, first, second, neither) < 0:
         raise InputError(f"pairs: expected at least one, got {both}, {first}, {second} and {neither}")
     shares = (both + second) / n, (both + first) / n
-    (low, high), (other_low, other_high) = (_wilson(share, n) for share in shares)
+    (low, high), (other_low, other_high) = (map(float, wilson(share, n)) for share in shares)
     spread = (both + first) * (second + neither) * (both + second) * (first + neither)
     covariance = float(both * neither - first * second)
     if covariance > 0.0:
@@ -103,9 +104,10 @@ def mcnemar(first: int, second: int) -> float:
     return min(1.0, 2.0 * float(bdtr(min(first, second), first + second, 0.5))) if first + second else 1.0
 
 
-def _wilson(share: float, n: int) -> tuple[float, float]:
+def wilson(share: Any, n: Any) -> tuple[Any, Any]:
+    """Return both ends of Wilson's score interval (1927) of shares of n, 95 %; numbers or arrays."""
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
-    middle, half = share + z * z / (2 * n), z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    middle, half = share + z * z / (2 * n), z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
     return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
 
 

@@ -37,13 +37,8 @@ from advsearch.errors import InputError
 from advsearch.progress import Progress
 from advsearch.report.wording import count as plural
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import (
-    DescribedValue,
-    DifferentFailure,
-    DifferentFailures,
-    FailingShare,
-    PicturedAnswer,
-)
+from advsearch.runs.results import attack as results
+from advsearch.runs.results.attack import PicturedAnswer
 from advsearch.runs.summary import read_answer
 from advsearch.scene.formation import next_count, to_8_bit
 from advsearch.tasks import Judgement
@@ -259,40 +254,36 @@ def write_failures(run: RunDirectory, problem: Problem, findings: Findings) -> N
         save_trial(run, problem, findings, (f"failure {number}", 0), _picture(number), checked.u)
 
 
-def described_failures(problem: Problem, findings: Findings) -> DifferentFailures | None:
+def described_failures(problem: Problem, findings: Findings) -> results.DifferentFailures | None:
     """Return what a summary says of the different failures; None of a policy that looks for one."""
     known = findings.search.failures if findings.search else None
     if known is None:
         return None
     listed = [_described(problem, findings, number, failure) for number, failure in enumerate(known.listed)]
-    return DifferentFailures(
+    return results.DifferentFailures(
         over=[problem.domain.names[place] for place in known.over],
         found=known.found,
         seen=known.seen,
         places=known.places,
-        share=None if known.share is None else FailingShare.of(known.share),
+        share=None if known.share is None else results.FailingShare.of(known.share),
         tried=len(findings.failures),
         held=sum(one.ending is Ending.FOUND for one in findings.failures),
         listed=listed,
     )
 
 
-def _described(problem: Problem, findings: Findings, number: int, failure: FoundFailure) -> DifferentFailure:
+def _described(problem: Problem, findings: Findings, number: int, failure: FoundFailure) -> results.DifferentFailure:
     checked = findings.failures[number] if number < len(findings.failures) else None
-    names, ranges = problem.domain.names, failure.ranges
-    return DifferentFailure(
+    names, ranges, first = problem.domain.names, failure.ranges, checked.adversarial_trials[0] if checked else None
+    return results.DifferentFailure(
         ranges={names[place]: _range(problem, failure.u, place, ends) for place, ends in ranges.items()},
-        configuration={name: DescribedValue.of(value) for name, value in problem.describe(failure.u).items()},
+        configuration={name: results.DescribedValue.of(value) for name, value in problem.describe(failure.u).items()},
         objective=failure.objective,
         holds=None if checked is None else checked.ending is Ending.FOUND,
         verified=None if checked is None else verified_rate(checked),
         picture=None if checked is None else f"images/{_picture(number)}.png",
-        pictured=None if checked is None else _pictured(checked.adversarial_trials[0]),
+        pictured=None if first is None else PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0),
     )
-
-
-def _pictured(first: Judgement) -> PicturedAnswer:
-    return PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0)
 
 
 def _picture(number: int) -> str:

@@ -67,13 +67,12 @@ def figure_value(value: float | str) -> str:
     return f"{value:.4g}"
 
 
-def rows_of(part: str, folder: Path, summary: AttackSummary | SweepSummary) -> list[Answered]:
-    """Return the answers that a sweep has stored, without the trials of its worst, or the trials of an attack."""
-    return answered(part, folder, summary, ("sweep",) if isinstance(summary, SweepSummary) else tuple(TRIALS))
-
-
-def answered(part: str, folder: Path, summary: AttackSummary | SweepSummary, kinds: Sequence[str]) -> list[Answered]:
-    """Return the rows of some kinds; other arguments and errors as for `rows_of`."""
+def rows_of(
+    part: str, folder: Path, summary: AttackSummary | SweepSummary, kinds: Sequence[str] | None = None
+) -> list[Answered]:
+    """Return the answers that a sweep has stored, without those of its worst, or trials of an attack, or some kinds."""
+    if kinds is None:
+        kinds = ("sweep",) if isinstance(summary, SweepSummary) else tuple(TRIALS)
     outer = {"object": summary.object, "environment": summary.environment, "model": summary.model}
     rows = []
     with Store(folder / NAME, read_only=True) as store:

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.special import ndtri, xlogy
+from scipy.special import xlogy
 
 from advsearch import seeds
 from advsearch.attacks.draws import batches
-from advsearch.attacks.trials import CONFIDENCE
+from advsearch.attacks.trials import wilson
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of
 from advsearch.engine.sweeps import Job
@@ -117,17 +117,11 @@ def _likelihood_ratio(k: Counts, n: Counts, failures: int, pictures: int) -> Dou
 
 
 def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubles, Doubles, Doubles]:
-    (one, below, above), (two, under, over) = _wilson(k, n), _wilson(others, rest)
-    difference = one - two
+    one, two = k / n, others / rest
+    (below, above), (under, over), difference = wilson(one, n), wilson(two, rest), one - two
     low = difference - np.hypot(one - below, over - two)
     high = difference + np.hypot(above - one, two - under)
     return difference, low, high
-
-
-def _wilson(k: Counts, n: Counts) -> tuple[Doubles, Doubles, Doubles]:
-    z, share = float(ndtri((1.0 + CONFIDENCE) / 2.0)), k / n
-    middle, half = share + z * z / (2 * n), z * np.sqrt(share * (1.0 - share) / n + z * z / (4.0 * n * n))
-    return share, (middle - half) / (1.0 + z * z / n), (middle + half) / (1.0 + z * z / n)
 
 
 LEAST = 5

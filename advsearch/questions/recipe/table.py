@@ -20,8 +20,8 @@ from advsearch.explanations import (
     PHOTOGRAPHS,
     TRIAL,
     Answered,
-    answered,
     figure_value,
+    rows_of,
 )
 from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO
 from advsearch.questions.recipe.answer import NamedCount, RecipeFigure
@@ -122,7 +122,7 @@ def photographs_of(folder: Path, summary: SweepSummary) -> list[Answered]:
 
     One that was aligned with a rendering has all values of that, others have no parameters.
     """
-    return answered(PHOTOGRAPHS, folder, summary, (PHOTO, LOOSE_PHOTO))
+    return rows_of(PHOTOGRAPHS, folder, summary, (PHOTO, LOOSE_PHOTO))
 
 
 CONFIDENCE = 0.95
