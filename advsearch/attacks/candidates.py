@@ -70,16 +70,10 @@ def with_last(pool: tuple[Candidate, ...], last: Candidate | None, size: int) ->
 
 
 def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...]:
-    """Return the winner so far and those that are not clearly worse, in their order.
-
-    One is clearly worse if the mean of its differences from the winner, seed by seed, is larger than the standard error
-    of that mean, and its success rate is no higher. (The race of Maron and Moore 1994, with normal intervals of one
-    deviation in place of Hoeffding's: a search needs the better of two, not a proof.)
-
-    Args:
-        pool: candidates that had the same seeds in their last renders.
-        shared: how many of these there were, at least 2 for anyone to be clearly worse.
-    """
+    """Return the winner so far and those that are not clearly worse, in their order: the mean of their differences from
+    the winner, seed by seed, in the last `shared` renders, is larger than the standard error of that mean, and their
+    success rate is no higher. (The race of Maron and Moore 1994, with normal intervals of one deviation in place of
+    Hoeffding's: a search needs the better of two, not a proof.)"""
     if shared < 2 or len(pool) < 2:
         return pool
     leader = best(pool)
@@ -197,16 +191,10 @@ class Failures:
 
 
 def most_different(at: Tensor, worst: Sequence[float], around: Tensor, apart: Tensor, most: int = MOST) -> list[int]:
-    """Return which to list: the worst first, then each time the one that is farthest from all before it.
-
-    That is the greedy choice of k centres, whose largest distance is at most twice the least possible (Gonzalez 1985,
-    "Clustering to minimize the maximum intercluster distance"). Of equals the worse one goes first.
-
-    Args:
-        at: (n, k) where they are, in shares of each range.
-        worst: (n,) objectives.
-        around: (k,) bool: ranges whose ends are the same place.
-        apart: (k,) bool: discrete choices, where different is 1 apart.
+    """Return which to list, at places (n, k) in shares of each range: the worst first, then each time the one that is
+    farthest from all before it. That is the greedy choice of k centres, whose largest distance is at most twice the
+    least possible (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance"). The ends of ranges
+    `around` (k,) are the same place; different choices, `apart` (k,), lie 1 apart. Of equals the worse one goes first.
     """
     order = sorted(range(len(at)), key=lambda number: -worst[number])
     at = at[order].double()
@@ -328,15 +316,9 @@ def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | No
 
 
 def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2, attempts: int = ATTEMPTS) -> Bracket:
-    """Return the bracket with its upper end moved out until the configuration there passes several times in a row.
-
-    What lies exactly on the edge passes its trials by chance, and the one that was chosen among many passed by luck. So
-    it is tried again with new seeds; where it fails, the change grows by a fortieth.
-
-    Args:
-        times: in a row.
-        attempts: steps outwards at most; what the last one leads to is returned untried, and not `confirmed`.
-    """
+    """Return the bracket with its upper end moved out until the configuration there passes so many times in a row: what
+    lies exactly on the edge passes its trials by chance. So it is tried again with new seeds; where it fails, the
+    change grows by a fortieth, in so many `attempts`, the last of which is returned untried."""
     if bracket.u is None:
         return bracket
     edge, reached, at = bracket.u, bracket.high, 1.0

@@ -39,22 +39,11 @@ NON_FINITE_LIMIT = 3
 
 @dataclass(frozen=True)
 class StepRecord:
-    """One evaluation, without its tensors.
-
-    Attributes:
-        step: number of the evaluation, from 0; ranking goes on counting.
-        seed: that it was rendered with.
-        phase: "search", or "ranking" for a candidate rendered again at the end.
-        objective: raw objective; NaN where it was not finite.
-        best: best raw objective of the search so far; NaN before there is one. Biased upwards.
-        success: whether the model was wrong on this render.
-        step_size: the policy's, in units of each block's radius; NaN where it has none.
-        gradient_norm: l2 norm of the gradient after cleaning; NaN without one.
-        non_finite: gradient elements that had to be set to zero.
-        seconds: time the evaluation took.
-        renders: pictures that all evaluations so far took together, this one included.
-        samples: times the search's own samples per pixel that it was rendered with.
-    """
+    """One evaluation, without its tensors: its number and seed, and `phase` "ranking" for a candidate rendered again at
+    the end; the raw objective, NaN where it was not finite, and the best so far, biased upwards; whether the model was
+    wrong; the policy's step in units of each block's radius and the l2 norm of the cleaned gradient, NaN without;
+    gradient elements that had to be set to zero; seconds; pictures that all evaluations so far took together; and times
+    the search's own samples a pixel."""
 
     step: int
     seed: int

@@ -57,18 +57,10 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
 
 
 def paired_difference(both: int, first: int, second: int, neither: int) -> tuple[float, tuple[float, float]]:
-    """Return how much more often the second of two paired outcomes happens than the first, and its 95 % interval.
-
-    The interval of the difference of two shares that were counted in the same n pairs, from the Wilson intervals of
-    both and their correlation (Newcombe 1998, "Improved confidence intervals for the difference between binomial
-    proportions based on paired data", method 10).
-
-    Args:
-        both: pairs in which both happen.
-        first: in which the first alone happens.
-        second: likewise.
-        neither: in which none happens.
-    """
+    """Return how much more often the second of two paired outcomes happens than the first, and its 95 % interval, from
+    counts of pairs: both, the first alone, the second alone, neither. It comes from the Wilson intervals of both shares
+    and their correlation (Newcombe 1998, "Improved confidence intervals for the difference between binomial proportions
+    based on paired data", method 10)."""
     n = both + first + second + neither
     if n < 1 or min(both, first, second, neither) < 0:
         raise InputError(f"pairs: expected at least one, got {both}, {first}, {second} and {neither}")
@@ -86,19 +78,10 @@ def paired_difference(both: int, first: int, second: int, neither: int) -> tuple
 
 
 def mcnemar(first: int, second: int) -> float:
-    """Return how likely it is that of pairs in which one outcome alone happens, chance splits so many so unevenly.
-
-    The exact test of McNemar (1947, "Note on the sampling error of the difference between correlated proportions or
-    percentages"): the pairs in which both happen, or none, say nothing about which happens more often, and the others
-    are throws of a fair coin where none does. Two-sided: twice the smaller tail of the binomial distribution.
-
-    Args:
-        first: pairs in which the first alone happens.
-        second: in which the second alone does.
-
-    Returns:
-        In (0, 1]; 1 without such pairs.
-    """
+    """Return how likely it is, in (0, 1], that of pairs in which one outcome alone happens, chance splits so many so
+    unevenly: the exact, two-sided test of McNemar (1947, "Note on the sampling error of the difference between
+    correlated proportions or percentages"): twice the smaller tail of the binomial distribution, as these pairs are
+    throws of a fair coin where neither happens more often."""
     if min(first, second) < 0:
         raise InputError(f"pairs: expected numbers from 0, got {first} and {second}")
     return min(1.0, 2.0 * float(bdtr(min(first, second), first + second, 0.5))) if first + second else 1.0

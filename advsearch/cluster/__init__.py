@@ -74,14 +74,9 @@ class Executor(Protocol):
         """How the workers do; None where there are none."""
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
-        """Carry out batches, and yield what comes of them, in any order, each once.
-
-        Only a few are taken from `batches` before their results are asked for. Where nobody goes on asking, what is
-        under way comes to nothing, and other batches may follow.
-
-        Raises:
-            AdvsearchError: what a batch raises, or there is nobody who can carry it out.
-        """
+        """Carry out batches, and yield what comes of them, in any order, each once; an AdvsearchError is what one
+        raises, or that nobody can. Only a few are taken from `batches` before their results are asked for. Where nobody
+        goes on asking, what is under way comes to nothing, and other batches may follow."""
 
 
 class InProcess:

@@ -67,14 +67,10 @@ class Asked:
         self.used = False
 
     def __call__(self, name: str) -> Any:
-        """Return what an objective asks for.
-
-        Args:
-            name: "u", (N, d) of the searched controls; "texture", (N, h, w, 3) display-referred sRGB in [0, 1], the
-                searched colours of the control that has some, or (N, h, w, 4) with 1 where they are searched and 0
-                elsewhere; "textures", the same by control, where several have some; "inputs", the scene inputs by
-                name; "configuration", the numbers by parameter.
-        """
+        """Return what an objective asks for by name: "u", (N, d) of the searched controls; "texture", (N, h, w, 3)
+        display-referred sRGB in [0, 1], the searched colours of the control that has some, or (N, h, w, 4) with 1 where
+        they are searched and 0 elsewhere; "textures", the same by control, where several have some; "inputs", the scene
+        inputs by name; "configuration", the numbers by parameter."""
         self.used = True
         if name == "inputs":
             return Named("input of the scene", [self._space.inputs(whole) for whole in self._wholes])

@@ -134,13 +134,9 @@ class Store:
             check_schema(self._db, path)
 
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
-        """Add rows in one transaction; they survive a kill of the process when this returns.
-
-        A row whose kind and step are there already changes nothing. What it `told` is that of the last one.
-
-        Raises:
-            StorageError: the disk is full or can't be written; none of these rows is kept.
-        """
+        """Add rows in one transaction; they survive a kill of the process when this returns, and where the disk is full
+        none of them is kept. A row whose kind and step are there already changes nothing. What it `told` is that of the
+        last one."""
         began, stamp = time.monotonic(), time.time()
         force = began >= self._next_sync
         with storage_errors(self.path):

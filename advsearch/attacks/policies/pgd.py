@@ -115,11 +115,8 @@ class Window:
         return replace(self, values=(*self.values, value), improved=self.improved + (value > last))
 
     def stalled(self, best: float) -> bool:
-        """Return whether the step size is due for halving; `best` is the best objective by now.
-
-        Either too few steps improved the objective, or the best has not moved since the last checkpoint although the
-        step size was kept there (conditions 1 and 2 of Auto-PGD).
-        """
+        """Return whether the step size is due for halving: too few steps improved the objective, or the best has not
+        moved since the last checkpoint although the step size was kept there (conditions 1 and 2 of Auto-PGD)."""
         return self.improved < IMPROVING * len(self.values) or (not self.halved and best <= self.best)
 
     def lags(self, best: float) -> bool:
