@@ -217,7 +217,6 @@ SMALLEST_SCALE = 1e-3
 """No smaller scale than this is tried."""
 
 ROUNDS = 12
-"""Searches at most."""
 
 ATTEMPTS = 6
 """Steps outwards that the confirmation of the upper end takes at most."""

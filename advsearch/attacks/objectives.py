@@ -103,9 +103,6 @@ def checked(function: Callable[..., Tensor]) -> Objective:
     The function returns (N,), or a scalar, for which it is called with one picture at a time. A label set of one class
     comes as (N,) int64, as torch's losses take it. What it raises itself passes through. NaN values pass too: a search
     has a rule for them.
-
-    Raises:
-        InputError: the function takes other arguments; see `form_of`.
     """
     name, form = name_of(function), form_of(function)
 
@@ -186,9 +183,6 @@ class ObjectiveKind:
     """What is known about a named objective.
 
     Args:
-        name: its name.
-        summary: one line about it.
-        unit: of its values.
         plain: the function of the right answers, which may ask for more as a user's own does; None for one that has to
             be made for a run.
         targeted: the same, of a target in their place; None if it has no such form.
@@ -319,9 +313,6 @@ def get_objective(
         task: judges the model; classification of any wrong answer if None.
         features: for an objective that `needs_features`: `advsearch.models.features.features_of(model)`.
         clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
-
-    Raises:
-        UnknownNameError, InputError: as for `check_objective`; no features.
     """
     task = task or Classification()
     targeted = task.target is not None

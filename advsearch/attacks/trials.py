@@ -27,22 +27,13 @@ CONFIDENCE = 0.95
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the exact two-sided binomial interval of a success rate.
+    """Return the exact two-sided binomial interval of a rate of k successes in n trials, exactly from 0 or to 1 where
+    none or all are.
 
     low solves P(X >= successes | low) = a/2 and high solves P(X <= successes | high) = a/2, with a = 1 - confidence.
     These are quantiles of beta distributions: low = B(a/2; k, n - k + 1), high = B(1 - a/2; k + 1, n - k). The interval
-    covers the true rate at least as often as it says, at every n (Clopper and Pearson 1934).
-
-    Args:
-        successes: k, from 0 to n.
-        trials: n, at least 1.
-        confidence: between 0 and 1.
-
-    Returns:
-        (low, high); low is exactly 0 for k = 0, high exactly 1 for k = n.
-
-    Raises:
-        InputError: an argument is out of range.
+    covers the true rate at least as often as it says, at every n (Clopper and Pearson 1934). InputError: an argument is
+    out of range.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")

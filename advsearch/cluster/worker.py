@@ -81,7 +81,6 @@ WITH_OTHERS = {".obj": (".mtl",), ".gltf": (".bin",), ".xml": (".obj", ".ply", "
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")
 
 LARGEST = 1 << 30
-"""Most bytes of all files together."""
 
 
 @dataclass(frozen=True)

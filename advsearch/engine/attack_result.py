@@ -329,7 +329,6 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
 
 
 FRAMES = 24
-"""Frames of the answer of an attack along its path."""
 
 STRIP, SIDE = 8, 160
 """Pictures of a strip at most, and the height of each in pixels."""

@@ -79,7 +79,6 @@ def _load(model: Any, task: Task, config: SceneConfig, *, alone: bool) -> Model:
 
 
 AnyModel = Model | nn.Module | str | Path
-"""What `load_model` takes."""
 
 
 def several(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
@@ -111,7 +110,6 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
 
 
 OF_SCENE = ("set", "environment", "up", "camera", "exposure", "object")
-"""The settings that say what a scene is."""
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:

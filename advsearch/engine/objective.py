@@ -156,10 +156,8 @@ def penalised(found: Evaluation, space: Space, u: Tensor) -> Evaluation:
 
 
 AnyObjective = str | Callable[..., Tensor]
-"""An objective: its name, or the user's own function."""
 
 Way = Literal["mean", "worst"]
-"""How the objectives of several models are put together."""
 
 CLEAN_SPP = 64
 """Samples a pixel of the clean picture that an objective compares features with."""

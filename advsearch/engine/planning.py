@@ -26,7 +26,6 @@ FACTORS = (1.0, 3.0, 9.0)
 """Steps that are tried, as multiples of the plan's; the last only where no other will do:
 it smooths away all but the coarse shape of the loss."""
 COUNTS = (8, 16, 32, 64, 128)
-"""Sample counts that are tried."""
 ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
 CONVERGED, AGAIN = 128, 4

@@ -46,7 +46,6 @@ from advsearch.scene.transport.renderer import TransportTooLargeError
 from advsearch.tasks import Judgement
 
 MOST_FRAMES = 60
-"""Pictures of a search that its animation has, at most."""
 
 UNPRINTED = "search without print terms"
 """The kind of the search beside one with print terms: what these cost is told by its answer."""

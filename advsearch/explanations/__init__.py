@@ -25,7 +25,6 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME, Store
 
 PHOTOGRAPHS = "photographs"
-"""The part that photographs are."""
 
 ANSWER, GROUP, PART, TRIAL = "answer", "group", "part", "trial"
 """What the model said, the group that an object is in, the part of the recipe, and which trial of an attack it is."""
@@ -42,7 +41,6 @@ WORKERS = "workers"
 """The number of processes that shared a sweep, in whole; only of sweeps that say it."""
 
 OTHERS = "other objects"
-"""The group of objects that are in none."""
 
 
 @dataclass(frozen=True)

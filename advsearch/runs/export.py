@@ -187,7 +187,6 @@ def _as(value: Any, wanted: Any, pyarrow: Any) -> Any:
 DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
 
 LARGEST = 4 << 30
-"""Most bytes of a `details.log`."""
 
 LONGEST = 1 << 20
 """Most bytes of one of its lines."""

@@ -27,7 +27,6 @@ VERSION = "1.0.0"
 """Of FiftyOne, whose form is written."""
 
 MASK, GROUND_TRUTH, PREDICTION, PREDICTIONS = "object_mask", "ground_truth", "prediction", "predictions"
-"""Fields with labels."""
 
 LARGEST = 1 << 28
 """Most bytes of a picture, or of the layers beside one."""

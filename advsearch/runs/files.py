@@ -164,7 +164,6 @@ def _refusal(error: OSError, folder: Path, owner: str) -> Exception:
 DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
 
 LARGEST = 64 << 30
-"""Most bytes of it."""
 
 APPLICATION_ID = 0x41445653
 """In the header of every results.sqlite that is ours: "ADVS"."""

@@ -18,13 +18,11 @@ MOST = 50
 """More numbers are refused: there would never be enough draws to learn from."""
 
 WINDOW = 1000
-"""The latest so many draws are learnt from."""
 
 ELITE, FEWEST = 0.1, 10
 """Where fewer draws failed, those with the largest objectives stand in for failures: a tenth of them, ten at least."""
 
 ROUNDS = 8
-"""Of expectation and maximisation, a generation."""
 
 EVEN, PRIOR = 12**-0.5, 3.0
 """Deviation of the even distribution in shares of a range; it counts for so many draws of each component, so that what

@@ -49,7 +49,6 @@ PICTURE_SPP = 64
 """Samples a pixel of the picture that is kept, unless verification needed more."""
 
 TELL_SECONDS = 0.1
-"""Least time between two reports of progress."""
 
 MOST_WAITING = 10_000
 """Batches that wait for an earlier one to be counted; where there are more, all rows are counted again at the end."""

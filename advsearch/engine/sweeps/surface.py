@@ -137,13 +137,11 @@ APART = 0.1
 """Distance of two listed parts, in units of the object's largest extent, so that one spot is listed once."""
 
 FILE = "artifacts/surface.npz"
-"""Where the counts are kept in the folder of a run."""
 
 SIDES = ((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (270.0, 20.0), (0.0, 80.0), (0.0, -60.0))
 """Azimuth and elevation of the cameras that show the object in colours, degrees."""
 
 SIDE_PIXELS = 240
-"""Width and height of these pictures."""
 
 UNKNOWN = -1
 """Stands for the answer to a picture of which there is no row."""
