@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from advsearch.attacks import objective_functions as functions
 from advsearch.attacks.objective_functions import ReadFeatures
+from advsearch.attacks.objective_functions import margin as margin  # for objectives of plugins, docs/extending.md
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import told
 from advsearch.registry import Registry
