@@ -41,8 +41,7 @@ from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
-from advsearch.scene.formation import ImageFormation  # noqa: E402
-from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
+from advsearch.scene.formation import EVERYTHING, ImageFormation  # noqa: E402
 from advsearch.scene.mitsuba_backend.denoise import denoise  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene  # noqa: E402
 from advsearch.tasks import Classification  # noqa: E402

@@ -37,7 +37,6 @@ from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region import carry_out as mapping
-from advsearch.questions.region import growing as region
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs import directory, export, store
 from advsearch.runs.results.attack import AttackSummary
@@ -45,7 +44,7 @@ from advsearch.runs.results.base import RenderResult, Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene import environments, exposure, library
 from advsearch.scene.description import FRAME_FILL
-from advsearch.scene.importing.images import TEXTURE_LIMIT
+from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import settings
@@ -180,7 +179,7 @@ def names() -> Iterator[str]:
     for target in re.findall(r"^([a-z-]+):.*?## ", read(ROOT / "Makefile"), re.M):
         if f"`{target}`" not in text and f"make {target}" not in text:
             yield f"docs/development.md: expected the target {target}"
-    yield from absent("design.md", [f"| [`{path.name}`]" for path in (ROOT / "benchmarks").glob("[!_]*.py")])
+    yield from absent("development.md", [f"| [`{path.name}`]" for path in (ROOT / "benchmarks").glob("[!_]*.py")])
 
 
 PLAIN = set(
@@ -259,8 +258,8 @@ MADE_BY_HAND = [
     ("questions.md", f"**Verified** on up to {TRIALS_OVER} conditions"),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
-    ("questions.md", {8: "as long as eight random pictures"}[region.PROBES]),
-    ("questions.md", {4: "with other seeds, up to four times"}[region.ATTEMPTS]),
+    ("questions.md", {8: "as long as eight random pictures"}[mapping.PROBES]),
+    ("questions.md", {4: "with other seeds, up to four times"}[mapping.ATTEMPTS]),
     ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
     ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
     ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),

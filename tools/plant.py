@@ -102,14 +102,14 @@ FAULTS = (
     ),
     Fault(
         "exporting: normals are flipped",
-        "advsearch/scene/exporting/gltf.py",
+        "advsearch/scene/glb.py",
         "_y_up(_unit(mesh.normals))",
         "_y_up(_unit(-mesh.normals))",
         ("tests/api/test_export_scene.py",),
     ),
     Fault(
         "exporting: degrees for radians",
-        "advsearch/scene/exporting/cycles.py",
+        "advsearch/scene/cycles.py",
         '"fov": math.radians(fov),',
         '"fov": fov,',
         ("tests/scene/test_cycles.py",),
@@ -319,7 +319,7 @@ FAULTS = (
     ),
     Fault(
         "recipes: right and wrong are mixed up",
-        "advsearch/questions/recipe/figures/agreement.py",
+        "advsearch/questions/recipe/given.py",
         "right_wrong=counts[True, False],",
         "right_wrong=counts[False, True],",
         ("tests/questions/test_recipe.py",),

@@ -39,7 +39,7 @@ from advsearch.runs.summary import attack_of, read_result
 from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES, Config, read_yaml
 from advsearch.tasks import make_task
-from advsearch.viewer.pages import write_page
+from advsearch.viewer.pages import keep_answer
 
 
 def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
@@ -263,9 +263,7 @@ def carry_out_study(
         result = result_of(rows, common)
         for suffix, data in figure_of_answer(shown(result)).items():
             write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _label_for_all(config: AttackConfig) -> list[str]:

@@ -94,7 +94,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
 def photos_of(run: Path) -> PhotoAgreement | None:
     """Return how photographs agree with the run's renderings; None where there are none."""
     # late, so that --help answers at once
-    from advsearch.questions.photographs.files import FOLDER
+    from advsearch.questions.photographs.answer import FOLDER
     from advsearch.runs.directory import IMAGES
 
     if not (run / IMAGES / FOLDER).is_dir():

@@ -39,8 +39,7 @@ from advsearch.options import as_setting
 from advsearch.progress import Progress
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.directory import only_here as only_python_has
-from advsearch.scene.formation import next_count
-from advsearch.scene.leaving_out import EVERYTHING, NOTHING
+from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task

@@ -36,12 +36,12 @@ from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerAlongDrive, AttackSummary
+from advsearch.scene.assets import simpler
 from advsearch.scene.description import OBJECT
-from advsearch.scene.exporting.gltf import PosedMesh, posed, web_glb
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.glb import PosedMesh, posed, web_glb
 from advsearch.scene.settings import Given
-from advsearch.scene.simpler import simpler
 from advsearch.settings import as_python
 from advsearch.tasks import Judgement, Mark
 

@@ -23,7 +23,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Conditions, Deviation, Predictor, Tick, deviation_of
 from advsearch.files import scaled
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.transport.renderer import MOST_BYTES, LinearRenderer
+from advsearch.scene.transport.matrix import MOST_BYTES, LinearRenderer
 
 FIRST = 8
 """Conditions in the bank at first, in what an evaluation draws."""

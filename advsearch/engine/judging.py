@@ -29,7 +29,7 @@ from advsearch.report.phrases import seen_text
 from advsearch.runs.export import AFTER, OWN
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
-from advsearch.scene.transport.renderer import linear_inputs
+from advsearch.scene.transport.matrix import linear_inputs
 from advsearch.tasks import Answer, Facts, Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean
 

@@ -19,8 +19,9 @@ from advsearch.errors import InputError
 from advsearch.models.guards import plainly
 from advsearch.options import told
 from advsearch.scene import settings
+from advsearch.scene.assembly import Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
-from advsearch.scene.cameras.model import bundled
+from advsearch.scene.camera_model import bundled
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -31,13 +32,11 @@ from advsearch.scene.description import (
     check_one_environment,
     describe,
 )
-from advsearch.scene.formation import SAMPLER, ImageFormation
-from advsearch.scene.importing.images import read_picture
-from advsearch.scene.leaving_out import EVERYTHING
+from advsearch.scene.formation import EVERYTHING, SAMPLER, ImageFormation
+from advsearch.scene.grounds import on_its_ground
+from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.motion import Motion
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.road import on_its_ground
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 

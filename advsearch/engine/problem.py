@@ -26,7 +26,7 @@ from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients import GradientPlan, Group
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.renderer import Linearised, LinearRenderer, linear_inputs
+from advsearch.scene.transport.matrix import Linearised, LinearRenderer, linear_inputs
 from advsearch.tasks import Facts, Judgement, Mark, Task
 from advsearch.tasks.base import Output, Truth, mean, typical
 

@@ -27,7 +27,7 @@ from advsearch.runs.store import Row
 from advsearch.runs.summary import NAME, read_result
 from advsearch.tasks import Answer, Judgement
 from advsearch.tasks.base import mean
-from advsearch.viewer.pages import write_page
+from advsearch.viewer.pages import keep_answer
 
 KEPT = 4
 """Pictures of each group of trials that are kept."""
@@ -305,6 +305,4 @@ def kept_rows(
     if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
         before = read_result(run.path)
         return before if isinstance(before, type(answer)) else answer
-    run.write_summary(answer)
-    write_page(run.path, answer)
-    return answer
+    return keep_answer(run, answer)

@@ -42,7 +42,7 @@ from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason
 from advsearch.engine.verifier import Verifier, check_failures, ladder_of
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
-from advsearch.scene.transport.renderer import TransportTooLargeError
+from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
 MOST_FRAMES = 60

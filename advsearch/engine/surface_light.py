@@ -25,7 +25,7 @@ from advsearch.engine.transport import BOUND, Conditions, Deviation, Predictor, 
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface import plan
+from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
 from advsearch.scene.surface.renderer import Look, Sketch, SurfaceRenderer
 
@@ -52,7 +52,7 @@ def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise
     if not specialise:
         return "nothing is left out"
     names = [one.name for one in problem.space.controls]
-    if not plan.varied(problem.renderer, names) & CAMERAS:
+    if not surface_renderer.varied(problem.renderer, names) & CAMERAS:
         return NO_CAMERA
     if steps * problem.draws < WORTH:
         return f"light on surfaces pays from {WORTH} pictures on"
@@ -61,7 +61,7 @@ def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise
     for group in problem.plan.groups:
         if "forced" in group.reason and group.estimator not in ("none", "image"):
             return f"the estimator of {group.name} is forced"
-    return plan.why_not(problem.renderer, names)
+    return surface_renderer.why_not(problem.renderer, names)
 
 
 @dataclass
@@ -172,7 +172,8 @@ class SurfaceLight(Predictor):
         """Which numbers of the whole space belong to controls that change some inputs of the scene."""
         space = self.problem.space
         found = torch.zeros(len(space.start), dtype=torch.bool)
-        names = {one.name for one in space.controls if inputs & plan.varied(self.problem.renderer, [one.name])}
+        renderer = self.problem.renderer
+        names = {one.name for one in space.controls if inputs & surface_renderer.varied(renderer, [one.name])}
         for group in space.groups:
             found[group.coordinates] = group.control in names
         return found

@@ -30,7 +30,7 @@ from advsearch.scene.transport.lights import (
     samples_to_collect,
     why_not,
 )
-from advsearch.scene.transport.renderer import TOO_LARGE, PredictingRenderer
+from advsearch.scene.transport.matrix import TOO_LARGE, PredictingRenderer
 
 WORTH = 16
 """Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients

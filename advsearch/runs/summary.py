@@ -1,4 +1,4 @@
-"""The answer of a run: `summary.json` (docs/design.md), and `artifacts/answer.npy`, the configuration, so that it can
+"""The answer of a run: `summary.json` (docs/answers.md), and `artifacts/answer.npy`, the configuration, so that it can
 be rendered again elsewhere. And what a run is made with: versions, and digests of the files that its settings name."""
 
 from __future__ import annotations

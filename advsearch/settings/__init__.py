@@ -13,12 +13,14 @@ from advsearch.settings.values import (
     as_python,
     as_text,
     check_once,
+    each_once,
     is_shallow,
     number_or_text,
     parse_assignment,
     read_yaml,
     shown,
     split_names,
+    texts,
 )
 
 __all__ = [
@@ -31,6 +33,7 @@ __all__ = [
     "as_python",
     "as_text",
     "check_once",
+    "each_once",
     "is_shallow",
     "number_or_text",
     "parse_assignment",
@@ -40,4 +43,5 @@ __all__ = [
     "settings",
     "shown",
     "split_names",
+    "texts",
 ]

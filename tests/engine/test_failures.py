@@ -20,7 +20,7 @@ from advsearch.engine.record import Findings, Stages
 from advsearch.engine.stages import Attack
 from advsearch.engine.verifier import TRIED, check_failures, described_failures
 from advsearch.progress import NullProgress
-from advsearch.questions.attack.words import failures_part, failures_text
+from advsearch.questions.attack.answer import failures_part, failures_text
 from advsearch.runs.results.attack import DifferentFailures
 
 NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))

@@ -26,9 +26,8 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Light
-from advsearch.scene.surface.plan import varied, why_not_kept
-from advsearch.scene.surface.renderer import SurfaceRenderer
-from advsearch.scene.transport.renderer import MOST_BYTES
+from advsearch.scene.surface.renderer import SurfaceRenderer, varied, why_not_kept
+from advsearch.scene.transport.matrix import MOST_BYTES
 
 PAYS = 2.0
 """Times the samples that a prediction takes, comparisons included, that a group has to take rendered, for it to pay."""

@@ -35,7 +35,7 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
 from advsearch.scene.transport.lights import NOISE, BasisRenderer, Lights, lighting
-from advsearch.scene.transport.renderer import MOST_BYTES, SPP
+from advsearch.scene.transport.matrix import MOST_BYTES, SPP
 from advsearch.tasks import Judgement, Mark
 from advsearch.tasks.base import Truth
 from advsearch.viewer import thumbnails
