@@ -252,7 +252,7 @@ _OWN = {
             task=Similarity.name, of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
-            "score", "the task's own score, over 0 where an answer is what is sought; in classification the margin",
+            "score", "the task's own score, over 0 where an answer is a success; in classification the margin",
             "that of the task", task=None, of_task=_score_of,
         ),
         *(
