@@ -256,7 +256,7 @@ _OWN = {
             "that of the task", task=None, of_task=_score_of,
         ),
         *(
-            ObjectiveKind(name, f"sought: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
+            ObjectiveKind(name, f"success: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
             for name, summary in GOALS.items()
         ),
         ObjectiveKind(
@@ -264,7 +264,7 @@ _OWN = {
             "those of the tasks", task=Together.name, of_task=_score_of,
         ),
         *(
-            ObjectiveKind(name, f"sought: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
+            ObjectiveKind(name, f"success: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
             for name, summary in DEPTH_GOALS.items()
         ),
         ObjectiveKind(
