@@ -3,28 +3,15 @@
 from __future__ import annotations
 
 from advsearch.attacks.domain import Block, Domain
-from advsearch.attacks.evaluation import Evaluate, Evaluation, Query
-from advsearch.attacks.objectives import OBJECTIVES, Objective, get_objective, margin
-from advsearch.attacks.policies import (
-    CMAES,
-    NES,
-    PGD,
-    POLICIES,
-    Adam,
-    Auto,
-    Choices,
-    Evaluated,
-    Grid,
-    Policy,
-    Portfolio,
-    Proposal,
-    Random,
-    Restarts,
-    Sobol,
-    draw_seed,
-    make_policy,
-    seeded,
-)
+from advsearch.attacks.evaluation import Evaluate, Evaluated, Evaluation, Policy, Proposal, Query, draw_seed, seeded
+from advsearch.attacks.objective_functions import margin
+from advsearch.attacks.objectives import OBJECTIVES, Objective, get_objective
+from advsearch.attacks.policies import POLICIES, make_policy
+from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts
+from advsearch.attacks.policies.choices import Choices
+from advsearch.attacks.policies.evolution import CMAES, NES
+from advsearch.attacks.policies.pgd import PGD, Adam
+from advsearch.attacks.policies.sampling import Grid, Random, Sobol
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
 from advsearch.attacks.trials import SampleCount, Trials, choose_spp, clopper_pearson
 from advsearch.attacks.verification import Ending, Verification, count_right, run_trials, verify

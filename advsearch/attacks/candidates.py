@@ -70,16 +70,10 @@ def with_last(pool: tuple[Candidate, ...], last: Candidate | None, size: int) ->
 
 
 def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...]:
-    """Return the winner so far and those that are not clearly worse, in their order.
-
-    One is clearly worse if the mean of its differences from the winner, seed by seed, is larger than the standard error
-    of that mean, and its success rate is no higher. (The race of Maron and Moore 1994, with normal intervals of one
-    deviation in place of Hoeffding's: a search needs the better of two, not a proof.)
-
-    Args:
-        pool: candidates that had the same seeds in their last renders.
-        shared: how many of these there were, at least 2 for anyone to be clearly worse.
-    """
+    """Return the winner so far and those that are not clearly worse, in their order: the mean of their differences from
+    the winner, seed by seed, in the last `shared` renders, is larger than the standard error of that mean, and their
+    success rate is no higher. (The race of Maron and Moore 1994, with normal intervals of one deviation in place of
+    Hoeffding's: a search needs the better of two, not a proof.)"""
     if shared < 2 or len(pool) < 2:
         return pool
     leader = best(pool)
@@ -184,16 +178,9 @@ class FoundFailure:
 
 @dataclass(frozen=True, eq=False)
 class Failures:
-    """What a search knows of different failures.
-
-    Attributes:
-        listed: at most `MOST`.
-        over: positions in u of what tells cells apart; none where there are no cells.
-        found: how many failing cells there are; without cells, failing draws.
-        seen: how many cells, or draws, were looked at, failing or not.
-        places: how many cells there are; None without cells.
-        share: how large a part of all configurations fails, where that can be told.
-    """
+    """What a search knows of different failures: at most `MOST` of them; the positions in u of what tells cells apart;
+    how many cells fail, were seen and are there (without cells, draws, and None); and how large a part of all
+    configurations fails, where that can be told."""
 
     listed: tuple[FoundFailure, ...]
     over: tuple[int, ...]
@@ -204,16 +191,10 @@ class Failures:
 
 
 def most_different(at: Tensor, worst: Sequence[float], around: Tensor, apart: Tensor, most: int = MOST) -> list[int]:
-    """Return which to list: the worst first, then each time the one that is farthest from all before it.
-
-    That is the greedy choice of k centres, whose largest distance is at most twice the least possible (Gonzalez 1985,
-    "Clustering to minimize the maximum intercluster distance"). Of equals the worse one goes first.
-
-    Args:
-        at: (n, k) where they are, in shares of each range.
-        worst: (n,) objectives.
-        around: (k,) bool: ranges whose ends are the same place.
-        apart: (k,) bool: discrete choices, where different is 1 apart.
+    """Return which to list, at places (n, k) in shares of each range: the worst first, then each time the one that is
+    farthest from all before it. That is the greedy choice of k centres, whose largest distance is at most twice the
+    least possible (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance"). The ends of ranges
+    `around` (k,) are the same place; different choices, `apart` (k,), lie 1 apart. Of equals the worse one goes first.
     """
     order = sorted(range(len(at)), key=lambda number: -worst[number])
     at = at[order].double()
@@ -236,7 +217,6 @@ SMALLEST_SCALE = 1e-3
 """No smaller scale than this is tried."""
 
 ROUNDS = 12
-"""Searches at most."""
 
 ATTEMPTS = 6
 """Steps outwards that the confirmation of the upper end takes at most."""
@@ -260,15 +240,9 @@ Likely = Callable[[Tensor], bool]
 
 @dataclass(frozen=True, eq=False)
 class Bracket:
-    """Where the smallest scale lies.
-
-    Attributes:
-        low: at this scale a search found nothing; 0 where none has failed.
-        high: at this scale `u` passes; infinity where nothing passed at all.
-        u: (d,) a configuration within `high`; None where nothing passed.
-        found_by: number of the search that found `u`, or the longer change that it is the end of.
-        confirmed: whether `u` has passed again, with new seeds (see `confirmed`).
-    """
+    """Where the smallest scale lies: a search found nothing at `low` (0 where none has failed), and `u` (d,) passes at
+    `high`, infinity where nothing did; it is of the search `found_by`, and has passed again, with new seeds, if
+    `confirmed`."""
 
     low: float
     high: float
@@ -341,15 +315,9 @@ def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | No
 
 
 def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2, attempts: int = ATTEMPTS) -> Bracket:
-    """Return the bracket with its upper end moved out until the configuration there passes several times in a row.
-
-    What lies exactly on the edge passes its trials by chance, and the one that was chosen among many passed by luck. So
-    it is tried again with new seeds; where it fails, the change grows by a fortieth.
-
-    Args:
-        times: in a row.
-        attempts: steps outwards at most; what the last one leads to is returned untried, and not `confirmed`.
-    """
+    """Return the bracket with its upper end moved out until the configuration there passes so many times in a row: what
+    lies exactly on the edge passes its trials by chance. So it is tried again with new seeds; where it fails, the
+    change grows by a fortieth, in so many `attempts`, the last of which is returned untried."""
     if bracket.u is None:
         return bracket
     edge, reached, at = bracket.u, bracket.high, 1.0

@@ -144,12 +144,8 @@ def _check_rivals(members_: Tensor, setting: str) -> None:
 
 
 def _sorted(logits: Tensor, one: Tensor) -> tuple[Tensor, Tensor]:
-    """Take the classes of `one` for a single one with their largest logit.
-
-    Returns:
-        The 4 largest logits (3, if there are no more), (N, 3 or 4), in falling order; and the distance (N,) from the
-        largest to the smallest of all.
-    """
+    """Return the 4 largest logits (3, if there are no more), (N, 3 or 4), in falling order, the classes of `one` taken
+    for a single one with their largest, and the distance (N,) from the largest to the smallest of all."""
     single = largest(logits, one)[:, None]
     others = logits[:, ~one]
     collapsed = torch.cat([single, others], dim=1)

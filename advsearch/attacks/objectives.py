@@ -23,19 +23,9 @@ from typing import Any, Protocol, final
 import torch
 from torch import Tensor, nn
 
-from advsearch.attacks.objective_functions import (
-    ReadFeatures,
-    cosine_distance,
-    cross_entropy,
-    dlr,
-    feature_distance,
-    log_odds,
-    margin,
-    targeted_cross_entropy,
-    targeted_dlr,
-    targeted_log_odds,
-    targeted_margin,
-)
+from advsearch.attacks import objective_functions as functions
+from advsearch.attacks.objective_functions import ReadFeatures
+from advsearch.attacks.objective_functions import margin as margin  # for objectives of plugins, docs/extending.md
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import told
 from advsearch.registry import Registry
@@ -114,9 +104,6 @@ def checked(function: Callable[..., Tensor]) -> Objective:
     The function returns (N,), or a scalar, for which it is called with one picture at a time. A label set of one class
     comes as (N,) int64, as torch's losses take it. What it raises itself passes through. NaN values pass too: a search
     has a rule for them.
-
-    Raises:
-        InputError: the function takes other arguments; see `form_of`.
     """
     name, form = name_of(function), form_of(function)
 
@@ -191,22 +178,12 @@ def _part(asked: Mapping[str, Any], picture: int) -> More:
     return more
 
 
-__all__ = [
-    "OBJECTIVES", "OBJECTIVE_KINDS", "Objective", "ObjectiveKind", "asked_by", "check_objective", "checked",
-    "cross_entropy", "dlr", "feature_distance", "get_objective", "log_odds", "margin", "objective_summaries",
-    "targeted_margin",
-]  # fmt: skip
-
-
 @final
 @dataclass(frozen=True)
 class ObjectiveKind:
     """What is known about a named objective.
 
     Args:
-        name: its name.
-        summary: one line about it.
-        unit: of its values.
         plain: the function of the right answers, which may ask for more as a user's own does; None for one that has to
             be made for a run.
         targeted: the same, of a target in their place; None if it has no such form.
@@ -257,36 +234,29 @@ def _score_of(task: Task) -> Objective:
 _OWN = {
     kind.name: kind
     for kind in (
-        ObjectiveKind(
-            "margin", "the largest wrong logit minus the largest right one", "logits (log-odds)", margin,
-            targeted_margin,
-        ),
-        ObjectiveKind(
-            "log_odds", "the log-odds of a wrong answer, over all classes", "logits (log-odds)", log_odds,
-            targeted_log_odds,
-        ),
-        ObjectiveKind(
-            "cross_entropy", "minus the logarithm of the probability of the right answers", "nats", cross_entropy,
-            targeted_cross_entropy,
-        ),
-        ObjectiveKind(
-            "dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)", dlr,
-            targeted_dlr,
+        *(
+            ObjectiveKind(name, summary, unit, getattr(functions, name), getattr(functions, f"targeted_{name}"))
+            for name, summary, unit in (
+                ("margin", "the largest wrong logit minus the largest right one", "logits (log-odds)"),
+                ("log_odds", "the log-odds of a wrong answer, over all classes", "logits (log-odds)"),
+                ("cross_entropy", "minus the logarithm of the probability of the right answers", "nats"),
+                ("dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)"),
+            )
         ),
         ObjectiveKind(
             "feature_distance", "how far the features lie from those of the clean picture",
-            "lengths of the clean features", of_features=feature_distance,
+            "lengths of the clean features", of_features=functions.feature_distance,
         ),
         ObjectiveKind(
             "distance", "how far the features lie from those of the clean picture, by the angle", "1 - cosine",
-            task=Similarity.name, of_features=cosine_distance,
+            task=Similarity.name, of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
-            "score", "the task's own score, over 0 where an answer is what is sought; in classification the margin",
+            "score", "the task's own score, over 0 where an answer is a success; in classification the margin",
             "that of the task", task=None, of_task=_score_of,
         ),
         *(
-            ObjectiveKind(name, f"sought: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
+            ObjectiveKind(name, f"success: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
             for name, summary in GOALS.items()
         ),
         ObjectiveKind(
@@ -294,7 +264,7 @@ _OWN = {
             "those of the tasks", task=Together.name, of_task=_score_of,
         ),
         *(
-            ObjectiveKind(name, f"sought: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
+            ObjectiveKind(name, f"success: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
             for name, summary in DEPTH_GOALS.items()
         ),
         ObjectiveKind(
@@ -344,9 +314,6 @@ def get_objective(
         task: judges the model; classification of any wrong answer if None.
         features: for an objective that `needs_features`: `advsearch.models.features.features_of(model)`.
         clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
-
-    Raises:
-        UnknownNameError, InputError: as for `check_objective`; no features.
     """
     task = task or Classification()
     targeted = task.target is not None

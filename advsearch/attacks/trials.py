@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,22 +27,13 @@ CONFIDENCE = 0.95
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the exact two-sided binomial interval of a success rate.
+    """Return the exact two-sided binomial interval of a rate of k successes in n trials, exactly from 0 or to 1 where
+    none or all are.
 
     low solves P(X >= successes | low) = a/2 and high solves P(X <= successes | high) = a/2, with a = 1 - confidence.
     These are quantiles of beta distributions: low = B(a/2; k, n - k + 1), high = B(1 - a/2; k + 1, n - k). The interval
-    covers the true rate at least as often as it says, at every n (Clopper and Pearson 1934).
-
-    Args:
-        successes: k, from 0 to n.
-        trials: n, at least 1.
-        confidence: between 0 and 1.
-
-    Returns:
-        (low, high); low is exactly 0 for k = 0, high exactly 1 for k = n.
-
-    Raises:
-        InputError: an argument is out of range.
+    covers the true rate at least as often as it says, at every n (Clopper and Pearson 1934). InputError: an argument is
+    out of range.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
@@ -56,23 +48,15 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
 
 
 def paired_difference(both: int, first: int, second: int, neither: int) -> tuple[float, tuple[float, float]]:
-    """Return how much more often the second of two paired outcomes happens than the first, and its 95 % interval.
-
-    The interval of the difference of two shares that were counted in the same n pairs, from the Wilson intervals of
-    both and their correlation (Newcombe 1998, "Improved confidence intervals for the difference between binomial
-    proportions based on paired data", method 10).
-
-    Args:
-        both: pairs in which both happen.
-        first: in which the first alone happens.
-        second: likewise.
-        neither: in which none happens.
-    """
+    """Return how much more often the second of two paired outcomes happens than the first, and its 95 % interval, from
+    counts of pairs: both, the first alone, the second alone, neither. It comes from the Wilson intervals of both shares
+    and their correlation (Newcombe 1998, "Improved confidence intervals for the difference between binomial proportions
+    based on paired data", method 10)."""
     n = both + first + second + neither
     if n < 1 or min(both, first, second, neither) < 0:
         raise InputError(f"pairs: expected at least one, got {both}, {first}, {second} and {neither}")
     shares = (both + second) / n, (both + first) / n
-    (low, high), (other_low, other_high) = (_wilson(share, n) for share in shares)
+    (low, high), (other_low, other_high) = (map(float, wilson(share, n)) for share in shares)
     spread = (both + first) * (second + neither) * (both + second) * (first + neither)
     covariance = float(both * neither - first * second)
     if covariance > 0.0:
@@ -85,27 +69,19 @@ def paired_difference(both: int, first: int, second: int, neither: int) -> tuple
 
 
 def mcnemar(first: int, second: int) -> float:
-    """Return how likely it is that of pairs in which one outcome alone happens, chance splits so many so unevenly.
-
-    The exact test of McNemar (1947, "Note on the sampling error of the difference between correlated proportions or
-    percentages"): the pairs in which both happen, or none, say nothing about which happens more often, and the others
-    are throws of a fair coin where none does. Two-sided: twice the smaller tail of the binomial distribution.
-
-    Args:
-        first: pairs in which the first alone happens.
-        second: in which the second alone does.
-
-    Returns:
-        In (0, 1]; 1 without such pairs.
-    """
+    """Return how likely it is, in (0, 1], that of pairs in which one outcome alone happens, chance splits so many so
+    unevenly: the exact, two-sided test of McNemar (1947, "Note on the sampling error of the difference between
+    correlated proportions or percentages"): twice the smaller tail of the binomial distribution, as these pairs are
+    throws of a fair coin where neither happens more often."""
     if min(first, second) < 0:
         raise InputError(f"pairs: expected numbers from 0, got {first} and {second}")
     return min(1.0, 2.0 * float(bdtr(min(first, second), first + second, 0.5))) if first + second else 1.0
 
 
-def _wilson(share: float, n: int) -> tuple[float, float]:
+def wilson(share: Any, n: Any) -> tuple[Any, Any]:
+    """Return both ends of Wilson's score interval (1927) of shares of n, 95 %; numbers or arrays."""
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
-    middle, half = share + z * z / (2 * n), z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    middle, half = share + z * z / (2 * n), z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
     return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
 
 
@@ -248,16 +224,9 @@ def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, sought: bool = True,
 
 @dataclass(frozen=True)
 class Rung:
-    """The margins of one configuration at one sample count.
-
-    Attributes:
-        name: which configuration, e.g. "clean".
-        mean: mean margin over the seeds.
-        half_width: how far the mean may lie on the other side of the true one (Student's t), in 5 % of all cases, after
-            all looks together.
-        drift: mean here minus mean at the rung below; NaN at the first.
-        settled: whether more samples would leave the margin on its side of zero; see `choose_spp`.
-    """
+    """The margins of one configuration at one sample count: their mean, how far it may lie on the other side of the
+    true one (Student's t) in 5 % of all cases, after all looks together, its drift from the rung below, NaN at the
+    first, and whether more samples would leave it on its side of zero; see `choose_spp`."""
 
     name: str
     spp: int

@@ -210,15 +210,9 @@ def run_trials(
     keep: int = 0,
     until: Callable[[Sequence[Judgement]], bool] | None = None,
 ) -> tuple[Judgement, ...]:
-    """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification".
-
-    Two groups run with the same root seed get the same seeds, trial by trial, which is what a control group needs. They
-    end sooner where `until`, asked after every trial, says so.
-
-    Args:
-        first: how many of them there are already, which are left out.
-        keep: the pictures of the first so many are wanted.
-    """
+    """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification", without the
+    `first` ones; the first `keep` pictures are wanted. Two groups run with the same root seed get the same seeds, trial
+    by trial, which is what a control group needs. They end sooner where `until`, asked after every trial, says so."""
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
     if spp < 1:

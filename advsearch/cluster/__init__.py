@@ -16,16 +16,10 @@ Call = Callable[[Sequence[Any]], Any]
 
 @dataclass(frozen=True)
 class Work:
-    """What batches are of, so that another process can carry them out.
-
-    Attributes:
-        function: ``"package.module:function"``; it takes the settings and returns a `Call`.
-        settings: JSON values that decide everything.
-        files: names of those settings that may hold paths, separated by commas. Files go along with the work.
-        threads: processor threads of a worker.
-        seconds: that a batch may take at least, where that is known beforehand; None goes by the median.
-        ahead: whether a worker has its next batch before it is done with one; not where batches take long.
-    """
+    """What batches are of, so that another process can carry them out: ``"package.module:function"``, which takes the
+    settings and returns a `Call`; which settings may hold paths, separated by commas, whose files go along; processor
+    threads of a worker; seconds that a batch may take at least (None: by the median); and whether a worker has its next
+    batch `ahead`, not where batches take long."""
 
     function: str
     settings: JsonObject
@@ -50,21 +44,9 @@ class Done:
 
 @dataclass
 class Workforce:
-    """How the workers did.
-
-    Attributes:
-        workers: that are ready.
-        most: that were ready at once.
-        lost: that went away before they were told to.
-        refused: that cannot do the work, and why, in words.
-        retried: batches that were given out again.
-        batches: that came back.
-        busy: seconds that workers spent on batches.
-        loading: seconds that they spent on getting ready.
-        alive: seconds that they were there and ready.
-        machines: name to description of those that are not like this one.
-        link: of a page that shows the workers; empty where there is none.
-    """
+    """How the workers did: those that are ready, at once at most, went away untold, and cannot do the work; batches
+    that were given out again and came back; seconds spent on batches, on getting ready, and ready; machines that are
+    not like this one, by name, and the link of a page that shows the workers."""
 
     workers: int = 0
     most: int = 0
@@ -92,14 +74,9 @@ class Executor(Protocol):
         """How the workers do; None where there are none."""
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
-        """Carry out batches, and yield what comes of them, in any order, each once.
-
-        Only a few are taken from `batches` before their results are asked for. Where nobody goes on asking, what is
-        under way comes to nothing, and other batches may follow.
-
-        Raises:
-            AdvsearchError: what a batch raises, or there is nobody who can carry it out.
-        """
+        """Carry out batches, and yield what comes of them, in any order, each once; an AdvsearchError is what one
+        raises, or that nobody can. Only a few are taken from `batches` before their results are asked for. Where nobody
+        goes on asking, what is under way comes to nothing, and other batches may follow."""
 
 
 class InProcess:

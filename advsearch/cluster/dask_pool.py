@@ -317,7 +317,6 @@ def _failure(error: Exception) -> Failure:
 
 
 LOCAL = "local"
-"""The cluster of this machine's own processes."""
 
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
 

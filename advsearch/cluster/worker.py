@@ -81,7 +81,6 @@ WITH_OTHERS = {".obj": (".mtl",), ".gltf": (".bin",), ".xml": (".obj", ".ply", "
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")
 
 LARGEST = 1 << 30
-"""Most bytes of all files together."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,8 @@ def write_files(work: Work, files: Files, folder: Path) -> Work:
     for name in work.files:
         value = settings.get(name)
         if isinstance(value, str):
-            settings[name] = ",".join(_moved(part, new) for part in value.split(","))
+            parts = (part.strip().partition("#") for part in value.split(","))
+            settings[name] = ",".join(new.get(path, path) + mark + inner for path, mark, inner in parts)
     return replace(work, settings=settings)
 
 
@@ -158,11 +158,6 @@ def _paths(work: Work) -> Iterable[Path]:
             path = Path(part.strip().partition("#")[0])
             if path.is_absolute() and path.is_file():
                 yield path
-
-
-def _moved(part: str, new: Mapping[str, str]) -> str:
-    path, mark, inner = part.strip().partition("#")
-    return new.get(path, path) + mark + inner
 
 
 def _with_others(path: Path) -> Sequence[Path]:

@@ -23,7 +23,7 @@ from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.config.attack import OVER_NUMBERS, OVER_ONE, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
-from advsearch.controls import Space, make_space
+from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.judging import Described, Looked, Metrics, check_truth, facts_of, load_metrics, shown
@@ -39,7 +39,6 @@ from advsearch.options import as_setting
 from advsearch.progress import Progress
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.directory import only_here as only_python_has
-from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES
@@ -55,17 +54,10 @@ SEARCHED_WITH = ("the objective", "the policy", "the metric")
 
 @dataclass
 class AttackParts:
-    """Everything that was asked for, found and loaded.
-
-    Attributes:
-        loaded: the model, and what was said of it.
-        task: not yet on the model.
-        controls: what is searched.
-        over: what varies by chance.
-        objective: a name, or a function of the caller's.
-        keep: whether the run is kept in a folder.
-        clean: the matrix of light transport of the clean scene, which attacks may share.
-    """
+    """Everything that was asked for, found and loaded: the model and what was said of it, a task that is not yet on the
+    model, the controls that are searched and those `over` that vary by chance; objective and policy may be the caller's
+    own. Attacks may share `clean`, the matrix of light transport of the clean scene. A run is kept in a folder, or
+    (`keep`) not."""
 
     config: AttackConfig
     scene: Scene
@@ -139,14 +131,13 @@ def check_from_config(config: AttackConfig) -> None:
     rendered."""
     job = parts_of(config)
     _task(job, shows=False)
-    _space(job, framed(job.scene.description, config.resolution or job.loaded[0].input_size))
+    size = config.resolution or job.loaded[0].input_size
+    make_space((*job.controls, *job.over), framed(job.scene.description, size))
 
 
 def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
     """Load what a configuration describes without searching: the problem, and warnings on the way."""
-    job = parts_of(AttackConfig.of(config, denoise=denoise or config.denoise))
-    problem = problem_on(job)
-    return problem, [*job.loaded[1], *sentences(problem.space.moved)]
+    return problem_of_parts(parts_of(AttackConfig.of(config, denoise=denoise or config.denoise)))
 
 
 def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, list[str]]:
@@ -173,7 +164,7 @@ def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
     task, facts = _task(job)
     resolution = config.resolution or model.input_size
     description = framed(description, resolution)
-    space = _space(job, description)
+    space = make_space((*job.controls, *job.over), description)
     renderer = make_renderer(
         description,
         space,
@@ -229,10 +220,6 @@ def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Desc
         job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
     task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
     return task, facts
-
-
-def _space(job: AttackParts, description: SceneDescription) -> Space:
-    return make_space((*job.controls, *job.over), description)
 
 
 def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:

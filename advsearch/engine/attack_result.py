@@ -206,14 +206,9 @@ PICTURE_SPP = 16
 
 @dataclass(frozen=True, eq=False)
 class KeptPicture:
-    """The picture of a configuration that is kept, and what is true of this picture alone.
-
-    Attributes:
-        whole: the configuration of the whole space, with the conditions of this picture.
-        radiance: (H, W, 3) linear.
-        picture: (H, W, 3) sRGB as the model sees it, 8-bit values in [0, 1].
-        trial: number of the trial that it is of; None where nothing was tried.
-    """
+    """The picture of a configuration of the whole space that is kept, as the model sees it: (H, W, 3) sRGB, 8-bit
+    values in [0, 1], and its linear radiance; what is said of it, and the number of its trial, None where nothing was
+    tried."""
 
     whole: Tensor
     radiance: Tensor
@@ -274,16 +269,22 @@ def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, show
     kind = "verification" if findings.beaten is None else "baseline verification"
     for number in range(min(KEPT, len(checked.adversarial_trials) if checked else 0)):
         assert checked is not None
-        seed, name = seeds.stream(problem.seed, "verification", number), f"verification-{number:02d}"
-        picture = findings.pictures.get((kind, number))
-        picture = problem.picture(checked.u, seed, findings.spp) if picture is None else picture
-        run.save_image(name, picture)
-        save_marked(run, name, picture, problem.marks(picture, problem.whole(checked.u, seed)))
+        save_trial(run, problem, findings, (kind, number), f"verification-{number:02d}", checked.u)
     if findings.frames:
         last = shown["adversarial"].picture
         if problem.conditions is not None and findings.search is not None:  # the frames see the scene as it comes
             last = KeptPicture.of(problem, findings, problem.domain.project(findings.search.best_u), None).picture
         run.save_animation("search", [*findings.frames, last.numpy()])
+
+
+def save_trial(
+    run: RunDirectory, problem: Problem, findings: Findings, trial: tuple[str, int], name: str, u: Tensor
+) -> None:
+    """Write the picture of a trial, by kind and number, as the model saw it, and with its answer."""
+    seed, picture = seeds.stream(problem.seed, "verification", trial[1]), findings.pictures.get(trial)
+    picture = problem.picture(u, seed, findings.spp) if picture is None else picture
+    run.save_image(name, picture)
+    save_marked(run, name, picture, problem.marks(picture, problem.whole(u, seed)))
 
 
 def save_marked(run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]) -> None:
@@ -328,7 +329,6 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
 
 
 FRAMES = 24
-"""Frames of the answer of an attack along its path."""
 
 STRIP, SIDE = 8, 160
 """Pictures of a strip at most, and the height of each in pixels."""

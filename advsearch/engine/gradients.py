@@ -8,7 +8,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -268,59 +268,34 @@ def reference(
     several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure enough;
     if none is, the one with the least noise goes on.
     """
-    before = renderer.renders
+    before, found, errors = renderer.renders, dict[float, Reference](), dict[float, float]()
     steps = {factor: probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step) for factor in factors}
-    pairs = {factor: _Pairs(replace(probe, step=step)) for factor, step in steps.items()}
-    for factor, tried in pairs.items():
-        tried.extend(renderer, loss, u, seed, spp, until=repeats[0])
-        if tried.error <= goal * abs(tried.value):
+    pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
+
+    def measure(factor: float, count: int) -> None:
+        """Take differences at a step and at half of it until there are so many pairs, of the same seeds each."""
+        for number in range(len(pairs[factor]), count):
+            noise = seeds.stream(seed, "reference", number)
+            wide, narrow = (
+                _difference(renderer, loss, u, probe, step, noise, spp) for step in (steps[factor], 0.5 * steps[factor])
+            )
+            pairs[factor].append((wide, narrow))
+        values = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairs[factor]]
+        both = statistics.fmean(wide for wide, _ in pairs[factor]), statistics.fmean(fine for _, fine in pairs[factor])
+        error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.inf
+        noise_of_both = math.hypot(error, 0.25 * (both[0] - both[1]))
+        found[factor], errors[factor] = Reference(statistics.fmean(values), noise_of_both, both, 0, factor), error
+
+    for factor in factors:
+        measure(factor, repeats[0])
+        if errors[factor] <= goal * abs(found[factor].value):
             best = factor
             break
     else:
-        best = min(pairs, key=lambda factor: pairs[factor].noise)
-        while pairs[best].error > goal * abs(pairs[best].value) and len(pairs[best].wide) < repeats[1]:
-            pairs[best].extend(renderer, loss, u, seed, spp, until=len(pairs[best].wide) + 1)
-    found = pairs[best]
-    return Reference(found.value, found.noise, found.both, renderer.renders - before, best)
-
-
-@dataclass
-class _Pairs:
-    """Differences at a probe's step and at half of it, with the same seeds."""
-
-    probe: Probe
-    wide: list[float] = field(default_factory=list)
-    narrow: list[float] = field(default_factory=list)
-
-    def extend(self, renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, *, until: int) -> None:
-        for number in range(len(self.wide), until):
-            noise = seeds.stream(seed, "reference", number)
-            self.wide.append(_difference(renderer, loss, u, self.probe, self.probe.step, noise, spp))
-            self.narrow.append(_difference(renderer, loss, u, self.probe, 0.5 * self.probe.step, noise, spp))
-
-    @property
-    def both(self) -> tuple[float, float]:
-        return statistics.fmean(self.wide), statistics.fmean(self.narrow)
-
-    @property
-    def _at_zero(self) -> list[float]:
-        """Extrapolated to a step of zero (Richardson)."""
-        return [(4.0 * fine - coarse) / 3.0 for coarse, fine in zip(self.wide, self.narrow, strict=True)]
-
-    @property
-    def value(self) -> float:
-        return statistics.fmean(self._at_zero)
-
-    @property
-    def error(self) -> float:
-        values = self._at_zero
-        return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.inf
-
-    @property
-    def noise(self) -> float:
-        """Standard error together with a quarter of the steps' disagreement."""
-        wide, narrow = self.both
-        return math.hypot(self.error, 0.25 * (wide - narrow))
+        best = min(found, key=lambda factor: found[factor].noise)
+        while errors[best] > goal * abs(found[best].value) and len(pairs[best]) < repeats[1]:
+            measure(best, len(pairs[best]) + 1)
+    return replace(found[best], renders=renderer.renders - before)
 
 
 def _difference(renderer: Renderer, loss: Loss, u: Tensor, probe: Probe, step: float, seed: int, spp: int) -> float:

@@ -26,13 +26,14 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.cluster import Call, Executor, Workforce
 from advsearch.engine.problem import Prepared, Problem
-from advsearch.engine.record import LOST, judged, judgement_of, no_answer, trial_row
+from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model
 from advsearch.models.ensemble import Ensemble
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
+from advsearch.tasks import Answer, Judgement
 
 Sent: TypeAlias = tuple[str, Prepared | None, Query]
 """The name of the problem, what it has been prepared with, and what is asked."""
@@ -109,7 +110,8 @@ def lost(query: Query, why: str) -> Evaluation:
         raise ClusterError(f"{what}: {why}; `advsearch resume RUN workers=null` makes it here")
     gradient = torch.zeros_like(query.u) if query.gradient else None
     cost = 0 if query.phase is None else query.samples
-    return Evaluation(math.nan, gradient, False, cost=cost, judgement=no_answer(why), lost=True)
+    said = Judgement(math.nan, math.nan, right=False, answer=Answer(LOST, None, None), payload={"lost": why})
+    return Evaluation(math.nan, gradient, False, cost=cost, judgement=said, lost=True)
 
 
 MADE_OF = "made of"
@@ -257,14 +259,8 @@ PLAN = "gradient plan"
 
 @dataclass
 class Journal:
-    """What a run has asked and was answered. Without a run directory it is kept in memory.
-
-    Attributes:
-        traced: answers what nothing predicts.
-        rows: what was written, where there is no run directory.
-        lost: queries that nobody could answer.
-        machines: on which answers were made that are not like this one.
-    """
+    """What a run has asked and was answered, without a run directory kept in `rows`; `traced` answers what nothing
+    predicts. It counts queries that nobody could answer (`lost`), and knows the machines that are not like this one."""
 
     run: RunDirectory | None
     traced: Shared

@@ -38,7 +38,6 @@ Metric = Callable[[Tensor, Any, Any], Any]
 tensor without axes."""
 
 Metrics = Mapping[str, Metric]
-"""Metrics by the names of their columns."""
 
 MAIN = "__main__"
 """The script that runs, which workers on this machine import too."""

@@ -45,7 +45,6 @@ Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 its instance, and ``mitsuba:KEY`` a range."""
 
 Texture = str | Path | npt.ArrayLike | Tensor
-"""A picture to paint an object with, see `load_scene`."""
 
 CONTROL, SCENE, MODEL = "control", "scene", "model"
 """Kinds of things that may stand for a name (`lent`)."""

@@ -79,7 +79,6 @@ def _load(model: Any, task: Task, config: SceneConfig, *, alone: bool) -> Model:
 
 
 AnyModel = Model | nn.Module | str | Path
-"""What `load_model` takes."""
 
 
 def several(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
@@ -111,7 +110,6 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
 
 
 OF_SCENE = ("set", "environment", "up", "camera", "exposure", "object")
-"""The settings that say what a scene is."""
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:
@@ -226,19 +224,16 @@ def _is_searched(kind: type[Control], parameter: str, given: Mapping[str, object
 
 def _not_taken(setting: str, name: str, kind: str) -> InputError:
     if setting == "epsilon":
+        choices = CONTROLS[kind].choices if kind in CONTROLS else ()
+        bounded = [choice.bounds for choice in choices if choice.run_setting == "epsilon" and choice.bounds]
+        instead = f", or search {bounded[0]} with it" if bounded else ""
         return InputError(
             f"`epsilon` {name}: the control has ranges and no epsilon; give its ranges, as in "
-            f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{_bounded(kind)}"
+            f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{instead}"
         )
     if setting == "path":
         return InputError(f"path: {name} does not travel; add `over=path` beside it, or `controls=path`")
     return InputError(f"{setting}: {name} has none, and no other control is there that has one; leave it out")
-
-
-def _bounded(kind: str) -> str:
-    choices = CONTROLS[kind].choices if kind in CONTROLS else ()
-    bounded = [choice.bounds for choice in choices if choice.run_setting == "epsilon" and choice.bounds]
-    return f", or search {bounded[0]} with it" if bounded else ""
 
 
 _TURN = threading.RLock()

@@ -5,7 +5,7 @@ same colours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -47,25 +47,15 @@ def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **m
     return Domain(start, blocks, **more)
 
 
-class Named(Mapping[str, Tensor]):
-    """Tensors by name, of N configurations: each (N, ...)."""
+class Named(dict[str, Tensor]):
+    """Tensors (N, ...) of N configurations by name; a message says `what` a name stands for that is none."""
 
     def __init__(self, what: str, each: Sequence[Mapping[str, Tensor]]) -> None:
-        self._what, self._each = what, each
+        super().__init__({name: torch.stack([one[name] for one in each]) for name in each[0]})
+        self._what = what
 
-    def __getitem__(self, name: str) -> Tensor:
-        if name not in self:
-            raise UnknownNameError(self._what, name, self._each[0])
-        return torch.stack([one[name] for one in self._each])
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._each[0]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._each[0])
-
-    def __len__(self) -> int:
-        return len(self._each[0])
+    def __missing__(self, name: str) -> Tensor:
+        raise UnknownNameError(self._what, name, self)
 
 
 class Asked:
@@ -77,14 +67,10 @@ class Asked:
         self.used = False
 
     def __call__(self, name: str) -> Any:
-        """Return what an objective asks for.
-
-        Args:
-            name: "u", (N, d) of the searched controls; "texture", (N, h, w, 3) display-referred sRGB in [0, 1], the
-                searched colours of the control that has some, or (N, h, w, 4) with 1 where they are searched and 0
-                elsewhere; "textures", the same by control, where several have some; "inputs", the scene inputs by
-                name; "configuration", the numbers by parameter.
-        """
+        """Return what an objective asks for by name: "u", (N, d) of the searched controls; "texture", (N, h, w, 3)
+        display-referred sRGB in [0, 1], the searched colours of the control that has some, or (N, h, w, 4) with 1 where
+        they are searched and 0 elsewhere; "textures", the same by control, where several have some; "inputs", the scene
+        inputs by name; "configuration", the numbers by parameter."""
         self.used = True
         if name == "inputs":
             return Named("input of the scene", [self._space.inputs(whole) for whole in self._wholes])
@@ -170,10 +156,8 @@ def penalised(found: Evaluation, space: Space, u: Tensor) -> Evaluation:
 
 
 AnyObjective = str | Callable[..., Tensor]
-"""An objective: its name, or the user's own function."""
 
 Way = Literal["mean", "worst"]
-"""How the objectives of several models are put together."""
 
 CLEAN_SPP = 64
 """Samples a pixel of the clean picture that an objective compares features with."""

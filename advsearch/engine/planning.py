@@ -26,7 +26,6 @@ FACTORS = (1.0, 3.0, 9.0)
 """Steps that are tried, as multiples of the plan's; the last only where no other will do:
 it smooths away all but the coarse shape of the loss."""
 COUNTS = (8, 16, 32, 64, 128)
-"""Sample counts that are tried."""
 ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
 CONVERGED, AGAIN = 128, 4
@@ -309,8 +308,12 @@ def measured_bounces(
         light = levels = 0.0
         for u, whole in zip(configurations, wholes, strict=True):
             cut = pictures(u, depth)
-            light = max(light, _missing(whole, cut))
-            levels = max(levels, LEVELS * _bias(whole, cut))
+            first, second = (one[1] - other[1] for one, other in zip(whole, cut, strict=True))
+            # the product of two independent differences has no noise in its mean
+            bias = float((first * second).mean().clamp_min(0.0).sqrt())
+            all_of_it, left = (sum(float(radiance.mean()) for radiance, _ in one) for one in (whole, cut))
+            light = max(light, 1.0 - left / all_of_it if all_of_it > 0.0 else 0.0)
+            levels = max(levels, LEVELS * bias)
         cuts.append(PathCut(depth=depth, light=light, levels=levels))
         if not levels <= bound:
             break
@@ -332,17 +335,6 @@ def _reason(depth: int, full: int, cuts: Mapping[int, PathCut]) -> str:
         rejected = cuts[depth - 1]
         said.append(f"{rejected.depth} would leave out {rejected.light:.2%} and move it by {rejected.levels:.2f}")
     return "; ".join(said) or f"all {full} segments"
-
-
-def _missing(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:
-    full = sum(float(radiance.mean()) for radiance, _ in whole)
-    return 1.0 - sum(float(radiance.mean()) for radiance, _ in cut) / full if full > 0.0 else 0.0
-
-
-def _bias(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:
-    """The root-mean-square bias: the product of two independent differences has no noise in its mean."""
-    first, second = (one[1] - other[1] for one, other in zip(whole, cut, strict=True))
-    return float((first * second).mean().clamp_min(0.0).sqrt())
 
 
 def _pictures(renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int) -> tuple[Tensor, Tensor]:

@@ -121,11 +121,6 @@ LOST = "(no answer)"
 """The answer to a picture that nobody could make; what the row keeps beside it says why."""
 
 
-def no_answer(why: str) -> Judgement:
-    """Return what stands for the answer to a picture that nobody could make: neither right nor a success, and why."""
-    return Judgement(math.nan, math.nan, right=False, answer=Answer(LOST, None, None), payload={"lost": why})
-
-
 def lost_remarks(lost: int) -> list[str]:
     """Return what a reader has to know of so many pictures that nobody could make."""
     if not lost:

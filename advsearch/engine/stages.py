@@ -30,21 +30,11 @@ from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirme
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
 from advsearch.config import AttackConfig
-from advsearch.engine import surface_light
+from advsearch.engine import planning, surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import inside
 from advsearch.engine.journal import PLAN, Journal, finite, other_answers, same
 from advsearch.engine.objective import penalised
-from advsearch.engine.planning import (
-    WORTH_BOUNCES,
-    bounces_of,
-    cosine_samples,
-    cosines,
-    measured_plan,
-    most_pictures,
-    plan_gradients,
-    tuned,
-)
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
@@ -56,7 +46,6 @@ from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
 MOST_FRAMES = 60
-"""Pictures of a search that its animation has, at most."""
 
 UNPRINTED = "search without print terms"
 """The kind of the search beside one with print terms: what these cost is told by its answer."""
@@ -127,16 +116,16 @@ class Attack:
     def _cut_paths(self) -> None:
         """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
         problem, config = self.problem, self.config
-        worth = config.specialise and (config.measure == "full" or problem.steps >= WORTH_BOUNCES)
+        worth = config.specialise and (config.measure == "full" or problem.steps >= planning.WORTH_BOUNCES)
         if worth and self.against_surface_light() is not None:  # else no step will be rendered
             self.stages.begin(
                 "setup",
                 "finding how many bounces of light the search needs",
-                most_pictures(problem),
+                planning.most_pictures(problem),
                 hint="few samples each; `specialise=false` leaves it out",
                 at_most=True,
             )
-            problem.search_depth = bounces_of(problem, problem.seed, tick=self._advance).depth
+            problem.search_depth = planning.bounces_of(problem, problem.seed, tick=self._advance).depth
 
     def _measure(self) -> None:
         """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
@@ -148,7 +137,7 @@ class Attack:
             return  # derivatives will come from what predicts the pictures
         renderer = problem.renderer
         u, seed = inside(renderer), seeds.stream(problem.seed, "measure")
-        gradients = plan_gradients(renderer.plan, every=full)
+        gradients = planning.plan_gradients(renderer.plan, every=full)
         if gradients:
             self.stages.begin(
                 "setup",
@@ -156,7 +145,7 @@ class Attack:
                 gradients,
                 hint=f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out",
             )
-        problem.plan = measured_plan(
+        problem.plan = planning.measured_plan(
             renderer,
             problem.loss,
             u,
@@ -170,12 +159,12 @@ class Attack:
             self.stages.begin(
                 "setup",
                 "choosing step and samples of gradients",
-                cosine_samples(problem.plan),
+                planning.cosine_samples(problem.plan),
                 hint="counted in samples a pixel; `measure=quick` leaves it out",
                 at_most=True,
             )
-            table = list(cosines(renderer, problem.loss, u, seed=seed, tick=self._advance))
-            plan, spp = tuned(problem.plan, table)
+            table = list(planning.cosines(renderer, problem.loss, u, seed=seed, tick=self._advance))
+            plan, spp = planning.tuned(problem.plan, table)
             problem.plan = plan
             problem.spp = spp if config.spp is None and spp is not None else problem.spp
 

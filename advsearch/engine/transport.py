@@ -65,17 +65,10 @@ Judged = float | Tensor
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far the prediction of one configuration is from what paths show.
-
-    Attributes:
-        levels: root mean square difference between the predicted and the traced change of the picture since the matrix
-            was made, in levels of 255, without the noise of tracing (`change_off`). Where light moves, of the picture
-            itself.
-        logits: predicted minus traced objective.
-        pictures: that were traced to find it.
-        most: levels up to which a prediction is good enough: `BOUND`, or, where light moves, what a rendered
-            evaluation is off if that is more.
-    """
+    """How far the prediction of one configuration is from what paths show: the root mean square difference of the
+    change of the picture since the matrix was made (`change_off`), or where light moves of the picture itself, in
+    levels of 255; that of the objective; and the levels that are good enough: `BOUND`, or, where light moves, what a
+    rendered evaluation is off if that is more. So many pictures were traced to find it."""
 
     levels: float
     logits: float

@@ -28,7 +28,7 @@ from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.trials import LADDER, margins_of, most_samples
 from advsearch.cluster import Executor
 from advsearch.config.scene import SceneConfig
-from advsearch.engine.attack_result import save_marked
+from advsearch.engine.attack_result import save_trial
 from advsearch.engine.journal import Journal, Shared, digest
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages, verified_rate
@@ -37,13 +37,8 @@ from advsearch.errors import InputError
 from advsearch.progress import Progress
 from advsearch.report.wording import count as plural
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import (
-    DescribedValue,
-    DifferentFailure,
-    DifferentFailures,
-    FailingShare,
-    PicturedAnswer,
-)
+from advsearch.runs.results import attack as results
+from advsearch.runs.results.attack import PicturedAnswer
 from advsearch.runs.summary import read_answer
 from advsearch.scene.formation import next_count, to_8_bit
 from advsearch.tasks import Judgement
@@ -256,47 +251,39 @@ def check_failures(verifier: Verifier, found: SearchResult) -> None:
 def write_failures(run: RunDirectory, problem: Problem, findings: Findings) -> None:
     """Write a picture of each failure that was tried, as the model saw it in its first trial."""
     for number, checked in enumerate(findings.failures):
-        seed, name = seeds.stream(problem.seed, "verification", 0), _picture(number)
-        seen = findings.pictures.get((f"failure {number}", 0))
-        seen = problem.picture(checked.u, seed, findings.spp) if seen is None else seen
-        run.save_image(name, seen)
-        save_marked(run, name, seen, problem.marks(seen, problem.whole(checked.u, seed)))
+        save_trial(run, problem, findings, (f"failure {number}", 0), _picture(number), checked.u)
 
 
-def described_failures(problem: Problem, findings: Findings) -> DifferentFailures | None:
+def described_failures(problem: Problem, findings: Findings) -> results.DifferentFailures | None:
     """Return what a summary says of the different failures; None of a policy that looks for one."""
     known = findings.search.failures if findings.search else None
     if known is None:
         return None
     listed = [_described(problem, findings, number, failure) for number, failure in enumerate(known.listed)]
-    return DifferentFailures(
+    return results.DifferentFailures(
         over=[problem.domain.names[place] for place in known.over],
         found=known.found,
         seen=known.seen,
         places=known.places,
-        share=None if known.share is None else FailingShare.of(known.share),
+        share=None if known.share is None else results.FailingShare.of(known.share),
         tried=len(findings.failures),
         held=sum(one.ending is Ending.FOUND for one in findings.failures),
         listed=listed,
     )
 
 
-def _described(problem: Problem, findings: Findings, number: int, failure: FoundFailure) -> DifferentFailure:
+def _described(problem: Problem, findings: Findings, number: int, failure: FoundFailure) -> results.DifferentFailure:
     checked = findings.failures[number] if number < len(findings.failures) else None
-    names, ranges = problem.domain.names, failure.ranges
-    return DifferentFailure(
+    names, ranges, first = problem.domain.names, failure.ranges, checked.adversarial_trials[0] if checked else None
+    return results.DifferentFailure(
         ranges={names[place]: _range(problem, failure.u, place, ends) for place, ends in ranges.items()},
-        configuration={name: DescribedValue.of(value) for name, value in problem.describe(failure.u).items()},
+        configuration={name: results.DescribedValue.of(value) for name, value in problem.describe(failure.u).items()},
         objective=failure.objective,
         holds=None if checked is None else checked.ending is Ending.FOUND,
         verified=None if checked is None else verified_rate(checked),
         picture=None if checked is None else f"images/{_picture(number)}.png",
-        pictured=None if checked is None else _pictured(checked.adversarial_trials[0]),
+        pictured=None if first is None else PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0),
     )
-
-
-def _pictured(first: Judgement) -> PicturedAnswer:
-    return PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0)
 
 
 def _picture(number: int) -> str:
@@ -324,15 +311,9 @@ def unchanged(picture: Tensor, seed: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class RetrialCondition:
-    """What an answer is tried under.
-
-    Attributes:
-        name: in tables and in the kinds of rows.
-        source: conditions with equal sources are shown the same picture before it is changed.
-        change: what happens to a picture (H, W, 3) sRGB in [0, 1] before the model sees it, by the seed of its trial.
-        light: conditions with equal lights get their pictures from one linear radiance: their scenes are the same, only
-            tone curves or models differ. None: this one renders by itself.
-    """
+    """What an answer is tried under. Conditions of equal source are shown the same picture before it is changed: (H, W,
+    3) sRGB in [0, 1], by the seed of its trial; those of equal light get theirs from one linear radiance, as their
+    scenes are the same and only tone curves or models differ (None: this one renders by itself)."""
 
     name: str
     problem: Problem
@@ -343,15 +324,9 @@ class RetrialCondition:
 
 
 class Retrials:
-    """Tries the clean scene and answers under conditions; what the run has stored already is read back.
-
-    Trial k has the same seed for the clean scene, for every answer and under every condition.
-
-    Args:
-        trials: of each answer under each condition.
-        seed: root of these trials, which nothing else uses.
-        executor: of workers that hold the problems by the names of their conditions; None makes pictures here.
-    """
+    """Tries the clean scene and answers under conditions, each in so many trials; what the run has stored already is
+    read back. Trial k has the same seed, of a root that nothing else uses, for all of them. An executor's workers hold
+    the problems by the names of their conditions; without, pictures are made here."""
 
     def __init__(
         self,

@@ -25,7 +25,6 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME, Store
 
 PHOTOGRAPHS = "photographs"
-"""The part that photographs are."""
 
 ANSWER, GROUP, PART, TRIAL = "answer", "group", "part", "trial"
 """What the model said, the group that an object is in, the part of the recipe, and which trial of an attack it is."""
@@ -42,21 +41,13 @@ WORKERS = "workers"
 """The number of processes that shared a sweep, in whole; only of sweeps that say it."""
 
 OTHERS = "other objects"
-"""The group of objects that are in none."""
 
 
 @dataclass(frozen=True)
 class Answered:
-    """What a model said of one picture.
-
-    Attributes:
-        part: of the recipe.
-        values: what the picture shows: object, environment, model, and parameters in their units.
-        units: of the parameters.
-        answer: in words.
-        time: when it was stored, seconds since 1970.
-        margin: of the task; over 0 where the answer is wrong.
-    """
+    """What a model said of one picture of a part of the recipe: what it shows, object, environment, model, and
+    parameters in their units; the answer in words, whether it is right, and its margin; and when it was stored, seconds
+    since 1970."""
 
     part: str
     values: Mapping[str, float | str]
@@ -74,13 +65,12 @@ def figure_value(value: float | str) -> str:
     return f"{value:.4g}"
 
 
-def rows_of(part: str, folder: Path, summary: AttackSummary | SweepSummary) -> list[Answered]:
-    """Return the answers that a sweep has stored, without the trials of its worst, or the trials of an attack."""
-    return answered(part, folder, summary, ("sweep",) if isinstance(summary, SweepSummary) else tuple(TRIALS))
-
-
-def answered(part: str, folder: Path, summary: AttackSummary | SweepSummary, kinds: Sequence[str]) -> list[Answered]:
-    """Return the rows of some kinds; other arguments and errors as for `rows_of`."""
+def rows_of(
+    part: str, folder: Path, summary: AttackSummary | SweepSummary, kinds: Sequence[str] | None = None
+) -> list[Answered]:
+    """Return the answers that a sweep has stored, without those of its worst, or trials of an attack, or some kinds."""
+    if kinds is None:
+        kinds = ("sweep",) if isinstance(summary, SweepSummary) else tuple(TRIALS)
     outer = {"object": summary.object, "environment": summary.environment, "model": summary.model}
     rows = []
     with Store(folder / NAME, read_only=True) as store:
@@ -413,15 +403,16 @@ def import_library(name: str) -> Any:
 
 def condition_rows(conditions: RuleConditions, factors: Sequence[Factor]) -> list[ConditionRow]:
     """Return conditions with the names of their factors."""
-    return [_condition_row(one, factors[one.place]) for one in conditions]
-
-
-def _condition_row(one: RuleCondition, factor: Factor) -> ConditionRow:
-    return ConditionRow(
-        parameter=factor.name,
-        unit=factor.unit,
-        over=one.low if np.isfinite(one.low) else None,
-        at_most=one.high if np.isfinite(one.high) else None,
-        options=[factor.options[number] for number in sorted(one.options or ())],
-        text=one.text(factor),
-    )
+    rows = []
+    for one in conditions:
+        factor = factors[one.place]
+        row = ConditionRow(
+            parameter=factor.name,
+            unit=factor.unit,
+            over=one.low if np.isfinite(one.low) else None,
+            at_most=one.high if np.isfinite(one.high) else None,
+            options=[factor.options[number] for number in sorted(one.options or ())],
+            text=one.text(factor),
+        )
+        rows.append(row)
+    return rows

@@ -88,18 +88,9 @@ class RunDirectory:
 
     @classmethod
     def create(cls, run: str | Path | None = None, *, overwrite: bool = False, default: str = "attack") -> RunDirectory:
-        """Make the directory of a new run and lock it.
-
-        Args:
-            run: a name (kept in ``runs/``), a path, or None for ``runs/<default>-NNN`` with the next free number.
-            overwrite: replace the run that is there. Only a directory that advsearch wrote is touched, and in it only
-                what advsearch writes.
-            default: see `run`; `default_name` makes one.
-
-        Raises:
-            RunExistsError: there is something already.
-            InputError: another process works on this run.
-        """
+        """Make the directory of a new run, by name (kept in ``runs/``), path, or None for ``runs/<default>-NNN`` with
+        the next free number, and lock it; RunExistsError if there is something already. With `overwrite`, only a
+        directory that advsearch wrote is touched, and in it only what advsearch writes."""
         path = _numbered(default) if run is None else run_path(run)
         check_free(path, overwrite=overwrite)
         with storage_errors(path):

@@ -187,7 +187,6 @@ def _as(value: Any, wanted: Any, pyarrow: Any) -> Any:
 DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
 
 LARGEST = 4 << 30
-"""Most bytes of a `details.log`."""
 
 LONGEST = 1 << 20
 """Most bytes of one of its lines."""
@@ -200,16 +199,9 @@ _PLACED = ("environment", "object")
 
 
 def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callable[[int], bytes | None]) -> int:
-    """Write the rows of a sweep as such a folder, and return how many there were.
-
-    ``loss`` holds the margin: how wrong an answer is, over 0 where it is not right. The parameter ``network`` tells
-    what several networks answer apart.
-
-    Args:
-        rows: yields the rows from the first, as often as it is called.
-        out: the folder; made, or empty.
-        picture: the PNG of a row by its number, None where none was kept.
-    """
+    """Write the rows of a sweep as such a folder, made or empty, with the PNG of each, where one was kept, and return
+    how many there were. ``loss`` holds the margin: how wrong an answer is, over 0 where it is not right. The parameter
+    ``network`` tells what several networks answer apart."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
     names, classes = dict[str, None](), _Classes()

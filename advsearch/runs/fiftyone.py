@@ -27,7 +27,6 @@ VERSION = "1.0.0"
 """Of FiftyOne, whose form is written."""
 
 MASK, GROUND_TRUTH, PREDICTION, PREDICTIONS = "object_mask", "ground_truth", "prediction", "predictions"
-"""Fields with labels."""
 
 LARGEST = 1 << 28
 """Most bytes of a picture, or of the layers beside one."""
@@ -53,17 +52,11 @@ class Pictured:
 
 
 def write_fiftyone(samples: Callable[[], Iterable[Pictured]], out: Path, name: str, label: str) -> int:
-    """Write a dataset, and return how many samples it has.
-
-    A sample has the fields `kind`, `step`, `correct`, `margin`, `objective` and `success` as a row has them;
-    `prediction`, a classification; of detection `ground_truth` and `predictions`, with boxes as shares of the picture;
-    `object_mask`, a segmentation, where layers were kept; and each value under its name with `_` for what FiftyOne does
-    not take, its unit in the description. It is tagged "right" or "wrong".
-
-    Args:
-        samples: yields them from the first, as often as it is called.
-        out: the folder; made, or empty.
-    """
+    """Write a dataset, and return how many samples it has; the samples are asked for as often as it takes, and the
+    folder is made, or empty. A sample has the fields `kind`, `step`, `correct`, `margin`, `objective` and `success` as
+    a row has them; `prediction`, a classification; of detection `ground_truth` and `predictions`, with boxes as shares
+    of the picture; `object_mask`, a segmentation, where layers were kept; and each value under its name with `_` for
+    what FiftyOne does not take, its unit in the description. It is tagged "right" or "wrong"."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
     fields = _ValueFields()

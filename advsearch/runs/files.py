@@ -60,13 +60,9 @@ def placed_by(setting: str) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a path to write to; when the block ends well its file takes the place of `path` in one step.
-
-    When the block raises, or the process is killed, `path` is as it was before. Missing folders are made.
-
-    Args:
-        durable: wait until the file is on the disk and survives a power cut; some 10 ms.
-    """
+    """Yield a path to write to; when the block ends well its file takes the place of `path` in one step. When it
+    raises, or the process is killed, `path` is as it was before. Missing folders are made. A `durable` file survives a
+    power cut; that takes some 10 ms."""
     part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
     try:
         with storage_errors(path):
@@ -168,7 +164,6 @@ def _refusal(error: OSError, folder: Path, owner: str) -> Exception:
 DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
 
 LARGEST = 64 << 30
-"""Most bytes of it."""
 
 APPLICATION_ID = 0x41445653
 """In the header of every results.sqlite that is ours: "ADVS"."""

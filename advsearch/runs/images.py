@@ -22,10 +22,8 @@ Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
 
 DIFFERENCE_GAIN = 5.0
-"""How much `difference` magnifies."""
 
 ANIMATION_BYTES = 3_000_000
-"""Largest animation that is written."""
 
 ANIMATION_FRAMES = 60
 """Most frames of an animation; of more, every second, third, ... is shown, and always the last."""

@@ -16,18 +16,9 @@ from advsearch.settings import read_yaml
 
 @dataclass(frozen=True)
 class Listed:
-    """One run.
-
-    Attributes:
-        command: that made it.
-        object: what the model should recognise; empty where a command has none.
-        controls: what could change.
-        state: ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending.
-        answer: what came out, in a few words.
-        kinds: how many rows there are of each kind.
-        begun: whether its settings are there, without which it cannot be resumed.
-        when: it was begun, seconds since 1970 (UTC); None where that is not known.
-    """
+    """One run in its folder: the command that made it, what the model should recognise, what could change, rows by
+    kind; ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending; the answer
+    in a few words; whether it has begun, so that it can be resumed; and when, seconds since 1970 (UTC), if known."""
 
     name: str
     path: str

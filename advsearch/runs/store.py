@@ -96,17 +96,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Told:
-    """What an evaluation told its search beside its row. A policy's state follows from what it has been told, so a
-    search goes on by being told all of that again.
-
-    Attributes:
-        number: its place among the evaluations of its search.
-        u: digest of the configuration.
-        non_finite: numbers of the gradient that were not.
-        cost: in evaluations.
-        gradient: (d,) float32; None where none was wanted.
-        picture: (H, W, 3) uint8; None where it is not kept.
-    """
+    """What an evaluation told its search beside its row: the digest of the configuration, how many numbers of the
+    gradient were not finite, the cost in evaluations, and, where it is kept, a gradient (d,) float32 and a picture (H,
+    W, 3) uint8. A policy's state follows from what it has been told, so a search goes on by being told all of that
+    again."""
 
     number: int
     u: bytes
@@ -141,13 +134,9 @@ class Store:
             check_schema(self._db, path)
 
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
-        """Add rows in one transaction; they survive a kill of the process when this returns.
-
-        A row whose kind and step are there already changes nothing. What it `told` is that of the last one.
-
-        Raises:
-            StorageError: the disk is full or can't be written; none of these rows is kept.
-        """
+        """Add rows in one transaction; they survive a kill of the process when this returns, and where the disk is full
+        none of them is kept. A row whose kind and step are there already changes nothing. What it `told` is that of the
+        last one."""
         began, stamp = time.monotonic(), time.time()
         force = began >= self._next_sync
         with storage_errors(self.path):

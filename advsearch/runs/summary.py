@@ -30,7 +30,6 @@ from advsearch.settings.configuration import FILES
 NAME = "summary.json"
 
 LARGEST = 64 << 20
-"""Most bytes of a summary."""
 
 
 def to_json(result: Result) -> str:
@@ -82,7 +81,6 @@ ANSWER = "answer.npy"
 FOLDER = "artifacts"
 
 LARGEST_ANSWER = 1 << 30
-"""Most bytes of one."""
 
 MAGIC = b"\x93NUMPY\x01\x00"
 """How a file of numpy's begins, of version 1.0."""

@@ -20,7 +20,6 @@ PACKAGES = {"mlflow": "mlflow", "tensorboard": "tensorboard.summary", "wandb": "
 """The trackers, and what of each is imported."""
 
 NUMBERS = ("objective", "score", "margin", "correct", "success", "probability")
-"""Of a row."""
 
 PATIENCE = 10.0
 """Seconds that the end of a run waits for what is still to be told."""
@@ -29,7 +28,6 @@ WAITING = 10_000
 """Messages that may wait; further ones are not told."""
 
 LONGEST = 250
-"""Characters of a setting."""
 
 PROJECT = "advsearch"
 
@@ -168,4 +166,3 @@ OPEN: Mapping[str, Callable[[Any, Path, Mapping[str, str]], Backend]] = {
     "tensorboard": _Tensorboard,
     "wandb": _Wandb,
 }
-"""What opens a run in each."""

@@ -22,19 +22,14 @@ from advsearch.attacks.objective_functions import (
     SUREST,
     cross_entropy,
     dlr,
+    feature_distance,
     log_odds,
     targeted_cross_entropy,
     targeted_dlr,
     targeted_log_odds,
     targeted_margin,
 )
-from advsearch.attacks.objectives import (
-    OBJECTIVE_KINDS,
-    asked_by,
-    check_objective,
-    feature_distance,
-    objective_summaries,
-)
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective, objective_summaries
 from advsearch.engine import objective
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import load_model

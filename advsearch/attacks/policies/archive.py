@@ -56,17 +56,9 @@ MEMORY = 300
 
 @dataclass(frozen=True, eq=False)
 class ArchiveState:
-    """Where the search stands.
-
-    Attributes:
-        spanned: (k,) positions in u of the parameters that span the archive.
-        half: (d,) half of each number's range.
-        archive: that of ribs; never written to again.
-        points: (n, d) float32, this generation's configurations.
-        values: objectives of the first of them.
-        wrong: whether each of these was a success.
-        seen: what the surrogate is made from; None where there are too many numbers, or a norm ball.
-    """
+    """Where the search stands: positions (k,) in u of what spans the archive, half of each number's range (d,), the
+    archive of ribs, which is never written to again, this generation's configurations (n, d), objectives and successes
+    of the first of them, and what the surrogate is made from; None where there are too many numbers, or a norm ball."""
 
     domain: Domain
     seed: int

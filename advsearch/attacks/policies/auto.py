@@ -78,16 +78,9 @@ class Tried:
 
 @dataclass(frozen=True, eq=False)
 class AutoState:
-    """Where the search stands.
-
-    Attributes:
-        seen: where the box coordinates, which are screened, have been, the norm balls at their start.
-        screen: (m, k) where the screen looks after the start.
-        ascent: of PGD, once it has begun.
-        climbing: whether the latest proposal was the ascent's.
-        last: the objective of the ascent's latest evaluation.
-        trial: what the latest proposal tried, if it did.
-    """
+    """Where the search stands: where the screened box coordinates have been, with norm balls at their start, where the
+    screen (m, k) looks next, the renders spent, and, once it has begun, the ascent of PGD, its latest objective and
+    what the latest proposal tried, if it did."""
 
     domain: Domain
     seen: Observed

@@ -21,23 +21,11 @@ from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed,
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
-NARROWEST, WIDEST = 1e-4, 2.0
-"""Bounds of the deviations, in half ranges."""
-
 
 @dataclass(frozen=True, eq=False)
 class NESState:
-    """Where the search stands. Samples are drawn again from their seeds, not kept.
-
-    Attributes:
-        scale: (d,) half range of each element.
-        wraps: (d,) whether leaving the bounds is coming round.
-        mean: (d,) of the distribution, in u.
-        deviation: (d,) of the distribution, in units of `scale`.
-        population: samples a generation, even.
-        generation: number of this one.
-        values: objectives of its samples so far.
-    """
+    """Where the search stands: half ranges (d,), the mean (d,) in u and deviation (d,) in half ranges of the
+    distribution, and the objectives of the generation so far. Samples are drawn again from their seeds, not kept."""
 
     domain: Domain
     seed: int
@@ -166,19 +154,10 @@ Doubles = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class CMAESState:
-    """Where the search stands.
-
-    Attributes:
-        origin: (d,) where this run began.
-        scale: (d,) length of the unit of pycma's coordinates: u = P(origin + scale * x).
-        wraps: (d,) where leaving the bounds costs nothing.
-        strategy: pycma's, as it is after the latest `ask`; never written to again.
-        points: (n, d) this generation's coordinates x.
-        values: objectives of the first of them.
-        outside: for each of these its squared distance from the domain, a mean over elements, in x.
-        best: the largest objective of this run.
-        before: the largest objective of the runs before, and the distribution at the end of the one that met it.
-    """
+    """Where the search stands. u = P(origin + scale * x) for coordinates x of pycma, whose strategy, as it is after the
+    latest `ask`, is never written to again; of this generation's points (n, d) in x, the first have values and squared
+    distances from the domain, means over elements (`outside`). `before` is the largest objective of the runs before,
+    with the distribution at the end of the one that met it."""
 
     domain: Domain
     seed: int

@@ -18,13 +18,11 @@ MOST = 50
 """More numbers are refused: there would never be enough draws to learn from."""
 
 WINDOW = 1000
-"""The latest so many draws are learnt from."""
 
 ELITE, FEWEST = 0.1, 10
 """Where fewer draws failed, those with the largest objectives stand in for failures: a tenth of them, ten at least."""
 
 ROUNDS = 8
-"""Of expectation and maximisation, a generation."""
 
 EVEN, PRIOR = 12**-0.5, 3.0
 """Deviation of the even distribution in shares of a range; it counts for so many draws of each component, so that what
@@ -92,14 +90,9 @@ class Components:
 
 @dataclass(frozen=True, eq=False)
 class MixtureState:
-    """Where the search stands.
-
-    Attributes:
-        learnt: the mixtures of the generations in the window, this one's last; None of an even one.
-        points: (n, d) this generation's draws in shares of each range.
-        seen: (m, d) the draws that were evaluated, the latest `WINDOW` of them.
-        log: (all draws, 5) of these objective, failed, unknown, weight and largest weight; see `failure_share`.
-    """
+    """Where the search stands: the mixtures of the generations in the window (None of an even one), this generation's
+    draws (n, d) and the latest `WINDOW` that were evaluated (m, d), in shares of each range, and of all draws
+    objective, failed, unknown, weight and largest weight; see `failure_share`."""
 
     domain: Domain
     seed: int

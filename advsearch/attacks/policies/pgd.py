@@ -99,16 +99,9 @@ class Peak:
 
 @dataclass(frozen=True)
 class Window:
-    """The objectives since the last checkpoint, and what was true there.
-
-    Attributes:
-        length: evaluations until the next checkpoint.
-        values: objectives since the last one.
-        before: the objective just before `values`; NaN at the start.
-        improved: how many of `values` exceed their predecessor.
-        best: best objective at the last checkpoint; without noise, of the window before it.
-        halved: whether the step size was halved there.
-    """
+    """The objectives since the last checkpoint, so many until the next, and the one before them, NaN at the start; how
+    many exceed their predecessor; the best at the checkpoint, without noise of the window before it; and whether the
+    step size was halved there."""
 
     length: int
     values: tuple[float, ...] = ()
@@ -122,11 +115,8 @@ class Window:
         return replace(self, values=(*self.values, value), improved=self.improved + (value > last))
 
     def stalled(self, best: float) -> bool:
-        """Return whether the step size is due for halving; `best` is the best objective by now.
-
-        Either too few steps improved the objective, or the best has not moved since the last checkpoint although the
-        step size was kept there (conditions 1 and 2 of Auto-PGD).
-        """
+        """Return whether the step size is due for halving: too few steps improved the objective, or the best has not
+        moved since the last checkpoint although the step size was kept there (conditions 1 and 2 of Auto-PGD)."""
         return self.improved < IMPROVING * len(self.values) or (not self.halved and best <= self.best)
 
     def lags(self, best: float) -> bool:
@@ -143,19 +133,10 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class PGDState:
-    """Where an ascent stands.
-
-    Attributes:
-        steps: evaluations that the renders suffice for.
-        u: (d,) what to propose next.
-        direction: (d,) accumulated gradient.
-        first: the objective at the start; NaN before it is known.
-        step_size: in units of each block's radius, before it falls.
-        flat: evaluations in a row whose gradient was zero.
-        idle: windows in a row that added nothing; counted without noise only.
-        lengths: of the latest gradients, as `clipped` wants them.
-        counts: outliers cut and steps taken back so far.
-    """
+    """Where an ascent of so many evaluations stands: u (d,) to propose next, the accumulated gradient (d,), the
+    objective at the start, the step size in units of each block's radius, evaluations in a row whose gradient was zero
+    (`flat`), windows in a row that added nothing (`idle`, without noise only), and lengths of gradients as `clipped`
+    wants them."""
 
     domain: Domain
     steps: int
@@ -325,20 +306,9 @@ def _step(state: PGDState, u: Tensor, direction: Tensor) -> PGDState:
 
 @dataclass(frozen=True, eq=False)
 class AdamState:
-    """Where the ascent stands.
-
-    Attributes:
-        steps: evaluations that the renders suffice for.
-        scale: (d,) half range of each element, the unit of a step.
-        u: (d,) what to propose next.
-        mean: (d,) decaying mean of the gradients.
-        square: (d,) decaying mean of their squares.
-        flat: evaluations in a row whose gradient was zero.
-        best: the largest objective so far.
-        peak: (d,) where it was met.
-        lengths: of the latest gradients, as `clipped` wants them.
-        counts: outliers cut and steps taken back so far.
-        shrunk: what the rate is multiplied by; half of it is gone after every objective that could not be computed.
+    """Where an ascent of so many evaluations stands: half ranges (d,), the unit of a step, u (d,) to propose next,
+    decaying means (d,) of the gradients and of their squares, gradients so far (`taken`), the best objective and its
+    peak (d,), and what the rate is multiplied by; half of it is gone after every objective that could not be computed.
     """
 
     domain: Domain

@@ -146,16 +146,8 @@ class Scales:
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """A fitted process.
-
-    Attributes:
-        space: measures distances.
-        x: (n, k) points of the unit box.
-        scales: see there.
-        factor: (n, n) Cholesky factor of the kernel matrix with noise, signal variance 1.
-        weights: (n,) its inverse times the centred values.
-        mean, variance: of the signal.
-    """
+    """A fitted process at points (n, k) of the unit box: the Cholesky factor (n, n) of the kernel matrix with noise, of
+    signal variance 1; its inverse times the centred values (n,); mean and variance of the signal."""
 
     space: Coordinates
     x: Tensor
@@ -176,14 +168,9 @@ class Surrogate:
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What was evaluated, and the process behind it.
-
-    Attributes:
-        points: (n, k) in the unit box.
-        values: the n objectives there; what could not be evaluated is not finite.
-        scales: of the process, fitted to the first `fitted` points.
-        memory: so many of the best points and so many of the latest count; for the scales `MEMORY`.
-    """
+    """What was evaluated, points (n, k) and n objectives, not finite where it could not be, and the scales of the
+    process behind it, fitted to the first `fitted`. The best and the latest points count, so many of each; for the
+    scales `MEMORY`."""
 
     space: Coordinates
     points: Tensor

@@ -204,12 +204,9 @@ def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes
 
 
 def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
-    """Bind every scene once, so that what is wrong is said before anything is rendered.
-
-    Returns:
-        The points of the first scene, and what the table shows of the draws: shares of the range where scenes, or
-        pictures of different shapes, have different ones.
-    """
+    """Bind every scene once, so that what is wrong is said before anything is rendered. Returns the points of the first
+    scene, and what the table shows of the draws: shares of the range where scenes, or pictures of different shapes,
+    have different ones."""
     bound = []
     for place in job.places:
         spaces = list(job.spaces(place).values())

@@ -114,15 +114,9 @@ def _axis_by_key(control: type[Control], name: str, given: Any) -> Axis:
 
 
 def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, ...]:
-    """Return the values of an axis, checked.
-
+    """Return the values of an axis, checked, from a text, a value, or a list; errors name `where`.
     ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both included; of a periodic parameter over
-    a whole turn, LAST would repeat FIRST and is left out.
-
-    Args:
-        where: what errors name: ``"`grid` pose.yaw"``.
-        given: the text, a value, or a list of values.
-    """
+    a whole turn, LAST would repeat FIRST and is left out."""
     values: Sequence[Any]
     if isinstance(given, str) and ":" in given and not parameter.options:
         values = _spaced(where, parameter, given)

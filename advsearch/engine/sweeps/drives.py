@@ -27,7 +27,6 @@ FEWEST, RESAMPLES, CONFIDENCE = 5, 2000, 0.95
 """Drives that an interval needs, and samples of the bootstrap."""
 
 ANIMATED = 60
-"""Frames of the animation at most."""
 
 UNKNOWN = -1
 

@@ -32,17 +32,10 @@ from advsearch.report.wording import count
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
+from advsearch.runs.results import sweep as results
 from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork
 from advsearch.runs.results.base import Formation
-from advsearch.runs.results.sweep import (
-    BesideAnswer,
-    DriveRates,
-    SurfaceMap,
-    SweepSummary,
-    WorstClaim,
-    WorstConfiguration,
-    WorstVerified,
-)
+from advsearch.runs.results.sweep import WorstConfiguration, WorstVerified
 from advsearch.runs.store import Row
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
@@ -56,7 +49,6 @@ PICTURE_SPP = 64
 """Samples a pixel of the picture that is kept, unless verification needed more."""
 
 TELL_SECONDS = 0.1
-"""Least time between two reports of progress."""
 
 MOST_WAITING = 10_000
 """Batches that wait for an earlier one to be counted; where there are more, all rows are counted again at the end."""
@@ -91,8 +83,8 @@ class Sweep:
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
         self._told, self._untold, self._begun = 0.0, 0, 0.0
-        self._surface: SurfaceMap | None = None
-        self._drives: list[DriveRates] | None = None
+        self._surface: results.SurfaceMap | None = None
+        self._drives: list[results.DriveRates] | None = None
         objects, environments = (
             list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
         )
@@ -314,7 +306,7 @@ class Sweep:
         number, model = divmod(index, self.models)
         return self.job.queries(range(number, number + 1))[model][2], model
 
-    def _driven(self) -> list[DriveRates] | None:
+    def _driven(self) -> list[results.DriveRates] | None:
         """What is said of whole drives, where frames of a path were swept; the worst of them is kept."""
         if time_axis(self.job.axes) is None:
             return None
@@ -332,10 +324,11 @@ class Sweep:
         predicting = self._transport.values() or [[one.summary() for one in (view.light.values() if view else ())]]
         swept = seconds.get("sweep", 0.0)
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
-        gains, models = self._gains() if formation else {}, [model.name for model in job.models]
+        gains = self._gains() if formation else {}
+        models, answer = [model.name for model in job.models], job.places[-1].answer
         if formation is not None and len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
-        summary = SweepSummary(
+        summary = results.SweepSummary(
             run=None if self.run is None else str(self.run.path),
             object=job.config.object,
             model=",".join(models),
@@ -352,7 +345,7 @@ class Sweep:
             answers=tally.frequent(),
             axes=tally.table(),
             cells=tally.map(),
-            beside=BesideAnswer(answer=job.places[-1].answer, pairs=tally.beside(models)) if self._pairs else None,
+            beside=results.BesideAnswer(answer=answer, pairs=tally.beside(models)) if self._pairs else None,
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
@@ -405,8 +398,8 @@ class Sweep:
         return remarks
 
 
-def _claim_of(seen: Judgement) -> WorstClaim:
-    return WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload)
+def _claim_of(seen: Judgement) -> results.WorstClaim:
+    return results.WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload)
 
 
 def carry_out(job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None) -> SweepResult:

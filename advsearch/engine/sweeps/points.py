@@ -89,19 +89,9 @@ def parts_of_ranges(pictures: int) -> int:
 
 
 class Points:
-    """The configurations of one scene.
-
-    Args:
-        domain: their budgets; the start is the scene as it is.
-        samples: pictures at each point of the grid.
-        scenes: number of scenes after which the draws come again, so that what is compared has the same; 0 for never.
-        among: how many scenes the sweep has.
-
-    Attributes:
-        parts: into how many the range of a drawn parameter is cut.
-        grid: sizes of the axes and the number of points.
-        drawn: what the table shows of the draws.
-        drawn_numbers: how many numbers a draw has, and which of them the table shows; the same for all scenes.
+    """The configurations of one scene `among` several, so many samples at each point of the grid, from a start that is
+    the scene as it is. After so many scenes the draws come again, so that what is compared has the same; 0 for never.
+    `drawn` is what the table shows of the draws, in `parts` of each range; `drawn_numbers` is the same for all scenes.
     """
 
     def __init__(

@@ -118,19 +118,9 @@ class SweptPicture:
 
 @dataclass
 class SweptPredictor(ABC):
-    """Predicts pictures of one scene at one size.
-
-    Args:
-        score: what a comparison says in logits.
-        specialise: whether anything may be left out.
-        before: pictures of the scenes before.
-
-    Attributes:
-        reason: why every picture is rendered; None if none is, and empty where nothing moves that it follows.
-        deviations: what comparisons found, of the groups that were made.
-        seconds: spent on what predicts and on comparing.
-        left: groups in which a prediction was too far off, so that they are rendered.
-    """
+    """Predicts pictures of one scene at one size; `before` it the other scenes have so many. Every picture is rendered
+    for a `reason`, if there is one, which is empty where nothing moves that it follows, and in groups that are `left`
+    since a prediction was too far off. `score` says what a comparison does in logits."""
 
     way: ClassVar[str]
     samples: ClassVar[int]

@@ -32,7 +32,6 @@ from advsearch.viewer import thumbnails
 from advsearch.viewer.sweep_page import write_sweep_page
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
-"""How a sweep ends."""
 
 WRONG, RIGHT = 1, 2
 """Of a configuration of a pair; 0: not seen yet."""
@@ -89,48 +88,37 @@ class Cells:
         self.rest = [name for name, _, _ in axes[2:]]
         self.shown = len(axes) > 1 and len(axes[0][2]) * len(axes[1][2]) <= MOST_CELLS
         wide, high = (len(values) for _, _, values in self._axes) if self.shown else (0, 0)
-        self._seen = [[0] * wide for _ in range(high)]
-        self._correct = [[0] * wide for _ in range(high)]
-        self._finite = [[0] * wide for _ in range(high)]
-        self._margin = [[0.0] * wide for _ in range(high)]
+        self._counts = np.zeros((3, high, wide), np.int64)  # seen, right, with a margin that is a number
+        self._margin = np.zeros((high, wide))
 
     def add(self, places: Sequence[int], trial: Judgement) -> None:
-        if not self.shown:
-            return
-        column, row = places[0], places[1]
-        self._seen[row][column] += 1
-        self._correct[row][column] += trial.right
-        if trial.margin == trial.margin:
-            self._finite[row][column] += 1
-            self._margin[row][column] += trial.margin
+        if self.shown:
+            column, row, told = places[0], places[1], trial.margin == trial.margin
+            self._counts[:, row, column] += (1, trial.right, told)
+            if told:
+                self._margin[row, column] += trial.margin
 
     def drawn(self) -> SweepMap | None:
         if not self.shown:
             return None
-        pairs = [zip(sums, counts, strict=True) for sums, counts in zip(self._margin, self._finite, strict=True)]
+        seen, right, told = self._counts.tolist()
         first, second = (MapAxis(axis=name, unit=unit, values=list(values)) for name, unit, values in self._axes)
         return SweepMap(
             axes=(first, second),
             over=self.rest,
-            configurations=self._seen,
-            correct=self._correct,
-            margin=[[total / count if count else None for total, count in row] for row in pairs],
+            configurations=seen,
+            correct=right,
+            margin=[
+                [total / count if count else None for total, count in zip(*rows, strict=True)]
+                for rows in zip(self._margin.tolist(), told, strict=True)
+            ],
         )
 
 
 class Tally:
-    """What has been counted so far.
-
-    Args:
-        outer: name and values of the axes outside the scene: object, environment, model.
-        drawn: what the table shows of the draws.
-        pairs: configurations without an answer, each of which comes again with it, so many numbers later; 0 for none.
-
-    Attributes:
-        not_finite: those whose margin was not a number; they count as not right.
-        worst: the number of the configuration with the largest margin, with what was seen there; the first of equals.
-        answers: how often each wrong answer was given.
-    """
+    """What has been counted so far, by the axes outside the scene (object, environment, model), those of the grid, and
+    what is drawn. Each of so many pairs without an answer comes again with it, so many numbers later. The first
+    configuration of the largest margin is the worst; a margin that is no number counts as not right."""
 
     def __init__(
         self, outer: Sequence[tuple[str, Sequence[str]]], axes: Sequence[Axis], drawn: Sequence[Drawn], pairs: int = 0

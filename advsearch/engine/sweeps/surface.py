@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.special import ndtri, xlogy
+from scipy.special import xlogy
 
 from advsearch import seeds
 from advsearch.attacks.draws import batches
-from advsearch.attacks.trials import CONFIDENCE
+from advsearch.attacks.trials import wilson
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of
 from advsearch.engine.sweeps import Job
@@ -69,15 +69,9 @@ class PartCounts:
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """What n parts have to do with the answers. Numbers are NaN where a part was not compared.
-
-    Attributes:
-        compared: (n,) bool.
-        difference: (n,) share of wrong answers where the part holds less that where it does not, in [-1, 1].
-        low: (n,) lower end of its 95 % interval, for the part by itself.
-        high: (n,) upper end.
-        p: (n,) how likely it is that by chance any part stands out as far, in (0, 1].
-    """
+    """What n parts have to do with the answers, (n,) each, NaN where a part was not compared: the share of wrong
+    answers where it holds less that where it does not, both ends of the 95 % interval for the part by itself, and how
+    likely it is that by chance any part stands out as far."""
 
     compared: npt.NDArray[np.bool_]
     difference: Doubles
@@ -123,17 +117,11 @@ def _likelihood_ratio(k: Counts, n: Counts, failures: int, pictures: int) -> Dou
 
 
 def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubles, Doubles, Doubles]:
-    (one, below, above), (two, under, over) = _wilson(k, n), _wilson(others, rest)
-    difference = one - two
+    one, two = k / n, others / rest
+    (below, above), (under, over), difference = wilson(one, n), wilson(two, rest), one - two
     low = difference - np.hypot(one - below, over - two)
     high = difference + np.hypot(above - one, two - under)
     return difference, low, high
-
-
-def _wilson(k: Counts, n: Counts) -> tuple[Doubles, Doubles, Doubles]:
-    z, share = float(ndtri((1.0 + CONFIDENCE) / 2.0)), k / n
-    middle, half = share + z * z / (2 * n), z * np.sqrt(share * (1.0 - share) / n + z * z / (4.0 * n * n))
-    return share, (middle - half) / (1.0 + z * z / n), (middle + half) / (1.0 + z * z / n)
 
 
 LEAST = 5
@@ -149,13 +137,11 @@ APART = 0.1
 """Distance of two listed parts, in units of the object's largest extent, so that one spot is listed once."""
 
 FILE = "artifacts/surface.npz"
-"""Where the counts are kept in the folder of a run."""
 
 SIDES = ((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (270.0, 20.0), (0.0, 80.0), (0.0, -60.0))
 """Azimuth and elevation of the cameras that show the object in colours, degrees."""
 
 SIDE_PIXELS = 240
-"""Width and height of these pictures."""
 
 UNKNOWN = -1
 """Stands for the answer to a picture of which there is no row."""

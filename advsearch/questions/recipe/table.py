@@ -20,8 +20,8 @@ from advsearch.explanations import (
     PHOTOGRAPHS,
     TRIAL,
     Answered,
-    answered,
     figure_value,
+    rows_of,
 )
 from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO
 from advsearch.questions.recipe.answer import NamedCount, RecipeFigure
@@ -114,7 +114,7 @@ def most_frequent(rows: Iterable[Answered]) -> list[tuple[str, int]]:
 def photographs_of(folder: Path, summary: SweepSummary) -> list[Answered]:
     """Return the answers about the photographs that a sweep has, as `rows_of` does: one that was aligned with a
     rendering has all values of that, others have no parameters."""
-    return answered(PHOTOGRAPHS, folder, summary, (PHOTO, LOOSE_PHOTO))
+    return rows_of(PHOTOGRAPHS, folder, summary, (PHOTO, LOOSE_PHOTO))
 
 
 CONFIDENCE = 0.95
