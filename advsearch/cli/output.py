@@ -248,6 +248,7 @@ def output_kept_clean() -> Iterator[None]:
 def shown_text(result: Result) -> str:
     """Return what is shown of an answer as text: what it says, its parts, by what it came about, and notes."""
     # late, so that --help answers at once
+    from advsearch.cli.flags import with_flags
     from advsearch.report.shown import facts_of, remarks_of, shown
     from advsearch.runs.directory import REPORT
 
@@ -258,7 +259,7 @@ def shown_text(result: Result) -> str:
             continue
         table = aligned([one.heads, *one.rows] if one.heads else one.rows)
         pictures = [[picture.file, picture.caption] for group in one.pictures for picture in group]
-        inside = [*one.text, "\n".join(filter(None, [table, aligned(pictures)]))]
+        inside = [*map(with_flags, one.text), "\n".join(filter(None, [table, aligned(pictures)]))]
         parts.append("\n".join(filter(None, [one.title, "\n\n".join(filter(None, inside))])))
     facts = [[name.lower(), text] for name, text in facts_of(result, given).items()]
     parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))

@@ -26,6 +26,7 @@ from advsearch.errors import ClusterError, FileFormatError, InputError
 
 psutil: Any = import_module("psutil")  # which Dask brings along
 dask: Any = import_module("dask")
+import_module("distributed")  # first: what it adds to the configuration would go again with what a test sets there
 SCRIPTS = Path(sys.executable).parent
 
 

@@ -62,11 +62,11 @@ def covered(control: BoundPatch, side: int = 32) -> np.ndarray:
 @pytest.mark.parametrize("name", only(["mug", "book", "hammer"], list_objects()))
 def test_texels_know_their_place_on_every_object(name: str) -> None:
     mesh = load_object(name).mesh
-    charts = rasterised(mesh, 256)
+    charts = rasterised(mesh, side := 512)
     uvs = np.einsum("hwk,hwkc->hwc", charts.weights, mesh.uvs[mesh.faces[charts.face]])
-    rows, columns = np.mgrid[:256, :256]
-    wanted = np.stack([(columns + 0.5) / 256, 1.0 - (rows + 0.5) / 256], axis=-1)
-    np.testing.assert_allclose(256 * uvs[charts.covered], 256 * wanted[charts.covered], atol=0.01)
+    rows, columns = np.mgrid[:side, :side]
+    wanted = np.stack([(columns + 0.5) / side, 1.0 - (rows + 0.5) / side], axis=-1)
+    np.testing.assert_allclose(side * uvs[charts.covered], side * wanted[charts.covered], atol=0.01)
     corners = mesh.vertices[mesh.faces].astype(float)
     total = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     assert float(charts.areas().sum()) == pytest.approx(total, rel=0.02)
