@@ -154,11 +154,13 @@ class _SuiteRun:
             return self._not_tried(one, NOT_TRIED)
         if self.trial.late():
             return self._not_tried(one, f"{TIME_OVER} before it began")
+        asked, begun = self._not_tried(one, ""), time.perf_counter()
         if one.one is None:
-            found = self.trial.claim(one.name, self.suite.claims[one.name], one.config)
+            found = self.trial.claim(asked, self.suite.claims[one.name], one.config)
         else:
             assert isinstance(one.config, AttackConfig)
-            found = self.trial.counterexample(one.one, one.config)
+            found = self.trial.counterexample(asked, one.one, one.config)
+        found = found.model_copy(update={"seconds": time.perf_counter() - begun})
         if TIME_OVER not in found.reason and found.reason != STOPPED:
             results.put(key, found.to_dict())
         if found.reason == STOPPED:
