@@ -233,7 +233,16 @@ class Transfer:
     def clean(self) -> list[MatrixModel]:
         """Try the clean scene on every model."""
         self._begin("trying the clean scene on every model")
-        return [self._control(one) for one in self._conditions]
+        return [
+            MatrixModel(
+                model=one.name,
+                labels=list(one.problem.task.truth_names(one.problem.truth())),
+                input_size=_size(one.problem),
+                spp=one.spp,
+                clean=control_group(self._retrials.clean(one), one.spp),
+            )
+            for one in self._conditions
+        ]
 
     def on_each(self, attacked: str, u: Tensor) -> list[MatrixCell]:
         """Try the answer (d,) to one model on every model."""
@@ -246,16 +255,6 @@ class Transfer:
 
     def _begin(self, title: str) -> None:
         self._progress.stage(title, self._each, hint=f"{self._each} answers; `trials` or `verify_spp` shorten it")
-
-    def _control(self, one: RetrialCondition) -> MatrixModel:
-        problem = one.problem
-        return MatrixModel(
-            model=one.name,
-            labels=list(problem.task.truth_names(problem.truth())),
-            input_size=_size(problem),
-            spp=one.spp,
-            clean=control_group(self._retrials.clean(one), one.spp),
-        )
 
 
 def _size(problem: Problem) -> tuple[int, int]:

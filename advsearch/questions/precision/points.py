@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
+from scipy.stats import linregress
 
 from advsearch.questions.precision.answer import PrecisionSlope, Recommended
 
@@ -263,13 +264,9 @@ def fit_line(points: Sequence[Point], against: Against = "samples", theory: Theo
 def straight_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
     """Return slope and offset of the least-squares line through (n,) and (n,), n at least 3, and half the slope's 95 %
     interval."""
-    count, across = len(x), x - x.mean()
-    spread = float(across @ across)
-    slope = float(across @ (y - y.mean())) / spread
-    offset = float(y.mean() - slope * x.mean())
-    rest = y - offset - slope * x
-    error = math.sqrt(float(rest @ rest) / (count - 2) / spread)
-    return slope, offset, float(stdtrit(count - 2, (1.0 + LEVEL) / 2.0)) * error
+    line = linregress(x, y)
+    half = float(stdtrit(len(x) - 2, (1.0 + LEVEL) / 2.0)) * float(line.stderr)
+    return float(line.slope), float(line.intercept), half
 
 
 def fixed_seconds(points: Sequence[Point]) -> float:

@@ -222,8 +222,9 @@ def replay_from_config(
         table = _Table(ways, u, config.trials, seed, run, progress)
         try:
             with interruptible():
-                for batch in _batches(ways):
-                    table.fill(batch)
+                table.fill([number for number, way in enumerate(ways) if way.shares])
+                for number in (number for number, way in enumerate(ways) if not way.shares):
+                    table.fill([number])
         except KeyboardInterrupt:
             ending = INTERRUPTED
         result = ReplayResult(
@@ -299,12 +300,6 @@ class _Table:
                 )
         finally:
             self.renders += sum(one.renders for one in renderers) - before
-
-
-def _batches(ways: Sequence[Way]) -> list[list[int]]:
-    """The places of the conditions that share their renders, and each of the others by itself."""
-    sharing = [number for number, way in enumerate(ways) if way.shares]
-    return [sharing, *([number] for number, way in enumerate(ways) if not way.shares)]
 
 
 def _changed(folder: Path, parts: AttackParts) -> list[str]:
