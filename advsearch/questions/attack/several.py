@@ -109,7 +109,8 @@ def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
     """How many objects are still recognised at an epsilon."""
     known = [row for row in rows if _known(row, epsilon)]
     wrong = sum(row.ending == "already wrong" for row in known)
-    found = sum(row.ending == "found" and _flips_within(row, epsilon) for row in known)
+    flipped = [row.flips_at for row in known if row.ending == "found"]
+    found = sum(epsilon is None or (isinstance(one, float) and one <= epsilon) for one in flipped)
     robust = len(known) - wrong - found
     return CurvePoint(
         epsilon=epsilon,
@@ -120,10 +121,6 @@ def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
         accuracy=robust / len(known) if known else None,
         interval=clopper_pearson(robust, len(known)) if known else (0.0, 1.0),
     )
-
-
-def _flips_within(row: ObjectRow, epsilon: float | None) -> bool:
-    return epsilon is None or (isinstance(row.flips_at, float) and row.flips_at <= epsilon)
 
 
 LEAST_SPP = 64

@@ -240,7 +240,7 @@ def fit_line(points: Sequence[Point], against: Against = "samples", theory: Theo
         sampling = [point for point in known if fixed <= MOSTLY_SAMPLING * point.seconds]
         holds = _counts(sampling) >= LEAST_POINTS
         known = sampling if holds else known
-    x = np.log([_across(point, against) for point in known])
+    x = np.log([float(one.setting.spp) if against == "samples" else one.seconds for one in known])
     y = np.log([point.error for point in known])
     slope, offset, half = straight_line(x, y)
     setting = known[0].setting
@@ -441,10 +441,6 @@ def _number_at(ordered: Sequence[Point], spp: int, what: Literal["seconds", "err
 
 def _counts(points: Sequence[Point]) -> int:
     return len({point.setting.spp for point in points})
-
-
-def _across(point: Point, against: Against) -> float:
-    return float(point.setting.spp) if against == "samples" else point.seconds
 
 
 def _agrees(slope: float, half: float, theory: Theory) -> bool | None:

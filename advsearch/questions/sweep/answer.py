@@ -96,7 +96,7 @@ def _table(name: str, rows: Sequence[AxisRow]) -> AnswerPart:
     lines = [
         [
             wording.value_text(row.value),
-            _bar(row.accuracy or 0.0),
+            "#" * (filled := round((row.accuracy or 0.0) * BAR)) + "." * (BAR - filled),
             percent(row.accuracy),
             f"{row.correct} of {row.configurations}",
             wording.interval_text(row.interval),
@@ -104,11 +104,6 @@ def _table(name: str, rows: Sequence[AxisRow]) -> AnswerPart:
         for row in listed
     ]
     return AnswerPart(title, rows=lines)
-
-
-def _bar(share: float) -> str:
-    filled = round(share * BAR)
-    return "#" * filled + "." * (BAR - filled)
 
 
 def _facts(summary: SweepSummary) -> dict[str, str]:

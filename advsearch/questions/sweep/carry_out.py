@@ -51,7 +51,6 @@ from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, fi
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import attack_of, read_answer
 from advsearch.scene.description import ENVIRONMENT
-from advsearch.scene.parameters import Parameter
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task
@@ -275,7 +274,10 @@ def _job(
     places = _beside_answer(config, places, drawn, axes)
     check_scenes(places, drawn, axes)
     sized = all(place.scene.description.object.metres is not None for place in places)
-    axes = tuple(replace(one, parameter=_in_units(one, sized)) for one in axes)
+    axes = tuple(
+        replace(one, parameter=measured_in(one.parameter, sized)) if one.control == CameraControl.kind else one
+        for one in axes
+    )
     made = make_task(task)
     networks, warnings = _models(models, config, made)
     scenes = [place.scene for place in places]
@@ -298,11 +300,6 @@ def _job(
         aovs=aovs_of(config.aov),
         warnings=tuple(dict.fromkeys(warnings)),
     )
-
-
-def _in_units(axis: Axis, metres: bool) -> Parameter:
-    """The parameter of an axis, as it is around objects that have a size in metres, or have not."""
-    return measured_in(axis.parameter, metres) if axis.control == CameraControl.kind else axis.parameter
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:

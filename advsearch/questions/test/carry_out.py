@@ -77,7 +77,11 @@ def test_from_config(
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage("reading the suite")
     noted = None if resumed is None else _noted(resumed)
-    described = (suite or _seeded(read_suite(config.suite), config)) if noted is None else noted
+    described = noted or suite
+    if described is None:
+        described = read_suite(config.suite)
+        seed = secrets.randbelow(2**31) if config.fresh else described.seed if config.seed is None else config.seed
+        described = described.model_copy(update={"seed": seed})
     seconds = config.seconds or described.seconds or math.inf
     added = None if config.add is None else add(config.suite, config.add)
     try:
@@ -218,11 +222,6 @@ def _noted(path: Path) -> Suite | None:
     with Store(path / STORE, read_only=True) as store:
         noted = store.noted(NOTE)
     return None if noted is None else suite_of(noted, f"{path}: the suite that it began with")
-
-
-def _seeded(suite: Suite, config: SuiteConfig) -> Suite:
-    seed = secrets.randbelow(2**31) if config.fresh else suite.seed if config.seed is None else config.seed
-    return suite.model_copy(update={"seed": seed})
 
 
 def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[PlannedClaim]:
