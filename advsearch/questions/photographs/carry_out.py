@@ -28,8 +28,17 @@ from advsearch.engine.turn import in_turn
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
-from advsearch.questions.photographs.answer import FOLDER, LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
-from advsearch.questions.photographs.serving import LARGEST, photo_name, rendering_file, sound_photo
+from advsearch.questions.photographs.answer import (
+    FOLDER,
+    LARGEST,
+    LOOSE_PHOTO,
+    PHOTO,
+    PhotoAgreement,
+    PhotographedRendering,
+    photo_name,
+    rendering_file,
+    sound_photo,
+)
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
