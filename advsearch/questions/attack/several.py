@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from advsearch import seeds
 from advsearch.api.studies import SETTLED, StudyRun, carry_out_study
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster.executor import Call, Executor
+from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, check_from_config, executor_for, problem_from_config
 from advsearch.engine.naming import different
@@ -35,7 +35,6 @@ from advsearch.questions.attack.answer import (
     MatrixRow,
     ObjectRow,
 )
-from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import StudyResult
 from advsearch.runs.summary import read_answer
@@ -167,11 +166,21 @@ def _matrix(config: AttackConfig, names: Sequence[str], study: StudyRun) -> tupl
                 with executor_for(
                     config, "advsearch.questions.attack.several:models_answering", study.progress
                 ) as executor:
-                    kept = (problems, study.run, study.progress, executor)
-                    tried = Transfer(*kept, trials=trials, spp=spp, seed=seed)
-                    models = tried.clean()
+                    conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
+                    retrials = Retrials(
+                        conditions, study.run, study.progress, trials=trials, seed=seed, executor=executor
+                    )
+                    each = trials * len(names)
+                    hint = f"{each} answers; `trials` or `verify_spp` shorten it"
+                    study.progress.stage("trying the clean scene on every model", each, hint=hint)
+                    models = [_model(one, retrials) for one in conditions]
                     for name, u in answers.items():
-                        cells[name] = tried.on_each(name, u)
+                        study.progress.stage(f"trying the answer to {name} on every model", each, hint=hint)
+                        checked = [(one.name, retrials.answer(name, u, one)) for one in conditions]
+                        cells[name] = [
+                            MatrixCell(model=model, ending=one.ending.value, verified=verified_rate(one))
+                            for model, one in checked
+                        ]
         except KeyboardInterrupt:
             study.interrupted = True
     rows = [
@@ -199,59 +208,14 @@ def _answer(summary: AttackSummary) -> Tensor | None:
     return torch.from_numpy(read_answer(Path(summary.run)))
 
 
-class Transfer:
-    """Tries answers on models.
-
-    Args:
-        problems: of each model, by its name; they have one space.
-        run: keeps the rows.
-        progress: told how far it is.
-        executor: of workers that make the pictures; None makes them here.
-        trials: of each answer on each model.
-        spp: samples a pixel.
-        seed: root of the trials.
-    """
-
-    def __init__(
-        self,
-        problems: Mapping[str, Problem],
-        run: RunDirectory,
-        progress: Progress,
-        executor: Executor | None,
-        *,
-        trials: int,
-        spp: int,
-        seed: int,
-    ) -> None:
-        self._conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
-        self._retrials = Retrials(self._conditions, run, progress, trials=trials, seed=seed, executor=executor)
-        self._progress, self._each = progress, trials * len(problems)
-
-    def clean(self) -> list[MatrixModel]:
-        """Try the clean scene on every model."""
-        self._begin("trying the clean scene on every model")
-        return [
-            MatrixModel(
-                model=one.name,
-                labels=list(one.problem.task.truth_names(one.problem.truth())),
-                input_size=_size(one.problem),
-                spp=one.spp,
-                clean=control_group(self._retrials.clean(one), one.spp),
-            )
-            for one in self._conditions
-        ]
-
-    def on_each(self, attacked: str, u: Tensor) -> list[MatrixCell]:
-        """Try the answer (d,) to one model on every model."""
-        self._begin(f"trying the answer to {attacked} on every model")
-        checked = {one.name: self._retrials.answer(attacked, u, one) for one in self._conditions}
-        return [
-            MatrixCell(model=name, ending=one.ending.value, verified=verified_rate(one))
-            for name, one in checked.items()
-        ]
-
-    def _begin(self, title: str) -> None:
-        self._progress.stage(title, self._each, hint=f"{self._each} answers; `trials` or `verify_spp` shorten it")
+def _model(one: RetrialCondition, retrials: Retrials) -> MatrixModel:
+    return MatrixModel(
+        model=one.name,
+        labels=list(one.problem.task.truth_names(one.problem.truth())),
+        input_size=_size(one.problem),
+        spp=one.spp,
+        clean=control_group(retrials.clean(one), one.spp),
+    )
 
 
 def _size(problem: Problem) -> tuple[int, int]:

@@ -172,15 +172,8 @@ NO_QR = "pip install segno"
 
 
 def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: str, elsewhere: str | None) -> str:
-    """Return the page as HTML.
-
-    Args:
-        run: its name.
-        renderings: names of the renderings that it kept; the first one is shown.
-        table: of the photographs so far.
-        key: what the server wants to see with a photograph.
-        elsewhere: the address by which another device opens the page; None where none can.
-    """
+    """Return the page of a run as HTML: the first of its renderings is shown, `key` is what the server wants to see
+    with a photograph, and `elsewhere` the address by which another device opens the page, if one can."""
     facts = {"key": key, "names": list(renderings[:1])}
     align = element("div", _hint(renderings), id="align") if renderings else _without()
     main = element(
@@ -347,17 +340,8 @@ def check_sender(headers: Message, key: str) -> None:
 
 
 def take(taker: PhotoTaker | None, run: Path, name: str, data: Callable[[], bytes]) -> Response:
-    """Take a photograph in.
-
-    Args:
-        taker: what does; None where nothing does.
-        run: its folder.
-        name: of the rendering.
-        data: reads what was sent, once there is something to compare it with.
-
-    Raises:
-        Refused: there is no such rendering, or it is no photograph.
-    """
+    """Take a photograph of a rendering in; `data` reads what was sent, once there is something to compare it with. It
+    is refused where there is no such rendering, or it is no photograph."""
     _found(rendering_file, run, name)
     try:
         table = _there(taker).add(run, name, data())

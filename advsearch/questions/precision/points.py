@@ -314,13 +314,8 @@ def levels_off(points: Sequence[Point]) -> bool:
 def recommend(
     lines: Mapping[tuple[str, str, str], Sequence[Point]], goal: float, round_up: RoundUp | None = None
 ) -> Recommended | None:
-    """Return the setting with the least time that reaches a relative error; None where none is known to.
-
-    Args:
-        lines: the points of each line, all of one measure.
-        goal: relative error, over 0.
-        round_up: what sample counts a series takes; None for all whole numbers.
-    """
+    """Return the setting with the least time that reaches a relative error, over 0, by the points of each line; None
+    where none is known to. `round_up` says what sample counts a series takes."""
     found = [one for points in lines.values() if (one := reaching(points, goal, round_up)) is not None]
     return min(found, key=lambda one: one.seconds or 0.0, default=None)
 

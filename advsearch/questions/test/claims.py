@@ -57,12 +57,10 @@ class Trial:
     """What claims are tried with.
 
     Attributes:
-        run: keeps every answer.
         confidence: of each claim that pictures decide.
         late: whether the time of the suite is over.
         left: seconds until then; infinite without a limit.
         workers, cluster: who shares the pictures of a claim.
-        progress: told how far it is.
         warnings: gets sentences that a reader has to know.
     """
 
