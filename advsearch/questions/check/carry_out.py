@@ -52,8 +52,6 @@ from advsearch.scene.gradients import STEP_RANGE, Group, compared
 
 
 class CheckKeywords(PlanKeywords, total=False):
-    """Of `check`."""
-
     all: bool
     loss: Literal["linear", "model", "both"]
 

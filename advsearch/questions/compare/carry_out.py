@@ -34,8 +34,6 @@ SWEEP = "sweep"
 
 
 class CompareKeywords(SampledKeywords, total=False):
-    """Of `compare`."""
-
     object: Names
     task: Named
     grid: dict[str, object]

@@ -29,8 +29,6 @@ from advsearch.viewer.pages import keep_answer
 
 
 class ExplainKeywords(RunKeywords, total=False):
-    """Of `explain`."""
-
     confirm: int
     pairs: int
     clusters: int

@@ -49,8 +49,6 @@ from advsearch.scene.transport.renderer import SPP
 
 
 class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):
-    """Of `plan`."""
-
     objective: str | None
     seconds: float | None
 

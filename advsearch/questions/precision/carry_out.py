@@ -60,8 +60,6 @@ from advsearch.viewer.pages import keep_answer
 
 
 class PrecisionKeywords(DerivativeKeywords, NamedKeywords, total=False):
-    """Of `precision`."""
-
     objective: str | None
     quantities: Names
     seconds: float

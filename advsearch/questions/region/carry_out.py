@@ -45,8 +45,6 @@ from advsearch.viewer.pages import keep_answer
 
 
 class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
-    """Of `region`."""
-
     around: str | None
     vary: Names | None
     samples: int
