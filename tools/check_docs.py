@@ -37,7 +37,7 @@ from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region import carry_out as mapping
-from advsearch.questions.region import carry_out as growing as region
+from advsearch.questions.region import carry_out as region
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs import directory, export, store
 from advsearch.runs.results.attack import AttackSummary
