@@ -319,7 +319,7 @@ FAULTS = (
     ),
     Fault(
         "recipes: right and wrong are mixed up",
-        "advsearch/questions/recipe/figures/given.py",
+        "advsearch/questions/recipe/given.py",
         "right_wrong=counts[True, False],",
         "right_wrong=counts[False, True],",
         ("tests/questions/test_recipe.py",),
