@@ -83,7 +83,7 @@ def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expec
     "controls", [["texture"], "texture", ("texture",), {"texture": {}}, {"texture:texture": {}}, ["texture", "pose"]]
 )
 def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
+    monkeypatch.setattr(attacking, "_carry_out", lambda job, *_: job)
     job: Any = advsearch.attack("mug", controls=controls, **ALL)
     again = given_to(job.config, job.config.controls)
     texture: Any
@@ -92,7 +92,7 @@ def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatc
 
 
 def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
+    monkeypatch.setattr(attacking, "_carry_out", lambda job, *_: job)
     job: Any = advsearch.attack("mug", controls=["geometry"], over=["texture:label"], **ALL)
     assert job.controls[0].epsilon == 0.07
     assert (job.over[0].epsilon, job.over[0].norm, job.over[0].resolution) == (None, "l2", 16)
