@@ -98,7 +98,7 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
 ) -> None:
     run = str(tmp_path / "it")
     monkeypatch.setattr(
-        "advsearch.questions.attack.several.curve_from_config", lambda config, **more: samples.curve(run=config.run)
+        "advsearch.questions.attack.carry_out.curve_from_config", lambda config, **more: samples.curve(run=config.run)
     )
     assert carry_out(AttackConfig(**several, run=run)) == samples.curve(run=run)
 
