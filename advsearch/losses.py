@@ -6,8 +6,8 @@
 Those of logits are **maximised**: they rise as the answer gets worse, or nearer to a target. Each takes logits (N, C)
 and labels: (N,) int64, one right answer for each picture, or the indices of a label set of which every answer is right.
 Each is an objective by itself: `attack("mug", objective=losses.log_odds)`. Those of colours are a **cost**, which is
-subtracted. All return (N,) and are differentiable; formulas and sources stand in `advsearch.attacks.logit_objectives`
-and `advsearch.engine.objective`.
+subtracted. All return (N,) and are differentiable; formulas and sources stand in
+`advsearch.attacks.objective_functions` and `advsearch.engine.objective`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from advsearch.attacks import logit_objectives as of_logits
+from advsearch.attacks import objective_functions as of_logits
 from advsearch.engine import objective
 from advsearch.errors import InputError
 

@@ -89,7 +89,7 @@ RULES = {
     "cli": Rule(None),
     "": Rule({"api", "engine", "losses", "models", "questions", "testing"}, set()),
 }
-"""As in docs/design.md, "Rooms, and who may know whom". The empty name is `advsearch/__init__.py`."""
+"""As in docs/design.md, "Packages and imports". The empty name is `advsearch/__init__.py`."""
 
 DISTRIBUTIONS = {"PIL": "pillow", "yaml": "PyYAML", "mitsuba_oidn": "mitsuba-oidn"}
 """Where a package is installed under another name than it is imported."""
@@ -259,7 +259,7 @@ def test_only_the_backend_speaks_mitsuba() -> None:
 
 
 def test_the_design_in_one_glance() -> None:
-    """As in docs/design.md, "Rooms, and who may know whom": bottom never reaches top, the command line is the roof."""
+    """As in docs/design.md, "Packages and imports": bottom never reaches top, the command line is the roof."""
     assert not any("cli" in (rule.rooms or ()) for rule in RULES.values())
     below: dict[str, set[str]] = {"models": set(), "tasks": {"models"}, "attacks": {"tasks"}}
     for name, rooms in below.items():

@@ -14,7 +14,7 @@ from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.api import carry_out as answered
 from advsearch.attacks import Evaluation, Query, make_policy
-from advsearch.attacks.sample_count import choose_spp, most_samples
+from advsearch.attacks.trials import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as plan_text
 from advsearch.config import AttackConfig, SweepConfig

@@ -32,8 +32,7 @@ from advsearch.engine.loading import (
     scene_as_settings,
     settings_of,
 )
-from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, model_name
-from advsearch.engine.turn import in_turn
+from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, in_turn, model_name
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import told

@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 
 from advsearch.config import RenderConfig
-from advsearch.engine import rendering, run_settings
-from advsearch.engine.naming import load_models, scene_of
+from advsearch.engine import rendering
+from advsearch.engine.naming import check_run_settings, given_to, in_turn, load_models, scene_of
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import pictures_of, writable
-from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.results.render import RenderResult
+from advsearch.runs.results.base import RenderResult
 from advsearch.scene.surfaces import aovs_of
 from advsearch.tasks import make_task
 from advsearch.watching import shows_progress
@@ -35,8 +34,8 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         if spec is not None and out.exists() and os.path.exists(spec) and out.samefile(spec):
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
     progress.stage("loading the scene and the model")
-    run_settings.check(config)
-    controls = run_settings.given_to(config, config.controls)
+    check_run_settings(config)
+    controls = given_to(config, config.controls)
     scene = scene_of(config)
     task = make_task(config.task)
     (model,), notes = load_models([config.model], task, config)

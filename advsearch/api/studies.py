@@ -16,13 +16,12 @@ from typing import TypeVar
 
 from advsearch import rooms
 from advsearch.api import carry_out
-from advsearch.cluster.executor import Call, Work
-from advsearch.cluster.opening import executor_of
+from advsearch.cluster import Call, Work
+from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import CONFIGS, AttackConfig
-from advsearch.engine import run_settings
-from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.naming import different, load_models
+from advsearch.engine.judging import one_label_for_several
+from advsearch.engine.naming import check_run_settings, different, load_models, settings_alone
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
@@ -115,11 +114,11 @@ def chains_of(config: AttackConfig) -> list[Chain]:
 
 def _controls_of(config: AttackConfig) -> Chain:
     """Every object with every control."""
-    run_settings.check(config)
+    check_run_settings(config)
     attacks = []
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
-            own = run_settings.alone(config, control, settings)
+            own = settings_alone(config, control, settings)
             one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
             attacks.append(StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control))
     return attacks

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the run and say where it is."""
     # late, so that --help answers at once
-    from advsearch.engine.sweeps.imported import import_threedb
+    from advsearch.engine.sweeps.summary import import_threedb
     from advsearch.runs.summary import read_result
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)

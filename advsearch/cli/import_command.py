@@ -113,7 +113,7 @@ def _slow(whole: ObjectAsset) -> list[str]:
 def _mitsuba(args: argparse.Namespace, out: Path | None) -> Callable[[], int]:
     """Read and picture, as its first camera sees it, a Mitsuba scene; return what prints what was understood."""
     # late: another thing has this name here
-    from advsearch.scene.mitsuba_backend.files.scene import contents
+    from advsearch.scene.mitsuba_backend.scene_files import contents
 
     found = contents(Path(args.file))
     warnings: tuple[str, ...] = ()

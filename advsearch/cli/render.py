@@ -9,7 +9,7 @@ from advsearch.cli.question import QuestionCommand
 from advsearch.report.phrases import seen_cells, seen_text
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.render import RenderResult
+    from advsearch.runs.results.base import RenderResult
 
 HELP = "render a picture of a scene, and say what the model sees in it"
 EXAMPLES = (

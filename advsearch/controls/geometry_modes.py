@@ -26,7 +26,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from advsearch.scene.assets import Mesh
-from advsearch.scene.surface_map import welded
+from advsearch.scene.raster import welded
 
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -3,7 +3,7 @@
     base colour = (1 - m) base colour + m linear(pixels at (a, b)),     m = soft square in (a, b), front of the surface
 
 A place is where a ray from outside towards the middle of the object meets the surface. Every texel of the object's
-base-colour map around it has a 3-D position and a normal (`advsearch.scene.surface_map`); its coordinates (a, b) are
+base-colour map around it has a 3-D position and a normal (`advsearch.scene.raster`); its coordinates (a, b) are
 those in the tangent plane, unrolled along the direction in which the surface bends (exact for cylinders and spheres;
 Schmidt et al. 2006, "Interactive Decal Compositing with Discrete Exponential Maps", do it for any surface). Only the
 connected part of the surface that faces the same way is painted, so that nothing bleeds through a wall.
@@ -23,11 +23,11 @@ from scipy import spatial
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import Doubles, camera_to_world, object_to_world
-from advsearch.scene.surface_map import Charts, MeshSurface, rasterised
+from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.raster import Charts, MeshSurface, rasterised
 
 BASE_SIDES = (512, 1024)
 """Smallest and largest side of the base-colour map that is painted into, in texels."""

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.parameters import Parameter
+from advsearch.scene.settings import Parameter
 
 Number = float | str
 

@@ -28,8 +28,7 @@ from advsearch.attacks import (
     search,
     verify,
 )
-from advsearch.attacks.sample_count import LOOKS, MarginsOf, most_samples
-from advsearch.attacks.trials import paired_difference
+from advsearch.attacks.trials import LOOKS, MarginsOf, most_samples, paired_difference
 from advsearch.attacks.verification import (
     EASIER,
     LEAST_RATE,

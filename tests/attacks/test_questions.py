@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
-from advsearch.attacks.smallest import RATIO, Bracket, confirmed, scaled, shrunk, smallest
+from advsearch.attacks.candidates import RATIO, Bracket, confirmed, scaled, shrunk, smallest
 from advsearch.errors import InputError
 from advsearch.questions.region.carry_out import grow
 

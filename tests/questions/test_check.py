@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.engine.measuring import OutOfTime, Results
+from advsearch.engine.record import OutOfTime, Results
 from advsearch.progress import Progress
 from advsearch.questions.check import answer as words
 from advsearch.questions.check import carry_out as checking

@@ -20,7 +20,7 @@ from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import BOUND, measured_bounces
 from advsearch.questions.plan.carry_out import ALL, RENDERS, WHAT, measured_gains, plan_from_config, resolved_texels
 from advsearch.questions.plan.settings import PlanConfig
-from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
+from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
 
 SIZE = 40

@@ -14,8 +14,8 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
-from advsearch.engine.measuring import Results
 from advsearch.engine.planning import cosine_samples, cosines
+from advsearch.engine.record import Results
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as precision_text
-from advsearch.cluster.executor import Done, InProcess, Workforce
+from advsearch.cluster import Done, InProcess, Workforce
 from advsearch.config import AttackConfig
 from advsearch.engine import attack_parts as attacking
 from advsearch.engine.gradients import smooth_loss

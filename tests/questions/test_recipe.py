@@ -19,7 +19,7 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.explanations.observations import Answered
+from advsearch.explanations import Answered
 from advsearch.questions.recipe import accuracy
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult, told_once
@@ -331,6 +331,9 @@ figures: [{{figure: agreement, of: [renderings, finer]}}]
     assert "expected some in a folder for each object (mug)" in capsys.readouterr().err
     for name in ("rendering-1", "rendering-1-again", "any"):
         write_png(folder / "mug" / f"{name}.png", np.full((20, 30, 3), 0.5))
+    with pytest.raises(InputError, match=r"any\.png: the task asks where the object is"):  # before anything is rendered
+        advsearch.recipe(path, run=tmp_path / "found", photographs=folder, task="detection")
+    assert not (tmp_path / "found").exists()
     for _ in range(2):  # those that it has are not taken again
         assert main(["resume", str(run), f"photographs={folder}", "--json"]) == 0
         printed = json.loads(capsys.readouterr().out)

@@ -16,8 +16,8 @@ def write(args: argparse.Namespace, out: Path) -> Written:
     """Write a folder as 3DB does."""
     # late, so that --help answers at once
     from advsearch.runs.directory import find_run
+    from advsearch.runs.export import write_threedb
     from advsearch.runs.store import NAME, Store
-    from advsearch.runs.threedb import write_threedb
     from advsearch.viewer.thumbnails import kept_pictures
 
     folder = find_run(args.run)

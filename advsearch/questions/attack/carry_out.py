@@ -15,7 +15,7 @@ from advsearch import losses
 from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.cluster.executor import Call
+from advsearch.cluster import Call
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.controls.clean import sentences
 from advsearch.engine.attack_parts import (
@@ -32,10 +32,10 @@ from advsearch.engine.attack_parts import (
     with_derivatives,
 )
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.journal import Journal, check_made_of
+from advsearch.engine.journal import Journal, Shared, answering, check_made_of
+from advsearch.engine.judging import Metric, check_shared, load_metrics, metrics_as_settings
+from advsearch.engine.judging import only_here as metrics_only_here
 from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
-from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
-from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
     OF_SCENE,
     AnyModel,
@@ -49,7 +49,6 @@ from advsearch.engine.naming import (
 from advsearch.engine.outcome import summarise
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.stages import Attack
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError

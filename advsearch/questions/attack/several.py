@@ -14,15 +14,15 @@ from advsearch import seeds
 from advsearch.api.studies import SETTLED, StudyRun, carry_out_study
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster.executor import Call
+from advsearch.cluster import Call
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, check_from_config, executor_for, problem_from_config
+from advsearch.engine.journal import answering
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import RetrialCondition, Retrials
-from advsearch.engine.rows import control_group, verified_rate
-from advsearch.engine.sharing import answering
+from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
+from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.files import JsonObject
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress

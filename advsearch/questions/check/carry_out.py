@@ -13,7 +13,6 @@ from typing_extensions import Unpack
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
 from advsearch.controls import CONTROLS
-from advsearch.engine import run_settings
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import (
     FACTORS,
@@ -29,10 +28,10 @@ from advsearch.engine.gradients import (
     smooth_loss,
 )
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
-from advsearch.engine.naming import AnyModel
+from advsearch.engine.naming import AnyModel, settings_alone
 from advsearch.engine.planning import CONVERGED, COUNTS, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
+from advsearch.engine.record import Results, kept_rows
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.check.answer import (
     WHOLE,
@@ -153,7 +152,7 @@ def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
         for control, kind in CONTROLS.items():
             if kind.parameters and control not in left_out:  # of one without, the scene names them
                 place = {"object": object, "environment": None if own else environment, "label": None}
-                alone = {"controls": {control: {}}, **run_settings.alone(config, control, {})}
+                alone = {"controls": {control: {}}, **settings_alone(config, control, {})}
                 yield config.model_copy(update={**place, **alone})
 
 

@@ -20,8 +20,7 @@ from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import mcnemar, paired_difference
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
-from advsearch.explanations.observations import Factor, Observations
-from advsearch.explanations.rules import FEWEST_ROWS, CountedRule, condition_rows, find_rules
+from advsearch.explanations import FEWEST_ROWS, CountedRule, Factor, Observations, condition_rows, find_rules
 from advsearch.questions.compare.answer import ComparedPair, CountOf, PairPart, PairRule
 from advsearch.report.wording import short_names
 from advsearch.runs.directory import CONFIG

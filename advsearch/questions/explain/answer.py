@@ -105,7 +105,7 @@ class ExplainResult(RunResult, RightOf):
     envelope: EnvelopeRow | None = Field(description="null where no box promises it")
     pairs: list[NearestRight]
     pairs_sought: int = Field(
-        default=0, description="failures for which one was sought, the most typical; others are left out"
+        default=0, description="failures for which one was looked for, the most typical; others are left out"
     )
     clusters: FailureClusters | None = Field(default=None, description="null where nothing was rendered for them")
     renders: int = Field(description="pictures that were rendered")

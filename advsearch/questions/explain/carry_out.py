@@ -14,8 +14,17 @@ from advsearch.api.keywords import RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
-from advsearch.explanations.observations import Answered, Factor, Observations, observed
-from advsearch.explanations.rules import CHANCE, FEWEST_ROWS, CountedRule, condition_rows, find_rules
+from advsearch.explanations import (
+    CHANCE,
+    FEWEST_ROWS,
+    Answered,
+    CountedRule,
+    Factor,
+    Observations,
+    condition_rows,
+    find_rules,
+    observed,
+)
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.explain.answer import EnvelopeRow, ExplainResult, ParameterWeight, RuleNotTold, RuleRow
 from advsearch.questions.explain.findings import Envelope, FactorWeight, find_envelope, find_importance

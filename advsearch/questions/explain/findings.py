@@ -29,8 +29,7 @@ from scipy.stats import chi2, ncx2
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.explanations.observations import Observations
-from advsearch.explanations.rules import RuleCondition, RuleConditions, covered, import_library
+from advsearch.explanations import Observations, RuleCondition, RuleConditions, covered, import_library
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25

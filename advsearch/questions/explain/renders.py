@@ -19,8 +19,18 @@ from advsearch.api.studies import carry_out_part
 from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.explanations.observations import Answered, Factor, Mask, Observations, figure_value, rows_of
-from advsearch.explanations.rules import CountedRule, RuleCondition, RuleConditions, covered
+from advsearch.explanations import (
+    Answered,
+    CountedRule,
+    Factor,
+    Mask,
+    Observations,
+    RuleCondition,
+    RuleConditions,
+    covered,
+    figure_value,
+    rows_of,
+)
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.progress import Progress

@@ -32,7 +32,7 @@ class ExplainConfig(Config):
     pairs: int = setting(
         12,
         "explain",
-        "failures for which the nearest right configuration is sought; 0 for none",
+        "failures for which the nearest right configuration is looked for; 0 for none",
         unit="failures",
         ge=0,
         le=100,

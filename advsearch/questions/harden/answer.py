@@ -69,7 +69,7 @@ class HardenResult(InNotebook, RunResult):
         description="held-out scenes that are right and in which no search over any control has found a wrong answer; "
         "null if it was interrupted, as are the others"
     )
-    after: Share | None = Field(description="the same, of the hardened model, searched anew")
+    after: Share | None = Field(description="the same, of the hardened model, searched again")
     clean_before: Share | None = Field(description="plain renders of held-out scenes that are right")
     clean_after: Share | None
     table: list[HardenedControl]

@@ -18,12 +18,11 @@ from typing_extensions import Unpack
 from advsearch import seeds
 from advsearch.api.keywords import Named, Names, RenderedKeywords, RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
-from advsearch.cluster.executor import Executor, InProcess
-from advsearch.engine import run_settings
+from advsearch.cluster import Executor, InProcess
 from advsearch.engine.attack_parts import LOADING, executor_for
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.loading import Controls
-from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name
+from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
 from advsearch.models.imported import split_weights
@@ -148,7 +147,7 @@ def harden_from_config(
     """Do what a configuration describes, or go on with it; see `harden`. None takes the configuration's model."""
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage(LOADING)
-    run_settings.check(config)
+    check_run_settings(config)
     task = make_task(config.task)
     (loaded, *_), warnings = load_models([config.model if model is None else model], task, config)
     course = Course(trainable(loaded, config.layers), loaded, config, optimiser, beside)

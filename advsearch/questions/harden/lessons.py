@@ -35,7 +35,7 @@ from advsearch.runs.files import replacing
 from advsearch.runs.images import write_png
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.transport.lights import why_not
-from advsearch.scene.transport.renderer import LinearRenderer
+from advsearch.scene.transport.matrix import LinearRenderer
 
 SPP, DEPTH = 2, 4
 """Samples a pixel of a lesson's pictures, and segments of the longest path: many lessons with some noise teach more

@@ -17,12 +17,11 @@ from safetensors import torch as safetensors
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.objects import OBJECTS
-from advsearch.cluster.executor import Call
+from advsearch.cluster import Call
 from advsearch.config import AttackConfig
-from advsearch.engine import run_settings
 from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import Scene, load_scene
-from advsearch.engine.naming import load_models, scene_settings
+from advsearch.engine.naming import RUN_SETTINGS, load_models, scene_settings, settings_alone
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
@@ -234,9 +233,9 @@ class SceneWork:
     def _of(self, controls: Sequence[str], name: str, **changes: object) -> AttackConfig:
         """What some of the controls are searched with, on an object of a name."""
         config, given = self.config, {control: self.config.controls[control] for control in controls}
-        own: dict[str, object] = dict.fromkeys(run_settings.RUN_SETTINGS)
+        own: dict[str, object] = dict.fromkeys(RUN_SETTINGS)
         for control in controls:
-            for setting, value in run_settings.alone(config, control, given[control]).items():
+            for setting, value in settings_alone(config, control, given[control]).items():
                 before = own[setting]
                 if isinstance(before, Mapping) and isinstance(value, Mapping):
                     own[setting] = {**before, **value}

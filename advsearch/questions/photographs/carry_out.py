@@ -18,13 +18,11 @@ from advsearch import seeds
 from advsearch.attacks import clopper_pearson
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
-from advsearch.engine.answers import facts_of
 from advsearch.engine.attack_parts import judged_alone, problem_from_config
-from advsearch.engine.metrics import judgements
-from advsearch.engine.naming import load_models, scene_of
-from advsearch.engine.retrial import kept_answer
-from advsearch.engine.rows import judged
-from advsearch.engine.turn import in_turn
+from advsearch.engine.judging import facts_of, judgements
+from advsearch.engine.naming import in_turn, load_models, scene_of
+from advsearch.engine.record import judged
+from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
@@ -44,7 +42,7 @@ from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
-from advsearch.tasks import Judgement, Task, make_task
+from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
 
@@ -70,10 +68,21 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         return _agreement(list(store.rows(PHOTO)))
 
 
-def photographs_in(folder: Path) -> list[Path]:
-    """Return the files in a folder that are photographs by their names; none where there is no such folder."""
+def photographs_in(folder: Path, task: AnyTask) -> list[Path]:
+    """Return the files in a folder that are photographs by their names; none where there is no such folder.
+
+    Raises:
+        InputError: the task asks where the object is, and one of them was aligned with no rendering.
+    """
     files = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+    found = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+    loose = [file for file in found if not _ALIGNED.fullmatch(file.stem)]
+    if loose and (made := make_task(task)) and (made.varies or made.looks):
+        raise InputError(
+            f"{loose[0].name}: the task asks where the object is, and only a rendering says that; name the file "
+            "rendering-NUMBER.jpg by the rendering that it was aligned with, or take it out"
+        )
+    return found
 
 
 class Photographs:
@@ -142,8 +151,6 @@ class Photographs:
             number = held.store.last_step(LOOSE_PHOTO) + 1
             rows = []
             for judge in self._judges(run):
-                if judge.varies:
-                    raise InputError("the task asks where the object is; name the file rendering-NUMBER.jpg after one")
                 values: dict[str, Value] = {"model": {"value": judge.model.name, "unit": ""}}
                 sound = sound_photo(data, judge.size[::-1])
                 row = judged(Row(LOOSE_PHOTO, number, values=values), judge.judgement("", judge.object, sound))
@@ -165,7 +172,6 @@ class _PhotoJudge:
         size: (height, width) of the run's renderings, in pixels.
         several: models that the run has.
         truth: what is true of a photograph, by the rendering that it was aligned with and the object.
-        varies: whether that differs between renderings of one object.
     """
 
     object: str
@@ -174,7 +180,6 @@ class _PhotoJudge:
     size: tuple[int, int]
     several: int
     truth: Callable[[str, str], Truth]
-    varies: bool = True
 
     def judgement(self, rendering: str, name: str, data: bytes) -> Judgement:
         """What is to be said of a picture, (any size), of an object; it is made as large as the run's renderings are.
@@ -211,9 +216,7 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
             return task.truth(facts_of(scene_of(config, name), name, config.label, dict))
 
         judges.append(
-            _PhotoJudge(
-                config.objects[0], model, task, config.resolution or model.input_size, len(models), truth, varies=False
-            )
+            _PhotoJudge(config.objects[0], model, task, config.resolution or model.input_size, len(models), truth)
         )
     return judges
 

@@ -18,7 +18,6 @@ from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, conf
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import Loss, inside
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import (
     GOAL,
@@ -31,6 +30,7 @@ from advsearch.engine.planning import (
     tuned,
 )
 from advsearch.engine.problem import Problem
+from advsearch.engine.record import Results, kept_rows
 from advsearch.engine.transport import WORTH
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, GainRow, PlanResult, TexelRow
@@ -39,13 +39,13 @@ from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import CosineRow, Formation, PathLength
 from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
-from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
-from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS
+from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import predicting, why_not
-from advsearch.scene.transport.renderer import SPP
+from advsearch.scene.transport.matrix import SPP
 
 
 class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):

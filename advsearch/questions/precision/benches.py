@@ -183,11 +183,11 @@ class PictureBench:
     def _refer(self, family: str, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
         renderer = self._truth(family)
         spp = part_samples(seconds_a_sample(partial(self._radiance, renderer, 0), calls=3), budget.left)
-        elsewhere = self.elsewhere(family, spp) or one_by_one(partial(self.part, family, spp))
-        parts = gather(elsewhere, budget, seed=seed, name=f"precision reference {family}", on_done=on_done)
+        parts = self.elsewhere(family, spp) or one_by_one(partial(self.part, family, spp))
+        gathered = gather(parts, budget, seed=seed, name=f"precision reference {family}", on_done=on_done)
         self.part_spp[family] = spp
-        self.pictures[family] = reference_through(lambda mean: flat(self._shown(mean)), parts)
-        self.margins[family] = reference_through(lambda mean: np.array([self._margin(self._shown(mean))]), parts)
+        self.pictures[family] = reference_through(lambda mean: flat(self._shown(mean)), gathered)
+        self.margins[family] = reference_through(lambda mean: np.array([self._margin(self._shown(mean))]), gathered)
 
     def _as(self, variant: Variant) -> Renderer:
         key = (variant.sampler, variant.depth, variant.integrator)

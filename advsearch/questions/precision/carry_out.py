@@ -17,14 +17,14 @@ from typing_extensions import Unpack
 from advsearch import seeds
 from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, Names, asks, configured
 from advsearch.attacks import Policy, make_policy
-from advsearch.cluster.executor import Call, Executor
+from advsearch.cluster import Call, Executor
 from advsearch.engine.attack_parts import LOADING, executor_for, problem_from_config
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem
+from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import NullProgress, Progress, Watched, watcher

@@ -27,9 +27,8 @@ from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_
 from advsearch.scene.gradients import BY_ADJOINT, Group, compared
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.plan import why_not_kept
-from advsearch.scene.surface.renderer import SurfaceRenderer
-from advsearch.scene.transport.renderer import LinearRenderer, PredictingRenderer, linear_inputs
+from advsearch.scene.surface.renderer import SurfaceRenderer, why_not_kept
+from advsearch.scene.transport.matrix import LinearRenderer, PredictingRenderer, linear_inputs
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
 BY_COORDINATE = 32

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from advsearch import seeds, threads
-from advsearch.cluster.executor import Executor
+from advsearch.cluster import Executor
 from advsearch.cluster.worker import processor
 from advsearch.errors import ClusterError
 from advsearch.questions.precision.answer import Machine

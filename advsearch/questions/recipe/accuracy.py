@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations.observations import Answered
+from advsearch.explanations import Answered
 from advsearch.questions.recipe.along import COLOURS, MARKS
 from advsearch.questions.recipe.answer import (
     BarsFigure,

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations.observations import WORKERS, Answered, figure_value
+from advsearch.explanations import WORKERS, Answered, figure_value
 from advsearch.questions.recipe.answer import CurveBin, CurveFigure, CurveLine, NamedCount, ScalingFigure, ScalingPoint
 from advsearch.questions.recipe.table import FigureKind, Options, Table, count_of, extremes, plural, rate_with_interval
 from advsearch.report.figures import BLUE, GREY, RED

@@ -20,7 +20,7 @@ from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.engine.attack_parts import check_from_config
 from advsearch.errors import InputError
-from advsearch.explanations.observations import TRIAL, WORKERS, Answered, rows_of
+from advsearch.explanations import TRIAL, WORKERS, Answered, rows_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.recipe.answer import RecipeFigure, RecipePart, RecipeResult
@@ -166,8 +166,14 @@ def _seconds(path: Path) -> float:
 
 def _check(described: Recipe, config: RecipeConfig) -> None:
     """Read everything that a recipe says, so that what is wrong in it is told before anything is rendered."""
-    if config.photographs is not None and not _photographed(described, planned(described, config)):
-        raise InputError(f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does")
+    if config.photographs is not None:
+        wanted = _photographed(described, planned(described, config))
+        if not wanted:
+            raise InputError(
+                f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does"
+            )
+        for part in wanted:
+            photographs_in(Path(config.photographs) / Path(part.config.object).stem, part.config.task)
     for one in described.figures:
         read_options(one, config.recipe)
         if one.get("figure") == CUES and config.task is not None and name_in(config.task) == DETECTION:
@@ -285,7 +291,7 @@ def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> Iter
     photographs, missing = Photographs(), list[str]()
     for one in wanted:
         inside = folder / Path(one.config.object).stem
-        photographs.add_files(run.path / PARTS / one.name, files := photographs_in(inside))
+        photographs.add_files(run.path / PARTS / one.name, files := photographs_in(inside, one.config.task))
         missing += [] if files else [f"{one.config.object}: {inside} has no photographs."]
     if len(missing) == len(wanted):
         names = ", ".join(Path(one.config.object).stem for one in wanted[:8])

@@ -19,7 +19,7 @@ from advsearch import seeds
 from advsearch.config import CONFIGS
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.explanations.observations import ANSWER, GROUP, PART, PHOTOGRAPHS
+from advsearch.explanations import ANSWER, GROUP, PART, PHOTOGRAPHS
 from advsearch.questions.recipe.accuracy import BARS, CORRUPTION_ERROR, HEAT_MAP, POINTS, SURFACE
 from advsearch.questions.recipe.along import CURVE, SCALING
 from advsearch.questions.recipe.answer import RecipeFigure

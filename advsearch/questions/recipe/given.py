@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations.observations import PHOTOGRAPHS, Answered
+from advsearch.explanations import PHOTOGRAPHS, Answered
 from advsearch.questions.recipe.along import COLOURS, MARKS
 from advsearch.questions.recipe.answer import (
     AgreementCount,

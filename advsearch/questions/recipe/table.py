@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.explanations.observations import (
+from advsearch.explanations import (
     ANSWER,
     GROUP,
     OTHERS,

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import Field
 
-from advsearch.explanations.observations import Answered
+from advsearch.explanations import Answered
 from advsearch.questions.recipe.answer import MixtureLead, TernaryAnswer, TernaryCell, TernaryFigure, bare
 from advsearch.questions.recipe.table import CONFIDENCE, FigureKind, Options, Table, count_of, extremes, most_frequent
 from advsearch.report.phrases import percent

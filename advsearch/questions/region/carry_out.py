@@ -18,15 +18,14 @@ from advsearch.attacks.evaluation import most_at_once
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, problem_from_config
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.outcome import transport_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.sharing import Shared
 from advsearch.engine.surface_light import COMPARED, LIGHTS, SurfaceLight
-from advsearch.engine.sweeps.surface_light import pays_from
+from advsearch.engine.sweeps.predicting import pays_from
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
@@ -37,7 +36,7 @@ from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
 from advsearch.runs.summary import read_answer
-from advsearch.scene.surface import plan
+from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.seeds import stream
 from advsearch.settings import split_names
@@ -181,12 +180,12 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
     """What predicts pictures while the box grows, and those of the map, where a camera moves and that pays; fresh
     samples of the box are rendered (docs/surface-light.md)."""
     problem, stages, findings = verifier.problem, verifier.stages, verifier.findings
-    moved = plan.varied(problem.renderer, varied.groups)
+    moved = surface_renderer.varied(problem.renderer, varied.groups)
     if not config.specialise or not moved & CAMERAS or not moved <= FREE:
         return None
     wanted = USUAL * len(varied.names) + config.map**2
     least = pays_from(problem.renderer, findings.spp, COMPARED)
-    reason = plan.why_not_kept(problem.renderer)
+    reason = surface_renderer.why_not_kept(problem.renderer)
     if reason is None and wanted < least:
         reason = f"light on surfaces pays from {least} pictures on"
     if reason is None:

@@ -21,20 +21,19 @@ from advsearch.engine.attack_parts import LOADING, SEARCHED_WITH, AttackParts, p
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import RetrialCondition, Retrials, kept_answer, unchanged
-from advsearch.engine.rows import control_group, verified_rate
+from advsearch.engine.record import control_group, verified_rate
+from advsearch.engine.verifier import RetrialCondition, Retrials, kept_answer, unchanged
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.replay.answer import NOT_DONE, ReplayResult, ReplayRow
 from advsearch.questions.replay.settings import ReplayConfig
-from advsearch.runs import made_with
 from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.store import NAME, Store
-from advsearch.runs.summary import attack_of
-from advsearch.scene.exporting.cycles import BlenderError, Cycles
+from advsearch.runs.summary import MADE_WITH, attack_of, changed_file
+from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP
 from advsearch.viewer.pages import keep_answer
 
@@ -298,9 +297,9 @@ class _Table:
 def _changed(folder: Path, parts: AttackParts) -> list[str]:
     """What a reader has to know of a file that was another one when the run was made."""
     with Store(folder / NAME, read_only=True) as results:
-        noted = results.noted(made_with.NOTE)
+        noted = results.noted(MADE_WITH)
     before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
-    name = made_with.changed_file(before, parts.config.plain())
+    name = changed_file(before, parts.config.plain())
     return [f"{name} is not what it was when the run was made: what does not hold may come from that."] if name else []
 
 

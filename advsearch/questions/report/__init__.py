@@ -35,7 +35,10 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.runs.summary import to_json
 
     if not args.evidence:
-        raise InputError("--evidence: say what to write; it is the one report of several runs, each has a page already")
+        raise InputError(
+            "report: expected --evidence, which writes the claims of all these runs; the page of one run is "
+            "report.html in its folder"
+        )
     folder = Path(args.out)
     names = [folder / f"{NAME}.{suffix}" for suffix in ("html", "md", "json")]
     there = [one for one in names if one.exists()]

@@ -17,14 +17,13 @@ from advsearch.questions.report.answer import Evidence, EvidenceRun
 from advsearch.report import wording
 from advsearch.report.claims import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
-from advsearch.runs.made_with import NOTE
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result, VariedValue
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
+from advsearch.runs.summary import MADE_WITH, read_result
 from advsearch.runs.summary import NAME as SUMMARY
-from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 
 RULES = (
@@ -323,7 +322,7 @@ def _made_with(folder: Path) -> dict[str, str]:
     """What the run noted at each sitting; of several that differ, all."""
     try:
         with Store(folder / STORE, read_only=True) as store:
-            noted = store.noted(NOTE)
+            noted = store.noted(MADE_WITH)
     except AdvsearchError:
         return {}
     facts: dict[str, dict[str, None]] = {}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing_extensions import Unpack
 
 from advsearch.api.keywords import Names, RunKeywords, asks, configured
-from advsearch.engine.measuring import Results, kept_rows
+from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import AdvsearchError, UnknownNameError
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.stability.answer import CaseRow, DecidingNumber, StabilityResult

@@ -20,7 +20,7 @@ from torch import Tensor
 from advsearch import seeds, threads
 from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.attacks.domain import project_l2_box
-from advsearch.attacks.policies.base import one_thread
+from advsearch.attacks.evaluation import one_thread
 from advsearch.engine.gradients import smooth_loss
 from advsearch.models import load_model
 from advsearch.questions.stability.scene import SIZE, CaseGroup, Check, ControlSettings, Outcome, Toy, holds, small

@@ -17,10 +17,9 @@ from advsearch.questions.stability.scene import REFERENCE_SPP, CaseGroup, Check,
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.plan import why_not
-from advsearch.scene.surface.renderer import SurfaceRenderer
+from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
 from advsearch.scene.transport.lights import BasisRenderer
-from advsearch.scene.transport.renderer import LinearRenderer
+from advsearch.scene.transport.matrix import LinearRenderer
 
 TRANSPORT = CaseGroup("transport")
 TRACED = 256

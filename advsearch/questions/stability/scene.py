@@ -18,11 +18,11 @@ from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import objective
 from advsearch.engine.gradients import Agreement, Loss, Probe, agreement, estimates, probes, reference, smooth_loss
 from advsearch.scene import library
+from advsearch.scene.assembly import Motion
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
 from advsearch.scene.description import describe
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.motion import Motion
 from advsearch.scene.parts import ScenePart
 from advsearch.scene.renderer import Renderer
 

@@ -12,33 +12,39 @@ import torch
 from typing_extensions import Unpack
 
 from advsearch.api.keywords import SweepKeywords, asks
-from advsearch.cluster.executor import Call
+from advsearch.cluster import Call
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, measured_in
-from advsearch.engine import run_settings
-from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.attack_parts import LOADING, executor_for, is_named
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.journal import check_made_of
+from advsearch.engine.journal import answering, check_made_of
+from advsearch.engine.judging import (
+    Metric,
+    check_shared,
+    load_metrics,
+    metrics_as_settings,
+    one_label_for_several,
+    shown,
+)
+from advsearch.engine.judging import only_here as metrics_only_here
 from advsearch.engine.loading import Controls, Scene, load_scene, named_camera, only_here, settings_of
-from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
-from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
     AnyModel,
     check_not_of_scene,
     check_not_spread,
+    check_run_settings,
     different,
     exists_here,
+    given_to,
     load_models,
     model_name,
     scene_of,
     several,
 )
-from advsearch.engine.sharing import answering
+from advsearch.engine.sweeps import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
 from advsearch.engine.sweeps.drives import with_frames
-from advsearch.engine.sweeps.job import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
 from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.engine.sweeps.swept_scene import Scenes
@@ -210,7 +216,7 @@ def _beside_answer(
     summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
     if summary.adversarial is None:
         raise InputError(f"answer_of: {folder} ended with {summary.ending!r}, so that there is no answer to sweep")
-    held = run_settings.given_to(theirs, theirs.controls)
+    held = given_to(theirs, theirs.controls)
     varied = {control.name for control in drawn} | {axis.instance for axis in axes}
     if twice := sorted(varied & {control.name for control in held}):
         raise InputError(
@@ -256,8 +262,8 @@ def scenes_of(config: SweepConfig) -> Scenes:
 def _job(
     config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:
-    run_settings.check(config.model_copy(update={"path": None}))  # where no control travels, one is added
-    drawn, grid = run_settings.given_to(config, controls), config.grid
+    check_run_settings(config.model_copy(update={"path": None}))  # where no control travels, one is added
+    drawn, grid = given_to(config, controls), config.grid
     if config.path is not None:
         drawn, grid = with_frames(config, drawn)
     axes = read_axes(grid, drawn)

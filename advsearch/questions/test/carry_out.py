@@ -12,7 +12,7 @@ from pathlib import Path
 
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.attack_parts import check_from_config
-from advsearch.engine.measuring import Results
+from advsearch.engine.record import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress

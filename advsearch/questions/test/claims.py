@@ -18,9 +18,8 @@ from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.attack_parts import executor_for, parts_of, problem_of
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, Shared, answering
 from advsearch.engine.problem import Problem
-from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.verifier import ladder_of
 from advsearch.files import JsonObject
 from advsearch.progress import Progress

@@ -23,7 +23,7 @@ from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.attack_parts import parts_in, problem_of_parts
 from advsearch.engine.loading import Scene
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import kept_answer
+from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
 from advsearch.questions.test.answer import ANSWERS, HELD

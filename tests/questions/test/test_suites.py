@@ -25,7 +25,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.cluster.executor import InProcess
+from advsearch.cluster import InProcess
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
