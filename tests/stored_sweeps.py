@@ -15,7 +15,7 @@ from samples import sweep
 from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.files import JsonValue
-from advsearch.questions.photographs.serving import PhotoTaker
+from advsearch.questions.photographs.answer import PhotoTaker
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     # late, so that --help answers at once
-    from advsearch.questions.photographs.serving import NO_QR, qr_text
+    from advsearch.questions.photographs.answer import NO_QR, qr_text
     from advsearch.runs.directory import find_run
     from advsearch.viewer.server import Dashboard
 

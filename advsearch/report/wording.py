@@ -147,6 +147,13 @@ def short_name(value: Any) -> str:
     return PurePath(str(value)).name or str(value)
 
 
+def value_text(value: Any) -> str:
+    """Return a value of a parameter, or the ends of a part of its range."""
+    if isinstance(value, (list, tuple)):
+        return " to ".join(map(value_text, value))
+    return f"{value:.4g}" if isinstance(value, float) else short_name(value)
+
+
 def short_names(text: str) -> str:
     """Return the last parts of paths, of one or of several separated by commas: ``a.hdr, studio``."""
     return ", ".join(map(short_name, split_names(text)))

@@ -391,7 +391,7 @@ def _after(query: Mapping[str, list[str]], otherwise: int) -> int:
 
 def _photographs(what: str) -> Callable[..., tuple[str, bytes]]:
     """A part of what takes photographs in, which the tool works without."""
-    found: Callable[..., tuple[str, bytes]] | None = rooms.in_room("photographs", "serving", what)
+    found: Callable[..., tuple[str, bytes]] | None = rooms.in_room("photographs", "answer", what)
     if found is None:
         raise Refused(HTTPStatus.NOT_FOUND, "there are no photographs")
     return found

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as precision_text
@@ -683,7 +684,8 @@ def test_what_was_measured_is_the_same_after_json() -> None:
     reference = PrecisionReference(quantity="image", reference="raw", error=math.inf, parts=2, spp=64)
     curve = PolicyCurve("random", (1, 2), (0.5, 1.0), ((0.1, 0.2, 0.3), (0.2, 0.3, 0.4)), 3)
     section = Section("independent", [line], [reference], [(setting, curve)], 0.5, (setting,), ["a warning"])
-    again = Section.of(json.loads(json.dumps(section.to_dict())))
+    adapter = TypeAdapter(Section)
+    again = adapter.validate_python(json.loads(json.dumps(adapter.dump_python(section, mode="json"))))
     assert repr(again).replace("nan", "inf") == repr(section).replace("nan", "inf")
     whole = Section("independent")
     whole.extend(again)

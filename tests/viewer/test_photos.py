@@ -25,8 +25,7 @@ from stored_sweeps import make_sweep, serving
 from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
-from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
-from advsearch.questions.photographs.serving import (
+from advsearch.questions.photographs.answer import (
     LARGEST,
     align_page,
     photo_file,
@@ -34,6 +33,7 @@ from advsearch.questions.photographs.serving import (
     rendering_names,
     sound_photo,
 )
+from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.viewer import certificate

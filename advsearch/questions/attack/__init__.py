@@ -1,7 +1,5 @@
 """`advsearch attack`: the worst configuration of a scene."""
 
-from __future__ import annotations
-
 from advsearch.cli.question import QuestionCommand
 
 HELP = "find the configuration of a scene that the model gets wrong most badly"

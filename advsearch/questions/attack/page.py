@@ -127,7 +127,10 @@ def _pictures(data: RunData) -> Html:
     ]
     trials = [name for name in data.pictures if name.startswith("images/verification")]
     trials = ([name for name in trials if name.endswith("-answer.png")] or trials)[:MOST_TRIALS]
-    small = _section("", [_figure(data, name, "", _trial(name)) for name in trials], "small")
+    numbers = {
+        name: Path(name).stem.removeprefix("verification").removesuffix("-answer").strip("-_") for name in trials
+    }
+    small = _section("", [_figure(data, name, "", f"trial {one}") for name, one in numbers.items()], "small")
     compare = element("div", id="compare", hidden="hidden")
     steps = join_html(element("h2", "The search, step by step"), element("div", id="search"))
     search = element("div", steps, hidden="hidden", class_="screen")
@@ -326,10 +329,6 @@ def _same_conditions(summary: AttackSummary) -> str:
 
 def _answer(summary: AttackSummary, answer: PicturedAnswer | None) -> str:
     return "no answer recorded" if answer is None else answer_text(summary.task, answer)
-
-
-def _trial(name: str) -> str:
-    return "trial " + Path(name).stem.removeprefix("verification").removesuffix("-answer").strip("-_")
 
 
 def _changes(summary: AttackSummary) -> Html:

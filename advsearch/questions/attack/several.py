@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from advsearch import seeds
 from advsearch.api.studies import SETTLED, StudyRun, carry_out_study
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster import Call, Executor
+from advsearch.cluster import Call
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, check_from_config, executor_for, problem_from_config
 from advsearch.engine.journal import answering
@@ -35,7 +35,6 @@ from advsearch.questions.attack.answer import (
     MatrixRow,
     ObjectRow,
 )
-from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import StudyResult
 from advsearch.runs.summary import read_answer
@@ -109,7 +108,8 @@ def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
     """How many objects are still recognised at an epsilon."""
     known = [row for row in rows if _known(row, epsilon)]
     wrong = sum(row.ending == "already wrong" for row in known)
-    found = sum(row.ending == "found" and _flips_within(row, epsilon) for row in known)
+    flipped = [row.flips_at for row in known if row.ending == "found"]
+    found = sum(epsilon is None or (isinstance(one, float) and one <= epsilon) for one in flipped)
     robust = len(known) - wrong - found
     return CurvePoint(
         epsilon=epsilon,
@@ -120,10 +120,6 @@ def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
         accuracy=robust / len(known) if known else None,
         interval=clopper_pearson(robust, len(known)) if known else (0.0, 1.0),
     )
-
-
-def _flips_within(row: ObjectRow, epsilon: float | None) -> bool:
-    return epsilon is None or (isinstance(row.flips_at, float) and row.flips_at <= epsilon)
 
 
 LEAST_SPP = 64
@@ -170,11 +166,21 @@ def _matrix(config: AttackConfig, names: Sequence[str], study: StudyRun) -> tupl
                 with executor_for(
                     config, "advsearch.questions.attack.several:models_answering", study.progress
                 ) as executor:
-                    kept = (problems, study.run, study.progress, executor)
-                    tried = Transfer(*kept, trials=trials, spp=spp, seed=seed)
-                    models = tried.clean()
+                    conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
+                    retrials = Retrials(
+                        conditions, study.run, study.progress, trials=trials, seed=seed, executor=executor
+                    )
+                    each = trials * len(names)
+                    hint = f"{each} answers; `trials` or `verify_spp` shorten it"
+                    study.progress.stage("trying the clean scene on every model", each, hint=hint)
+                    models = [_model(one, retrials) for one in conditions]
                     for name, u in answers.items():
-                        cells[name] = tried.on_each(name, u)
+                        study.progress.stage(f"trying the answer to {name} on every model", each, hint=hint)
+                        checked = [(one.name, retrials.answer(name, u, one)) for one in conditions]
+                        cells[name] = [
+                            MatrixCell(model=model, ending=one.ending.value, verified=verified_rate(one))
+                            for model, one in checked
+                        ]
         except KeyboardInterrupt:
             study.interrupted = True
     rows = [
@@ -202,60 +208,14 @@ def _answer(summary: AttackSummary) -> Tensor | None:
     return torch.from_numpy(read_answer(Path(summary.run)))
 
 
-class Transfer:
-    """Tries answers on models.
-
-    Args:
-        problems: of each model, by its name; they have one space.
-        run: keeps the rows.
-        progress: told how far it is.
-        executor: of workers that make the pictures; None makes them here.
-        trials: of each answer on each model.
-        spp: samples a pixel.
-        seed: root of the trials.
-    """
-
-    def __init__(
-        self,
-        problems: Mapping[str, Problem],
-        run: RunDirectory,
-        progress: Progress,
-        executor: Executor | None,
-        *,
-        trials: int,
-        spp: int,
-        seed: int,
-    ) -> None:
-        self._conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
-        self._retrials = Retrials(self._conditions, run, progress, trials=trials, seed=seed, executor=executor)
-        self._progress, self._each = progress, trials * len(problems)
-
-    def clean(self) -> list[MatrixModel]:
-        """Try the clean scene on every model."""
-        self._begin("trying the clean scene on every model")
-        return [self._control(one) for one in self._conditions]
-
-    def on_each(self, attacked: str, u: Tensor) -> list[MatrixCell]:
-        """Try the answer (d,) to one model on every model."""
-        self._begin(f"trying the answer to {attacked} on every model")
-        checked = {one.name: self._retrials.answer(attacked, u, one) for one in self._conditions}
-        return [
-            MatrixCell(model=name, ending=one.ending.value, verified=verified_rate(one))
-            for name, one in checked.items()
-        ]
-
-    def _begin(self, title: str) -> None:
-        self._progress.stage(title, self._each, hint=f"{self._each} answers; `trials` or `verify_spp` shorten it")
-
-    def _control(self, one: RetrialCondition) -> MatrixModel:
-        problem = one.problem
-        return MatrixModel(
-            model=one.name,
-            labels=list(problem.task.truth_names(problem.truth())),
-            input_size=_size(problem),
-            spp=one.spp,
-            clean=control_group(self._retrials.clean(one), one.spp),
-        )
+def _model(one: RetrialCondition, retrials: Retrials) -> MatrixModel:
+    return MatrixModel(
+        model=one.name,
+        labels=list(one.problem.task.truth_names(one.problem.truth())),
+        input_size=_size(one.problem),
+        spp=one.spp,
+        clean=control_group(retrials.clean(one), one.spp),
+    )
 
 
 def _size(problem: Problem) -> tuple[int, int]:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from typing_extensions import Unpack
 
@@ -51,8 +51,6 @@ from advsearch.scene.gradients import STEP_RANGE, Group, compared
 
 
 class CheckKeywords(PlanKeywords, total=False):
-    """Of `check`."""
-
     all: bool
     loss: Literal["linear", "model", "both"]
 
@@ -149,22 +147,13 @@ def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
         yield config
         return
     for object, environment in SCENES:
-        for control in CONTROLS:
-            if not CONTROLS[control].parameters:
-                continue  # the scene names them
-            if control == "contents" and object == "bottle":
-                continue  # a bottle is closed
-            if control == "sky" and environment != DEFAULT_ENVIRONMENT:
-                continue  # a sky takes the place of the environment
-            yield config.model_copy(
-                update={
-                    "object": object,
-                    "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
-                    "controls": {control: {}},
-                    "label": None,
-                    **settings_alone(config, control, {}),
-                }
-            )
+        own = environment == DEFAULT_ENVIRONMENT
+        left_out = ["contents"] * (object == "bottle") + ["sky"] * (not own)  # it is closed; it would take its place
+        for control, kind in CONTROLS.items():
+            if kind.parameters and control not in left_out:  # of one without, the scene names them
+                place = {"object": object, "environment": None if own else environment, "label": None}
+                alone = {"controls": {control: {}}, **settings_alone(config, control, {})}
+                yield config.model_copy(update={**place, **alone})
 
 
 def _rows_of(part: CheckedPart, parts: int, results: Results, progress: Progress) -> Iterator[CheckedRow]:
@@ -190,25 +179,25 @@ def _line(row: CheckedRow) -> str:
     return f"{row.object}, {row.name} by {row.estimator}: {how}, {row.status}"
 
 
+class _How(NamedTuple):
+    """How single parameters are checked: by what estimators, with what multiples of the step, beside references of so
+    many samples and seeds, with steps so many times as wide."""
+
+    tried: Callable[[Group], list[tuple[str, float]]]
+    high: int
+    repeats: tuple[int, int]
+    factors: Sequence[float]
+
+
 def _linear(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[DerivativeRow]:
     config = part.config
     problem, _ = problem_from_config(config, denoise="none")
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
     problem.renderer.plan = problem.renderer.plan.at_a_pixel()
     loss = smooth_loss(problem.renderer.formation.resolution, config.seed)
-    yield from _rows(
-        problem,
-        part,
-        title,
-        loss,
-        config.spp if isinstance(config.spp, int) else RAW_SPP,
-        results,
-        progress,
-        tried=attempts,
-        high=REFERENCE_SPP,
-        repeats=SEEDS,
-        factors=FACTORS[:2],
-    )
+    spp = config.spp if isinstance(config.spp, int) else RAW_SPP
+    how = _How(attempts, REFERENCE_SPP, SEEDS, FACTORS[:2])
+    yield from _rows(problem, part, title, loss, spp, results, progress, how)
 
 
 def _model(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
@@ -245,19 +234,8 @@ def _model(part: CheckedPart, title: str, results: Results, progress: Progress) 
         )
     renderer.plan, spp = tuned(renderer.plan, table)
     wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
-    for one in _rows(
-        problem,
-        part,
-        title,
-        problem.loss,
-        spp or problem.spp,
-        results,
-        progress,
-        tried=lambda group: [(group.estimator, 1.0)],
-        high=CONVERGED,
-        repeats=FEW_SEEDS,
-        factors=(1.0,),
-    ):
+    how = _How(lambda group: [(group.estimator, 1.0)], CONVERGED, FEW_SEEDS, (1.0,))
+    for one in _rows(problem, part, title, problem.loss, spp or problem.spp, results, progress, how):
         group = f"{one.control}.{one.parameter.partition('.')[0]}"  # coordinates of one have a number behind it
         factor = wider.get(group, 1.0)
         yield one.model_copy(update={"factor": factor, "reference_factor": factor})
@@ -271,13 +249,8 @@ def _rows(
     spp: int,
     results: Results,
     progress: Progress,
-    *,
-    tried: Callable[[Group], list[tuple[str, float]]],
-    high: int,
-    repeats: tuple[int, int],
-    factors: Sequence[float],
+    how: _How,
 ) -> Iterator[DerivativeRow]:
-    """Rows of single parameters, with references of `high` samples, so many seeds, and steps so many times as wide."""
     renderer, seed = problem.renderer, seeds.stream(part.config.seed, "check")
     u = inside(renderer)
     progress.stage(f"{title}: choosing directions")
@@ -290,17 +263,19 @@ def _rows(
 
             def referred(probe: Probe = probe) -> Reference:
                 # what acts on the picture clips: its mean depends on the noise, so both get the same
-                many = spp if probe.group.estimator == "image" else max(spp, high)
-                return reference(renderer, loss, u, probe, seed=seed, spp=many, repeats=repeats, factors=factors)
+                many = spp if probe.group.estimator == "image" else max(spp, how.high)
+                return reference(
+                    renderer, loss, u, probe, seed=seed, spp=many, repeats=how.repeats, factors=how.factors
+                )
 
             references[probe.name] = results.value(_key(part, "reference", [probe]), Reference, referred)
             progress.advance(1)
         sets = _sets(mine)
-        most = sum(len(tried(group[0].group)) for group in sets)
+        most = sum(len(how.tried(group[0].group)) for group in sets)
         progress.stage(f"{title}: gradients for {control}", most, hint=f"{REPEATS} by each estimator", at_most=True)
         for group in sets:
             good: set[str] = set()
-            for estimator, factor in tried(group[0].group):
+            for estimator, factor in how.tried(group[0].group):
                 wanted = group if factor == 1.0 else [one for one in group if one.name not in good]
                 if not wanted:
                     break

@@ -165,7 +165,7 @@ def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
     heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
     heads += [f"{pair.first} alone", f"{pair.second} alone"]
     for name, parts in tables.items():
-        lines = [[value_text(one.value), *_count_cells(one)] for one in parts]
+        lines = [[wording.value_text(one.value), *_count_cells(one)] for one in parts]
         yield AnswerPart(name, heads=heads, rows=lines, only="" if name in told else "page")
     if len(told) < len(tables):
         more = f"The difference varies most over these; the page has all {len(tables)} parameters."
@@ -276,13 +276,6 @@ def _count_cells(one: PairCounts) -> list[str]:
     first, second = (percent(right / one.pairs) for right in one.right)
     difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
     return [str(one.pairs), first, second, difference, str(one.first_only), str(one.second_only)]
-
-
-def value_text(value: AxisValue) -> str:
-    """Return a value of a parameter, or the ends of a part of its range."""
-    if isinstance(value, tuple):
-        return " to ".join(value_text(end) for end in value)
-    return f"{value:.4g}" if isinstance(value, float) else wording.short_name(value)
 
 
 def picture_text(one: PairPicture, pair: ComparedPair) -> str:

@@ -27,7 +27,6 @@ from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.settings import split_names
 from advsearch.viewer import thumbnails
-from advsearch.viewer.columns import Column
 from advsearch.viewer.pages import keep_answer
 
 SWEEP = "sweep"
@@ -35,8 +34,6 @@ SWEEP = "sweep"
 
 
 class CompareKeywords(SampledKeywords, total=False):
-    """Of `compare`."""
-
     object: Names
     task: Named
     grid: dict[str, object]
@@ -174,7 +171,12 @@ class _Pictures:
             ]
             yield PairPicture(
                 number=number,
-                values={one.name: _value(one, number) for one in columns},
+                values={
+                    one.name: float(f"{float(one.data[number]):.6g}")
+                    if one.levels is None
+                    else one.levels[int(one.data[number])]
+                    for one in columns
+                },
                 right=(first if first.right[number] else second).name,
                 answers=(str(first.answers[number]), str(second.answers[number])),
                 pictures=names if len(names) == len(sides) else [],
@@ -215,8 +217,3 @@ class _Pictures:
 
 def _name(pair: int, number: int, place: int) -> str:
     return f"images/pair-{pair}-{number}-{'ab'[place]}.jpg"
-
-
-def _value(column: Column, number: int) -> str | float:
-    value = column.data[number]
-    return column.levels[int(value)] if column.levels is not None else float(f"{float(value):.6g}")

@@ -50,9 +50,7 @@ class Side:
 
     Attributes:
         name: what tells it from the others.
-        folder: of its sweep.
-        config: of its sweep.
-        summary: of its sweep.
+        folder, config, summary: of its sweep.
         named: object, model and answer.
         numbers: (n,) of the pictures in its sweep.
         right: (n,) whether the model is right.

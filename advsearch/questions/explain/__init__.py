@@ -1,7 +1,5 @@
 """`advsearch explain`: where a model is wrong and why, in words, from the rows of sweeps."""
 
-from __future__ import annotations
-
 from advsearch.cli.question import Positional, QuestionCommand
 
 HELP = "say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh renders"

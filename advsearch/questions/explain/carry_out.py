@@ -38,8 +38,6 @@ from advsearch.viewer.pages import keep_answer
 
 
 class ExplainKeywords(RunKeywords, total=False):
-    """Of `explain`."""
-
     confirm: int
     pairs: int
     clusters: int
@@ -76,7 +74,8 @@ def explain_from_config(
     rows = [row for one in asked for row in one.rows]
     if len(rows) < FEWEST_ROWS:
         raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
-    found = observed([(_shown(row), row.correct) for row in rows])
+    values = ({name: (value, row.units.get(name, "")) for name, value in row.values.items()} for row in rows)
+    found = observed([(one, row.correct) for one, row in zip(values, rows, strict=True)])
     choosing, counting = found.halves(config.seed)
     progress.stage("seeking rules on one half of the rows")
     sought = find_rules(choosing, counting, config.seed)
@@ -135,10 +134,6 @@ def _sweeps_of(folder: Path) -> list[Path]:
     if not parts:
         raise InputError(f"explain: expected sweeps, got {folder}, a recipe without one")
     return parts
-
-
-def _shown(row: Answered) -> dict[str, tuple[float | str, str]]:
-    return {name: (value, row.units.get(name, "")) for name, value in row.values.items()}
 
 
 def _together(names: Iterator[str] | Sequence[str]) -> str:

@@ -207,17 +207,10 @@ class Clusters:
 
 
 def find_clusters(features: NDArray[np.float64], seed: int) -> Clusters:
-    """Group failures by k-means over the directions of their features.
+    """Group failures by k-means over the directions of their features (n, F).
 
     How many groups there are is chosen by the mean silhouette (Rousseeuw 1987). They are apart if it is larger than
-    that of each reference, grouped likewise (after Tibshirani, Walther and Hastie 2001).
-
-    Args:
-        features: (n, F), n at least 1.
-        seed: of the references.
-
-    Raises:
-        InputError: scikit-learn is not installed.
+    that of each reference, grouped likewise (after Tibshirani, Walther and Hastie 2001). It takes scikit-learn.
     """
     lengths = np.linalg.norm(features, axis=1, keepdims=True)
     points = features / np.maximum(lengths, 1e-12)

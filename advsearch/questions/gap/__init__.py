@@ -1,7 +1,5 @@
 """`advsearch gap`: the worst case beside the average."""
 
-from __future__ import annotations
-
 from advsearch.cli.question import QuestionCommand
 
 HELP = "compare the worst case with the average over the same space, for each object and each control"

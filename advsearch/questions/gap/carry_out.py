@@ -13,7 +13,6 @@ from advsearch.engine.naming import AnyModel
 from advsearch.progress import Progress, Watched, watcher
 from advsearch.questions.gap.answer import GapResult, GapRow
 from advsearch.questions.gap.settings import GapConfig
-from advsearch.runs.results.attack import AttackSummary, AverageCase
 
 
 @asks(GapConfig, GapKeywords)
@@ -45,18 +44,15 @@ def _compared(study: StudyRun) -> list[GapRow]:
     for (one,) in study.chains:
         summary = study.attack(one)
         if summary is not None and summary.average is not None:
-            rows.append(_row(one.config.object, one.of, summary, summary.average))
+            row = GapRow(
+                object=one.config.object,
+                control=one.of,
+                average=summary.average,
+                worst=summary.verified,
+                ending=summary.ending,
+                margin=summary.verified.margin if summary.verified else None,
+                renders=summary.renders,
+                run=summary.run,
+            )
+            rows.append(row)
     return rows
-
-
-def _row(name: str, control: str, summary: AttackSummary, average: AverageCase) -> GapRow:
-    return GapRow(
-        object=name,
-        control=control,
-        average=average,
-        worst=summary.verified,
-        ending=summary.ending,
-        margin=summary.verified.margin if summary.verified else None,
-        renders=summary.renders,
-        run=summary.run,
-    )

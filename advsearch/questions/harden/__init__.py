@@ -1,7 +1,5 @@
 """`advsearch harden`: train a copy of a model on its worst cases, and measure what came of it."""
 
-from __future__ import annotations
-
 from advsearch.cli.question import QuestionCommand
 
 HELP = "train a copy of a model on its worst cases, and measure it before and after on scenes that training never saw"

@@ -67,8 +67,6 @@ from advsearch.viewer.pages import keep_answer
 
 
 class HardenKeywords(RenderedKeywords, RunKeywords, total=False):
-    """Of `harden`."""
-
     controls: Controls
     spp: int | Literal["auto"] | None
     epsilon: float | Mapping[str, float] | None

@@ -143,15 +143,11 @@ def has_matrix(problem: Problem) -> bool:
 
 
 def lessons(problem: Problem, views: int, seed: int, *, tries: int | None = None, shared: bool = False) -> list[Lesson]:
-    """Draw lessons from one scene whose view and light vary by chance.
+    """Draw lessons from so many views of one scene, each with conditions of its own, drawn by chance.
 
-    Args:
-        problem: with the searched controls, and conditions.
-        views: how many; each has conditions of its own.
-        seed: root of the draws.
-        tries: configurations that are rendered beside each view as it is, where no matrix says the pictures; see
-            `tried`. None for two renders of a view: one of the controls moved, and all of them.
-        shared: let all views have one adversarial texture.
+    Where no matrix says the pictures, `tries` configurations are rendered beside each view as it is (see `tried`); None
+    for two renders of a view: one of the controls moved, and all of them. Views that are `shared` have one adversarial
+    texture.
     """
     linear, quickly, found = has_matrix(problem), problem.renderer.like(quick=True), list[Lesson]()
     right = tuple(int(index) for index in problem.truth())

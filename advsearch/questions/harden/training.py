@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-import torch._dynamo
+import torch._dynamo  # by optimisers, too: before there are scenes, whose changes make Python collect what is new
 import torch.nn.functional as F
 from safetensors import torch as safetensors
 from torch import Tensor, nn

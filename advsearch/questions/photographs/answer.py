@@ -1,10 +1,40 @@
-"""How renderings and photographs of the same configurations agree."""
+"""How renderings and photographs of the same configurations agree, and what the dashboard's server answers about it.
+
+A rendering is named as its file is: a sweep's by the number of its picture, an attack's ``adversarial``, ``clean`` or
+``verification-00``. A photograph comes from a browser, so nothing in it is believed: it is measured before it is
+decoded, cut to the rendering's shape, and written anew without what else its file said (places, names of cameras). The
+page lays a rendering, translucent or its edges, over the camera's picture, after the phone app of 3DB (Leclerc et al.
+2021, appendix D).
+"""
 
 from __future__ import annotations
 
+import hmac
+import importlib
+import io
+import json
+import re
+import time
+from collections.abc import Callable, Sequence
+from email.message import Message
+from http import HTTPStatus
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import quote
+
+from PIL import Image, ImageOps
 from pydantic import Field
 
+from advsearch.errors import InputError
+from advsearch.report import wording
+from advsearch.report.markup import Html, element, join_html
+from advsearch.report.phrases import percent
+from advsearch.runs.directory import IMAGES
 from advsearch.runs.results.base import Fields, Interval
+from advsearch.viewer.document import data_script, document
+from advsearch.viewer.server import Refused
+from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
@@ -42,3 +72,314 @@ class PhotoAgreement(Fields):
         description="95 % Clopper-Pearson interval of the agreement, as if all photographs were independent"
     )
     renderings: list[PhotographedRendering]
+
+
+LARGEST = 16 << 20
+"""Most bytes of a photograph's file."""
+
+MOST_PIXELS = 50_000_000
+"""Of a photograph before it is made smaller; the largest phones take 50 million."""
+
+SIDE = 1024
+"""Longest side of a photograph that is kept, pixels."""
+
+QUALITY = 95
+"""Of its JPEG file, from 1 to 95."""
+
+_NUMBER = re.compile(r"[0-9]{1,12}")
+_NAME = re.compile(r"clean|adversarial|verification-[0-9]{2}")
+_PHOTO = re.compile(r"(?:[0-9]{1,12}|clean|adversarial|verification-[0-9]{2})-[0-9]{4,9}\.jpg")
+
+
+def rendering_file(run: Path, name: str) -> Path:
+    """Return the file of a rendering.
+
+    Raises:
+        InputError: the run has none of that name.
+    """
+    file = None
+    if _NUMBER.fullmatch(name):
+        file = path_of(run, int(name))
+    elif _NAME.fullmatch(name):
+        file = run / IMAGES / f"{name}.png"
+    if file is None or file.is_symlink() or not file.is_file():
+        raise InputError(f"rendering: {run.name} has none called {name[:40]!r}; open its page for those that it has")
+    return file
+
+
+def rendering_names(run: Path) -> tuple[str, ...]:
+    """Return the names of a run's renderings; empty where it kept none."""
+    kept = kept_pictures(run)
+    if kept is not None:
+        return tuple(map(str, kept.numbers))
+    files = sorted((run / IMAGES).glob("*.png"))
+    found = [file.stem for file in files if _NAME.fullmatch(file.stem) and not file.is_symlink()]
+    return tuple(sorted(found, key=lambda name: (name != "adversarial", name)))
+
+
+def photo_file(run: Path, name: str) -> Path:
+    """Return the file of a photograph that was kept.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    file = run / IMAGES / FOLDER / name
+    if not _PHOTO.fullmatch(name) or file.is_symlink() or not file.is_file():
+        raise InputError("photo: there is none of that name")
+    return file
+
+
+def photo_name(rendering: str, number: int) -> str:
+    """Return what the file of a run's photograph `number` is called."""
+    return f"{rendering}-{number:04d}.jpg"
+
+
+def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
+    """Return a photograph as a JPEG of at most `SIDE` pixels a side, its middle cut to a shape.
+
+    Args:
+        data: the file as it was sent: JPEG, PNG or WebP.
+        shape: (width, height) of the rendering; their ratio counts.
+
+    Raises:
+        InputError: it is too large, or no such picture.
+    """
+    if len(data) > LARGEST:
+        raise InputError(f"photo: expected at most {LARGEST >> 20} MB, got more; send a smaller one")
+    bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)
+    try:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise InputError(f"photo: expected at most {MOST_PIXELS:,} pixels, got {image.width} x {image.height}")
+            image.draft("RGB", (2 * SIDE, 2 * SIDE))  # a JPEG is decoded at about the size that is needed
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+    except InputError:
+        raise
+    except bombs:
+        raise InputError(f"photo: expected at most {MOST_PIXELS:,} pixels, got far more") from None
+    except (OSError, SyntaxError, ValueError, EOFError, OverflowError, MemoryError):
+        raise InputError("photo: expected a picture in JPEG, PNG or WebP, got something else or a part") from None
+    width, height = shape
+    shrunk = min(SIDE, max(upright.size)) / max(width, height)
+    size = max(1, round(width * shrunk)), max(1, round(height * shrunk))
+    buffer = io.BytesIO()
+    ImageOps.fit(upright, size, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=QUALITY)
+    return buffer.getvalue()
+
+
+NO_QR = "pip install segno"
+"""What to type where there is nothing to draw a code with."""
+
+
+def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: str, elsewhere: str | None) -> str:
+    """Return the page of a run as HTML: the first of its renderings is shown, `key` is what the server wants to see
+    with a photograph, and `elsewhere` the address by which another device opens the page, if one can."""
+    facts = {"key": key, "names": list(renderings[:1])}
+    align = element("div", _hint(renderings), id="align") if renderings else _without()
+    main = element(
+        "main",
+        align,
+        element("h2", "Renderings and reality"),
+        element("div", table_html(table), id="agreement"),
+        _code(elsewhere),
+    )
+    header = element("header", element("p", "Photographs", class_="eyebrow"), element("h1", f"{run}, photographed"))
+    data = [data_script(facts, "photographing")] if renderings else []
+    scripts = ("make.js", "align.js") if renderings else ()
+    return document(f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True)
+
+
+def _hint(names: Sequence[str]) -> Html:
+    shown = ", ".join(names[:8]) + (f", ... {names[-1]}" if len(names) > 8 else "")
+    first = "Lay a rendering over what the camera sees, move the real object until both agree, and take a photograph."
+    return join_html(
+        element("p", first),
+        element("p", f"Renderings of this run ({len(names)}): {shown}.", class_="soft", id="renderings"),
+        element("noscript", element("p", "The camera needs JavaScript, which is switched off.")),
+    )
+
+
+def _without() -> Html:
+    return element(
+        "p",
+        "This run kept no pictures to align with. An attack keeps them when it ends; a sweep with ",
+        element("code", "keep_pictures=all"),
+        ".",
+    )
+
+
+def _code(address: str | None) -> Html | None:
+    if address is None:
+        return None
+    code = qr_svg(address)
+    drawn = Html(code) if code else element("p", f"A code to point the phone at would stand here: {NO_QR}")
+    return element(
+        "details", element("summary", "Open this page on a phone"), element("div", drawn, class_="qr"),
+        element("pre", address, class_="wrap", tabindex="0"),
+    )  # fmt: skip
+
+
+def qr_svg(address: str) -> str | None:
+    """Return an address as a QR code, an SVG for a page; None where segno is not installed."""
+    made = _made(address)
+    return (
+        None
+        if made is None
+        else str(made.svg_inline(omitsize=True, light="#fff", title="QR code of the address below"))
+    )
+
+
+def qr_text(address: str) -> str | None:
+    """Return an address as a QR code for a terminal; None where segno is not installed."""
+    made, text = _made(address), io.StringIO()
+    if made is None:
+        return None
+    made.terminal(out=text, compact=True)
+    return text.getvalue()
+
+
+def _made(address: str) -> Any:
+    try:
+        return importlib.import_module("segno").make(address, error="m", micro=False)
+    except ImportError:
+        return None
+
+
+def table_html(table: PhotoAgreement) -> Html:
+    """Return the counts of right and wrong answers in rendering and photograph, in all and by rendering."""
+    if not table.photos or table.interval is None:
+        return element("p", "No photographs yet.", class_="soft")
+    heads = ("photographs", "right in the photograph", "wrong in the photograph")
+    head = element("tr", *(element("th", text, scope="col") for text in heads))
+    rows = [
+        _row("right in the rendering", str(table.right_right), str(table.right_wrong)),
+        _row("wrong in the rendering", str(table.wrong_right), str(table.wrong_wrong)),
+    ]
+    agreeing = table.right_right + table.wrong_wrong
+    text = (
+        f"They agree in {agreeing} of {wording.count(table.photos, 'photograph')}: {percent(table.agreement)}, 95 % "
+        f"interval {wording.interval_text(table.interval)}."
+    )
+    several = len({one.model for one in table.renderings}) > 1
+    names = ["rendering", *(["model"] if several else []), "in the rendering", "in photographs", "agree", "interval"]
+    each = element(
+        "table",
+        element("thead", element("tr", *(element("th", text, scope="col") for text in names))),
+        element("tbody", *(_rendering(one, several) for one in table.renderings)),
+    )
+    counts = element("table", element("thead", head), element("tbody", *rows), class_="agreement")
+    return join_html(
+        counts,
+        element("p", text),
+        element("div", each, class_="scroll", tabindex="0", role="region", aria_label="by rendering"),
+    )
+
+
+def _row(name: str, *cells: str) -> Html:
+    return element("tr", element("th", name, scope="row"), *(element("td", one, class_="number") for one in cells))
+
+
+def _rendering(one: PhotographedRendering, several: bool) -> Html:
+    photos = [
+        join_html(element("a", label or "nothing", href=f"photos/{quote(file, safe='')}"), " ")
+        for label, file in zip(one.labels, one.files, strict=True)
+    ]
+    name = element("a", one.rendering, href=f"renderings/{quote(one.rendering, safe='')}")
+    return element(
+        "tr",
+        element("th", name, scope="row"),
+        element("td", one.model) if several else None,
+        element("td", f"{'right' if one.rendering_right else 'wrong'}: {one.label}"),
+        element("td", f"{one.photos_right} of {one.photos} right: ", *photos),
+        element("td", f"{one.agreeing} of {one.photos}", class_="number"),
+        element("td", wording.interval_text(one.interval), class_="number"),
+    )
+
+
+SENDING = 60.0
+"""Seconds in which a photograph has to have come."""
+
+KEY = "X-Advsearch-Key"
+"""The header with which this server's page sends a photograph; another page could not send it."""
+
+Response = tuple[str, bytes]
+
+
+class PhotoTaker(Protocol):
+    """Takes photographs in; `Photographs` does."""
+
+    def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
+        """Judge and keep a photograph, and return the run's table; InputError says why it can't."""
+
+    def agreement(self, run: Path) -> PhotoAgreement:
+        """Return the run's table."""
+
+
+def photographs_html(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> Response:
+    """Return the page of a run's photographs; arguments as for `align_page`."""
+    table = _there(taker).agreement(run)
+    return "text/html; charset=utf-8", align_page(name, rendering_names(run), table, key, elsewhere).encode()
+
+
+def rendering_picture(run: Path, name: str) -> Response:
+    """Return the picture of a rendering."""
+    file = _found(rendering_file, run, name)
+    return "image/png" if file.suffix == ".png" else "image/jpeg", file.read_bytes()
+
+
+def photo(run: Path, name: str) -> Response:
+    """Return a photograph that was kept."""
+    return "image/jpeg", _found(photo_file, run, name).read_bytes()
+
+
+def check_sender(headers: Message, key: str) -> None:
+    """Refuse what this server's own page did not send: it has no origin, or not the key."""
+    given = headers.get(KEY, "").encode("utf-8", "replace")
+    if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), given):
+        raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")
+
+
+def take(taker: PhotoTaker | None, run: Path, name: str, data: Callable[[], bytes]) -> Response:
+    """Take a photograph of a rendering in; `data` reads what was sent, once there is something to compare it with. It
+    is refused where there is no such rendering, or it is no photograph."""
+    _found(rendering_file, run, name)
+    try:
+        table = _there(taker).add(run, name, data())
+    except InputError as error:
+        raise Refused(HTTPStatus.BAD_REQUEST, str(error)) from None
+    return "application/json", json.dumps({"table": str(table_html(table))}).encode()
+
+
+def request_body(headers: Message, stream: BufferedIOBase) -> bytes:
+    """Return what was sent along; nothing is read of what says that it is larger than `LARGEST`.
+
+    Raises:
+        Refused: it is too large, says no length, or does not come.
+    """
+    length = headers.get("Content-Length", "")
+    if not re.fullmatch(r"[0-9]{1,15}", length):
+        raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
+    if int(length) > LARGEST:
+        raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST >> 20} MB")
+    parts, left, end = [], int(length), time.monotonic() + SENDING
+    while left:
+        part = stream.read1(min(left, 1 << 16)) if time.monotonic() < end else b""
+        if not part:
+            raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
+        parts.append(part)
+        left -= len(part)
+    return b"".join(parts)
+
+
+def _there(taker: PhotoTaker | None) -> PhotoTaker:
+    if taker is None:
+        raise Refused(HTTPStatus.NOT_FOUND, "this server takes no photographs; advsearch dashboard does")
+    return taker
+
+
+def _found(find: Callable[[Path, str], Path], run: Path, name: str) -> Path:
+    """The file that `find` returns; what it says of one that is not there becomes the answer."""
+    try:
+        return find(run, name)
+    except InputError as error:
+        raise Refused(HTTPStatus.NOT_FOUND, str(error)) from None

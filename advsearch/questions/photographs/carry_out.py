@@ -26,8 +26,17 @@ from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
-from advsearch.questions.photographs.answer import FOLDER, LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
-from advsearch.questions.photographs.serving import LARGEST, photo_name, rendering_file, sound_photo
+from advsearch.questions.photographs.answer import (
+    FOLDER,
+    LARGEST,
+    LOOSE_PHOTO,
+    PHOTO,
+    PhotoAgreement,
+    PhotographedRendering,
+    photo_name,
+    rendering_file,
+    sound_photo,
+)
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
@@ -84,12 +93,8 @@ class Photographs:
         self._thread = ThreadPoolExecutor(1, "photographs")  # a scene is used by the thread that has loaded it
 
     def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
-        """Judge a photograph by the models and the task of a run, keep both beside the rendering, and return the table.
-
-        Args:
-            run: its folder.
-            rendering: the name of what the photograph was aligned with.
-            data: the file as it was sent.
+        """Judge a photograph by the models and the task of a run, keep both beside the rendering that it was aligned
+        with, and return the table.
 
         Raises:
             InputError: there is no such rendering, it is no photograph, another process works on the run, or its scene
@@ -98,17 +103,12 @@ class Photographs:
         return self._thread.submit(self._add, run, rendering, data, "").result()
 
     def add_files(self, run: Path, files: Sequence[Path]) -> None:
-        """Judge the photographs among some that the run does not have yet, known by the names of their files.
+        """Judge the photographs among some files that the run, of a sweep of one object, does not have yet, by their
+        names.
 
         A file ``rendering-12.jpg``, or ``rendering-12-`` and anything, was aligned with the rendering 12. All others
-        show the object as it stood by chance: they are judged, but are compared with no single rendering.
-
-        Args:
-            run: its folder, of a sweep of one object.
-            files: in JPEG, PNG or WebP.
-
-        Raises:
-            InputError: as for `add`; the message names the file.
+        show the object as it stood by chance: they are judged, but are compared with no single rendering. Errors are
+        those of `add`.
         """
         with Store(run / NAME, read_only=True) as store:
             known = {_source(row) for kind in (PHOTO, LOOSE_PHOTO) for row in store.rows(kind)}

@@ -49,8 +49,6 @@ from advsearch.scene.transport.matrix import SPP
 
 
 class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):
-    """Of `plan`."""
-
     objective: str | None
     seconds: float | None
 
@@ -299,22 +297,12 @@ def measured_gains(
     depth: int | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> list[GainRow]:
-    """Put back what is left out, item by item and all at once, and measure a gradient.
+    """Put back what a renderer leaves out, item by item and all at once, and measure a gradient of a loss at u (d,).
 
-    Args:
-        renderer: with everything left out.
-        loss: what is differentiated.
-        u: (d,) where.
-        seed: root of the noise.
-        spp: samples a pixel.
-        repeats: timed gradients of each.
-        depth: longest light path of the search, where it is shorter than the scene's.
-        tick: called after each gradient.
-
-    Returns:
-        One row for each item, one for all, and where light transport can predict the pictures of a search one for that
-            too: against a rendered gradient, with a share of the making as large as the shortest search that predicts
-            has, its picture beside one of as many samples as its own.
+    `depth` is the longest light path of the search, where it is shorter than the scene's; `tick` is called after each
+    gradient. There is one row for each item, one for all, and where light transport can predict the pictures of a
+    search one for that too: against a rendered gradient, with a share of the making as large as the shortest search
+    that predicts has, its picture beside one of as many samples as its own.
     """
     scene = renderer.scene
     depth = scene.max_depth if depth is None else depth

@@ -1,7 +1,5 @@
 """`advsearch precision`: error against run time, as a table, JSON and diagrams."""
 
-from __future__ import annotations
-
 from advsearch.cli.question import QuestionCommand
 
 HELP = "measure error against run time, draw it, and recommend settings"

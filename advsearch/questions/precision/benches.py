@@ -103,16 +103,8 @@ def variants(
 
 
 class PictureBench:
-    """Renders one configuration in every variant and compares it with references.
-
-    Args:
-        renderer: of the run.
-        u: (d,) the configuration.
-        margin: the model's.
-        chosen: the variants.
-        elsewhere: from a family and samples to what carries out parts of its reference, if not this process.
-        there: (d,) where predictions are made, from which they predict the configuration; None for itself.
-    """
+    """Renders one configuration (d,) in every variant and compares it with references, whose parts, of a family and
+    samples, something else may carry out. Predictions are made `there`, at the configuration itself by default."""
 
     def __init__(
         self,

@@ -60,8 +60,6 @@ from advsearch.viewer.pages import keep_answer
 
 
 class PrecisionKeywords(DerivativeKeywords, NamedKeywords, total=False):
-    """Of `precision`."""
-
     objective: str | None
     quantities: Names
     seconds: float
@@ -143,9 +141,9 @@ def _measured(config: PrecisionConfig, run: RunDirectory | None, progress: Progr
             left = config.seconds
             for number, part in enumerate(parts):
                 share = part.share / math.fsum(one.share for one in parts[number:])
-                stored = results.get(part.name, partial(part.timed, TimeBudget(share * left)))
-                left = max(0.0, left - stored["seconds"])
-                yield Section.of(stored["section"])
+                stored = results.value(part.name, TimedSection, partial(part.timed, TimeBudget(share * left)))
+                left = max(0.0, left - stored.seconds)
+                yield stored.section
 
         def result(sections: Sequence[Section], ending: str) -> PrecisionResult:
             whole = Section(config.pixel_sampler)
@@ -205,6 +203,14 @@ VERIFY_SPP, VERIFY_RENDERS = 64, 4
 IMAGE = "image"
 
 
+@dataclass
+class TimedSection:
+    """What was measured in one sitting, and the seconds that it took."""
+
+    section: Section
+    seconds: float
+
+
 class MeasuredPart(NamedTuple):
     """What is measured in one sitting: of a quantity, under a name of its own, in a share of the time."""
 
@@ -213,11 +219,10 @@ class MeasuredPart(NamedTuple):
     share: float
     measure: Callable[[TimeBudget], Section]
 
-    def timed(self, budget: TimeBudget) -> JsonObject:
-        """Measure, and return what came out and the seconds that it took, as JSON values."""
+    def timed(self, budget: TimeBudget) -> TimedSection:
+        """Measure, and return what came out and the seconds that it took."""
         begun = time.perf_counter()
-        section = self.measure(budget)
-        return {"section": section.to_dict(), "seconds": time.perf_counter() - begun}
+        return TimedSection(self.measure(budget), time.perf_counter() - begun)
 
 
 @dataclass

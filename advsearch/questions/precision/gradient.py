@@ -126,15 +126,10 @@ def theory_of(estimator: str, sampler: str) -> Theory:
 
 
 class GradientBench:
-    """Takes gradients of one part of a space by every estimator and compares them with a reference.
+    """Takes gradients (d,) of one part of a space at u by every estimator and compares them with a reference.
 
-    Args:
-        renderer: in the formation that the gradient is of.
-        loss: what is differentiated.
-        u: (d,) where.
-        part: of what.
-        exact: renders the same with a better sampler, for references; None takes the renderer itself.
-        elsewhere: from a way to take it and samples to what carries out parts of the reference, if not this process.
+    References are taken with a renderer that does the same with a better sampler, and by what carries out parts of
+    them, of a way to take it and samples, if not this process.
     """
 
     def __init__(

@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
+from scipy.stats import linregress
 
 from advsearch.questions.precision.answer import PrecisionSlope, Recommended
 
@@ -239,7 +240,7 @@ def fit_line(points: Sequence[Point], against: Against = "samples", theory: Theo
         sampling = [point for point in known if fixed <= MOSTLY_SAMPLING * point.seconds]
         holds = _counts(sampling) >= LEAST_POINTS
         known = sampling if holds else known
-    x = np.log([_across(point, against) for point in known])
+    x = np.log([float(one.setting.spp) if against == "samples" else one.seconds for one in known])
     y = np.log([point.error for point in known])
     slope, offset, half = straight_line(x, y)
     setting = known[0].setting
@@ -263,13 +264,9 @@ def fit_line(points: Sequence[Point], against: Against = "samples", theory: Theo
 def straight_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
     """Return slope and offset of the least-squares line through (n,) and (n,), n at least 3, and half the slope's 95 %
     interval."""
-    count, across = len(x), x - x.mean()
-    spread = float(across @ across)
-    slope = float(across @ (y - y.mean())) / spread
-    offset = float(y.mean() - slope * x.mean())
-    rest = y - offset - slope * x
-    error = math.sqrt(float(rest @ rest) / (count - 2) / spread)
-    return slope, offset, float(stdtrit(count - 2, (1.0 + LEVEL) / 2.0)) * error
+    line = linregress(x, y)
+    half = float(stdtrit(len(x) - 2, (1.0 + LEVEL) / 2.0)) * float(line.stderr)
+    return float(line.slope), float(line.intercept), half
 
 
 def fixed_seconds(points: Sequence[Point]) -> float:
@@ -317,13 +314,8 @@ def levels_off(points: Sequence[Point]) -> bool:
 def recommend(
     lines: Mapping[tuple[str, str, str], Sequence[Point]], goal: float, round_up: RoundUp | None = None
 ) -> Recommended | None:
-    """Return the setting with the least time that reaches a relative error; None where none is known to.
-
-    Args:
-        lines: the points of each line, all of one measure.
-        goal: relative error, over 0.
-        round_up: what sample counts a series takes; None for all whole numbers.
-    """
+    """Return the setting with the least time that reaches a relative error, over 0, by the points of each line; None
+    where none is known to. `round_up` says what sample counts a series takes."""
     found = [one for points in lines.values() if (one := reaching(points, goal, round_up)) is not None]
     return min(found, key=lambda one: one.seconds or 0.0, default=None)
 
@@ -444,10 +436,6 @@ def _number_at(ordered: Sequence[Point], spp: int, what: Literal["seconds", "err
 
 def _counts(points: Sequence[Point]) -> int:
     return len({point.setting.spp for point in points})
-
-
-def _across(point: Point, against: Against) -> float:
-    return float(point.setting.spp) if against == "samples" else point.seconds
 
 
 def _agrees(slope: float, half: float, theory: Theory) -> bool | None:

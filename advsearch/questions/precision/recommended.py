@@ -7,9 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from pydantic import TypeAdapter
-
-from advsearch.files import JsonObject
 from advsearch.questions.precision.answer import (
     NotMeasured,
     PrecisionPoint,
@@ -70,16 +67,6 @@ class Section:
     left_out: tuple[MeasuredSetting, ...] = ()
     warnings: list[str] = field(default_factory=list)
 
-    def to_dict(self) -> JsonObject:
-        """Return JSON values, of which `of` makes the same again."""
-        values: JsonObject = TypeAdapter(Section).dump_python(self, mode="json")
-        return values
-
-    @classmethod
-    def of(cls, values: JsonObject) -> Section:
-        """Return what `to_dict` was made of."""
-        return TypeAdapter(cls).validate_python(values)
-
     def extend(self, more: Section) -> None:
         """Add what was measured in another part of the work."""
         self.lines += more.lines
@@ -123,10 +110,9 @@ def report_of(section: Section, goal: float, **asked: Any) -> PrecisionResult:
     slopes, warnings = [], list(section.warnings)
     for one in section.lines:
         for against in AGAINST:
-            slope = fit_line(one.points, against, one.theory)
-            said = None if slope is None else warning_of(slope, one.points)
-            slopes += [] if slope is None else [slope]
-            warnings += [] if said is None else [said]
+            if (slope := fit_line(one.points, against, one.theory)) is not None:
+                slopes.append(slope)
+                warnings += filter(None, [warning_of(slope, one.points)])
     return PrecisionResult(
         **asked,
         goal=goal,
@@ -174,24 +160,21 @@ def _together(by_measure: Mapping[str, Point], family: str | None) -> PrecisionP
 
 def _objective_points(section: Section) -> list[PrecisionPoint]:
     best = _best(section)
-    found = []
-    for setting, curve in section.curves:
-        shares = missing(curve, best, section.start)
+    return [
+        PrecisionPoint(
+            **vars(_place(setting)),
+            renders=renders,
+            seconds=seconds,
+            repeats=curve.repeats,
+            error=share,
+            objective=middle,
+            quartiles=(low, high),
+        )
+        for setting, curve in section.curves
         for renders, seconds, (low, middle, high), share in zip(
-            curve.renders, curve.seconds, curve.objective, shares, strict=True
-        ):
-            found.append(
-                PrecisionPoint(
-                    **vars(_place(setting)),
-                    renders=renders,
-                    seconds=seconds,
-                    repeats=curve.repeats,
-                    error=share,
-                    objective=middle,
-                    quartiles=(low, high),
-                )
-            )
-    return found
+            curve.renders, curve.seconds, curve.objective, missing(curve, best, section.start), strict=True
+        )
+    ]
 
 
 def _best(section: Section) -> float:

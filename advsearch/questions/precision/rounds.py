@@ -72,21 +72,13 @@ def in_rounds(
     warm_up: int = 1,
     on_done: Callable[[MeasuredSetting], None] | None = None,
 ) -> Rounds[Result]:
-    """Measure settings in rounds until the rounds are done or the budget is used up; the first of all is always
+    """Measure settings, cheapest first, in rounds until these are done or the budget is used up; the first is always
     measured.
 
     In the first round a setting is begun only if `least` calls of it, and those that the settings before it still need
-    for as many, fit into what is left; see `Forecast`.
-
-    Args:
-        settings: what to measure, cheapest first.
-        measure: see `Measure`; gets a seed that no other call gets.
-        budget: when to stop. A call that should not fit is not begun: it is kept to within a setting's first calls.
-        rounds: calls of each setting, at least 1, warm-up aside.
-        seed: root of the seeds.
-        least: see above.
-        warm_up: so many calls more of every setting in the first round, whose calls compile and record kernels.
-        on_done: told about every call.
+    for as many, fit into what is left (see `Forecast`); it has `warm_up` calls more, which compile and record kernels.
+    A call that should not fit is not begun: a budget is kept to within a setting's first calls. Each call has a seed of
+    its own.
     """
     ordered = sorted(settings, key=lambda one: one.cost)
     found: Rounds[Result] = Rounds()

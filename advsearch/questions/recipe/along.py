@@ -213,7 +213,13 @@ def _compute_scaling(table: Table, options: Options) -> ScalingFigure:
     fewest = min(count for count, _, _ in rates)
     alone = {name: rate for (count, _, name), rate in rates.items() if count == fewest}
     points = [
-        _point(count, [(rate, alone.get(name)) for (other, _, name), rate in rates.items() if other == count])
+        ScalingPoint(
+            workers=count,
+            rates=[rate for (other, _, _), rate in rates.items() if other == count],
+            gains=[
+                rate / alone[name] for (other, _, name), rate in rates.items() if other == count and alone.get(name)
+            ],
+        )
         for count in sorted({count for count, _, _ in rates})
     ]
     return ScalingFigure(
@@ -232,12 +238,6 @@ def _rate(rows: Sequence[Answered]) -> float:
     if not times or times[-1] <= begun:
         raise InputError("figures: scaling: expected runs of several batches; ask for more `samples`, or set `batch`")
     return sum(time > begun for time in times) / (times[-1] - begun)
-
-
-def _point(workers: int, rates: Sequence[tuple[float, float | None]]) -> ScalingPoint:
-    return ScalingPoint(
-        workers=workers, rates=[rate for rate, _ in rates], gains=[rate / base for rate, base in rates if base]
-    )
 
 
 def _said_scaling(points: Sequence[ScalingPoint], cores: int) -> list[str]:

@@ -56,8 +56,6 @@ from advsearch.viewer.pages import keep_answer
 
 
 class RecipeKeywords(RunKeywords, total=False):
-    """Of `recipe`."""
-
     quick: bool
     photographs: str | Path | None
     object: Path | Names | None

@@ -162,10 +162,7 @@ def recipe_yaml(name: str) -> str:
 
 
 def read_recipe(name: str) -> Recipe:
-    """Return a recipe.
-
-    Args:
-        name: of a bundled recipe, or a YAML file: it has a suffix, or a folder before it.
+    """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or a folder before it.
 
     Raises:
         UnknownNameError: there is no such recipe.
@@ -219,12 +216,8 @@ ANY = "*"
 
 
 def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where: str) -> None:
-    """Refuse a figure of a part or of a column that there is not.
-
-    Args:
-        recipe: as its file says it.
-        columns: for each part that is carried out, parameters that its rows will have.
-        where: the recipe, for messages.
+    """Refuse a figure of a part or of a column that there is not. `columns` are the parameters that the rows of each
+    part will have, and `where` is the recipe.
 
     Raises:
         UnknownNameError: a figure names one; the message says which figure.
@@ -360,13 +353,8 @@ FIGURES: dict[str, FigureKind[Any, Any]] = {
 
 
 def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
-    """Return the kind of a figure and its options, as they stand in a recipe, with its kind as `figure`; `where` is the
-    recipe.
-
-    Raises:
-        UnknownNameError: there is no such kind.
-        FileFormatError: an option is missing, unknown, or of another kind.
-    """
+    """Return the kind of a figure and its options, as they stand in the recipe `where`, with its kind as `figure`; an
+    UnknownNameError or a FileFormatError where there is none of that kind, or such an option."""
     given = dict(described)
     kind = str(given.pop("figure", ""))
     if kind not in FIGURES:

@@ -132,7 +132,11 @@ class CuesOptions(Options):
 
 def _compute_cues(table: Table, options: CuesOptions) -> CuesFigure:
     rows = [
-        _row_cues(name, inside, options.classes.get(name, [])) for name, inside in table.by(options.texture).items()
+        CuesRow(
+            **counted(name, inside).model_dump(),
+            textured=sum(_names(row.answer, options.classes.get(name, [])) for row in inside),
+        )
+        for name, inside in table.by(options.texture).items()
     ]
     cells = _cells(table, options)
     total = sum(one.answers for one in cells)
@@ -144,7 +148,11 @@ def _compute_cues(table: Table, options: CuesOptions) -> CuesFigure:
     return CuesFigure(
         figure="cues",
         title=options.title or "Answers by shape and by texture",
-        text=[*_by_texture(table, options, rows), *_which(predicted, difference), *_hardest(rows)],
+        text=[
+            *_by_texture(table, options, rows),
+            *_which(predicted, difference),
+            *extremes(rows, "The hardest texture", "the easiest", "textures"),
+        ],
         shape=options.shape,
         texture=options.texture,
         predicted=predicted,
@@ -152,10 +160,6 @@ def _compute_cues(table: Table, options: CuesOptions) -> CuesFigure:
         difference_interval=None if difference is None else difference[1],
         rows=rows,
     )
-
-
-def _row_cues(name: str, rows: list[Answered], classes: list[str]) -> CuesRow:
-    return CuesRow(**counted(name, rows).model_dump(), textured=sum(_names(row.answer, classes) for row in rows))
 
 
 def _names(answer: str, classes: list[str]) -> bool:
@@ -190,13 +194,10 @@ def _cells(table: Table, options: CuesOptions) -> list[_Cell]:
         same_texture = [one for (s, t), more in inside.items() if t == texture and s != shape for one in more]
         count = min(len(same_shape), len(same_texture))
         if count:
-            first = [_most(generator.sample(one, count)) for one in (same_shape, same_texture)]
+            drawn = (Counter(generator.sample(one, count)).items() for one in (same_shape, same_texture))
+            first = [min(each, key=lambda one: (-one[1], one[0]))[0] for each in drawn]
             found.append(_Cell(len(answers), answers.count(first[0]), answers.count(first[1])))
     return found
-
-
-def _most(answers: Sequence[str]) -> str:
-    return min(Counter(answers).items(), key=lambda one: (-one[1], one[0]))[0]
 
 
 def _difference(cells: Sequence[_Cell]) -> tuple[float, Interval] | None:
@@ -249,10 +250,6 @@ def _which(predicted: Sequence[NamedCount], difference: tuple[float, Interval] |
     if high < 0.0:
         return [f"{said}: the model goes more by texture than by shape."]
     return [f"{said}: no difference is shown."]
-
-
-def _hardest(rows: list[CuesRow]) -> list[str]:
-    return extremes(rows, "The hardest texture", "the easiest", "textures")
 
 
 def _draw_cues(made: CuesFigure, figure: Any, run: Path) -> None:

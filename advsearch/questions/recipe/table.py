@@ -167,14 +167,8 @@ def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str, ve
     """Return which of several has the lowest accuracy and which the highest, and whether that is more than chance.
 
     The two were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k,
-    which hold for all k together (Bonferroni). Where these overlap, no difference is shown.
-
-    Args:
-        counts: of each.
-        worst: what the lowest is called: "Hardest".
-        best: what the highest is called: "easiest".
-        thing: what they are, for several of them: "environments".
-        verb: what is counted.
+    which hold for all k together (Bonferroni). Where these overlap, no difference is shown. They are called, say,
+    "Hardest" and "easiest", several of them "environments", and `verb` is what is counted.
     """
     known = [one for one in counts if one.configurations]
     if len(known) < 2:

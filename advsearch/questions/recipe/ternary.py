@@ -29,7 +29,10 @@ class TernaryOptions(Options):
 
 
 def _compute(table: Table, options: TernaryOptions) -> TernaryFigure:
-    mixtures = [_mixture(values) for values in zip(*(table.numbers(name) for name in options.shares), strict=True)]
+    drawn = zip(*(table.numbers(name) for name in options.shares), strict=True)
+    mixtures: list[Shares] = [
+        (a / (a + b + c or 1.0), b / (a + b + c or 1.0), c / (a + b + c or 1.0)) for a, b, c in drawn
+    ]
     places = [_cell_of(one, options.side) for one in mixtures]
     given = most_frequent(table.rows)
     answers = [_answer(name, table.rows, mixtures, places, options) for name, _ in given[: options.most]]
@@ -49,12 +52,6 @@ def _compute(table: Table, options: TernaryOptions) -> TernaryFigure:
         answers=answers,
         leads=leads,
     )
-
-
-def _mixture(values: Sequence[float]) -> Shares:
-    total = sum(values) or 1.0
-    a, b, c = (value / total for value in values)
-    return a, b, c
 
 
 def _cell_of(mixture: Shares, side: int) -> tuple[int, int, bool]:

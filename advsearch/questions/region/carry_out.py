@@ -44,8 +44,6 @@ from advsearch.viewer.pages import keep_answer
 
 
 class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
-    """Of `region`."""
-
     around: str | None
     vary: Names | None
     samples: int
@@ -340,23 +338,14 @@ noise have taken."""
 def grow(
     same: Same, centre: Tensor, *, seed: int, samples: int = 200, on_check: Callable[[], None] = lambda: None
 ) -> GrownBox:
-    """Grow a box around the centre, then check it with samples that nothing was fitted to.
+    """Grow a box around the centre (d,) in [0, 1], then check it with `samples` points that nothing was fitted to.
 
     Each face in turn tries to move out by a share of what is left to the bound (1/2 at first, halved at every level at
     which no face can move any more). The slab that it would win is probed at random points; if all have the centre's
     answer, it moves. Growing ends after `MOST_PROBED` pictures for each parameter at the latest. Then the box is
     sampled; on an exception, the face that cuts off the least of the box moves in to it and the box is sampled anew,
-    with other seeds, `ATTEMPTS` times at most; the last check counts whatever it shows.
-
-    Args:
-        same: judges a configuration.
-        centre: (d,) in [0, 1].
-        seed: root of the random points.
-        samples: of the final check, at least 1.
-        on_check: told the beginning of each final check.
-
-    Raises:
-        InputError: the centre is not in the unit box, or samples is under 1.
+    with other seeds, `ATTEMPTS` times at most; the last check counts whatever it shows. `on_check` is told the
+    beginning of each.
     """
     if samples < 1:
         raise InputError(f"samples: expected at least 1, got {samples}")

@@ -11,7 +11,7 @@ from advsearch.settings import setting, setting_as_in
 
 FEWEST_SAMPLES = 8
 """With fewer, not even a box without exceptions has one verdict in more than half of it, at the confidence of
-`questions.region.growing.Region.interval`."""
+`questions.region.carry_out.GrownBox.interval`."""
 
 
 class RegionConfig(SceneConfig):

@@ -1,7 +1,5 @@
 """`advsearch replay`: the answer of a run under other conditions, in one table."""
 
-from __future__ import annotations
-
 from advsearch.cli.question import Positional, QuestionCommand
 
 HELP = "render the answer of a run again under other conditions, beside the clean scene"

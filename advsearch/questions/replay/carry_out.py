@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -158,8 +158,6 @@ def _sensor(values: dict[str, float]) -> Callable[[Tensor, int], Tensor]:
 
 
 class ReplayKeywords(RunKeywords, total=False):
-    """Of `replay`."""
-
     ways: Names | None
     model: Names | None
     trials: int
@@ -221,8 +219,9 @@ def replay_from_config(
         table = _Table(ways, u, config.trials, seed, run, progress)
         try:
             with interruptible():
-                for batch in _batches(ways):
-                    table.fill(batch)
+                table.fill([number for number, way in enumerate(ways) if way.shares])
+                for number in (number for number, way in enumerate(ways) if not way.shares):
+                    table.fill([number])
         except KeyboardInterrupt:
             ending = INTERRUPTED
         result = ReplayResult(
@@ -247,8 +246,7 @@ def replay_from_config(
 
 @dataclass
 class _Table:
-    """The rows so far, by the place of their condition among all ways; the answer (d,), and the pictures that were
-    rendered."""
+    """The rows so far, by the place of their condition among all, for an answer (d,), and the pictures rendered."""
 
     ways: Sequence[Way]
     u: torch.Tensor
@@ -262,48 +260,38 @@ class _Table:
     def fill(self, batch: Sequence[int]) -> None:
         """Add the rows of some conditions that share their renders: the clean scene under all of them, then the answer.
         A condition that cannot be had, or that Blender fails at, gets a row that says why."""
-        ways = [self.ways[number] for number in batch]
-        missing = next((way.missing for way in ways if way.missing), "")
+        ways = {number: self.ways[number] for number in batch}
+        missing = next((way.missing for way in ways.values() if way.missing), "")
         try:
             if not missing:
-                self._try(batch, ways)
+                self._try(ways)
         except BlenderError as error:
             missing = str(error)
-        if missing:
-            self.rows |= {
-                number: ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=missing)
-                for number, way in zip(batch, ways, strict=True)
-            }
+        for number, way in ways.items() if missing else ():
+            self.rows[number] = ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=missing)
 
-    def _try(self, batch: Sequence[int], ways: Sequence[Way]) -> None:
-        names = ", ".join(dict.fromkeys(way.name for way in ways))
-        text = names if len(ways) > 1 else f"{names}: {ways[0].text}"
+    def _try(self, ways: Mapping[int, Way]) -> None:
+        text = ", ".join(dict.fromkeys(way.name for way in ways.values()))
+        text += "".join(f": {way.text}" for way in ways.values()) if len(ways) == 1 else ""
         total = 2 * self.trials * len(ways)
         self.progress.stage(f"replaying, {text}", total, hint="`trials` or `ways` shorten it")
-        conditions = [way.condition() for way in ways]
-        renderers = {id(one.problem.renderer): one.problem.renderer for one in conditions}.values()
+        conditions = {number: way.condition() for number, way in ways.items()}
+        renderers = {id(one.problem.renderer): one.problem.renderer for one in conditions.values()}.values()
         before = sum(one.renders for one in renderers)
-        retrials = Retrials(conditions, self.run, self.progress, trials=self.trials, seed=self.seed)
+        retrials = Retrials([*conditions.values()], self.run, self.progress, trials=self.trials, seed=self.seed)
         try:
-            for condition in conditions:
-                retrials.clean(condition)
-            for number, way, condition in zip(batch, ways, conditions, strict=True):
+            clean = {number: retrials.clean(condition) for number, condition in conditions.items()}
+            for number, condition in conditions.items():
                 checked = retrials.answer("answer", self.u, condition)
                 self.rows[number] = ReplayRow(
-                    way=way.name,
-                    condition=way.text,
+                    way=ways[number].name,
+                    condition=ways[number].text,
                     ending=checked.ending.value,
-                    clean=control_group(retrials.clean(condition), condition.spp),
+                    clean=control_group(clean[number], condition.spp),
                     verified=verified_rate(checked),
                 )
         finally:
             self.renders += sum(one.renders for one in renderers) - before
-
-
-def _batches(ways: Sequence[Way]) -> list[list[int]]:
-    """The places of the conditions that share their renders, and each of the others by itself."""
-    sharing = [number for number, way in enumerate(ways) if way.shares]
-    return [sharing, *([number] for number, way in enumerate(ways) if not way.shares)]
 
 
 def _changed(folder: Path, parts: AttackParts) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
+from advsearch.cli.output import at_work
 from advsearch.cli.question import QuestionCommand
 
 if TYPE_CHECKING:
@@ -37,25 +38,20 @@ class _Stability(QuestionCommand):
         """Run the cases, or list them."""
         if not args.list:
             return super().run(args)
-        # these take longer to import than `--help` takes
-        from advsearch.cli.flags import config_from
-        from advsearch.cli.output import at_work
-        from advsearch.questions.stability.settings import StabilityConfig
-
-        config = config_from(args, StabilityConfig)
         with at_work(as_json=args.json, quiet=args.quiet):
             # late, so that --help answers at once
-            from advsearch.questions.stability.carry_out import (
-                chosen,
-            )  # torch and the renderer, which `--help` leaves out
+            from advsearch.cli.flags import config_from
+            from advsearch.questions.stability.carry_out import chosen
+            from advsearch.questions.stability.settings import StabilityConfig
 
+            config = config_from(args, StabilityConfig)
             cases = chosen(config.cases, config.groups)
         return _print_cases(cases, as_json=args.json)
 
 
 def _print_cases(cases: Sequence[Case], *, as_json: bool) -> int:
-    listed = [{"case": one.name, "group": one.group, "control": one.control, "holds": one.holds} for one in cases]
     if as_json:
+        listed = [{"case": one.name, "group": one.group, "control": one.control, "holds": one.holds} for one in cases]
         output.print_json({"schema": 1, "command": "stability", "cases": listed})
     else:
         rows = [[one.group, one.name, one.holds] for one in cases]

@@ -31,8 +31,6 @@ CASES: tuple[Case, ...] = tuple(case for group in _GROUPS for case in group.case
 
 
 class StabilityKeywords(RunKeywords, total=False):
-    """Of `stability`."""
-
     case: Names | None
     group: Names | None
     seconds: float | None

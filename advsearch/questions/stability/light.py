@@ -205,13 +205,7 @@ _MOVED = "values are rendered inside the range in which the adjoint is right (me
 
 @dataclass(frozen=True, eq=False)
 class GlassBall(ScenePart):
-    """A ball of clear glass; nothing of it varies.
-
-    Attributes:
-        name: of the part.
-        place: (3,) of its middle.
-        radius: in object sizes.
-    """
+    """A ball of clear glass, in object sizes; nothing of it varies."""
 
     place: tuple[float, float, float]
     radius: float

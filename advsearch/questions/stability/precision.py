@@ -186,12 +186,7 @@ def accumulation() -> Outcome:
 
 
 def rendered(path: str, count: int) -> None:
-    """Render with a number of threads and save what comes out; run in a process of its own.
-
-    Args:
-        path: the .npz file to write.
-        count: threads of Dr.Jit.
-    """
+    """Render with so many threads of Dr.Jit and save what comes out in an .npz file; run in a process of its own."""
     threads.configure(count)
     loss = smooth_loss((SIZE, SIZE))
     raw, denoised = small("mug", TEXTURE), small("mug", SHIFT, denoise="oidn")

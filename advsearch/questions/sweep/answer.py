@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from advsearch.report import wording
 from advsearch.report.claims import Claim, Extent, claim, extent_of, share_text
@@ -96,8 +95,8 @@ def _table(name: str, rows: Sequence[AxisRow]) -> AnswerPart:
         title += f" (the {len(listed)} of {len(rows)} values where the model is right least often)"
     lines = [
         [
-            _value(row.value),
-            _bar(row.accuracy or 0.0),
+            wording.value_text(row.value),
+            "#" * (filled := round((row.accuracy or 0.0) * BAR)) + "." * (BAR - filled),
             percent(row.accuracy),
             f"{row.correct} of {row.configurations}",
             wording.interval_text(row.interval),
@@ -105,17 +104,6 @@ def _table(name: str, rows: Sequence[AxisRow]) -> AnswerPart:
         for row in listed
     ]
     return AnswerPart(title, rows=lines)
-
-
-def _bar(share: float) -> str:
-    filled = round(share * BAR)
-    return "#" * filled + "." * (BAR - filled)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, (list, tuple)):
-        return " to ".join(_value(end) for end in value)
-    return f"{value:.4g}" if isinstance(value, float) else wording.short_name(value)
 
 
 def _facts(summary: SweepSummary) -> dict[str, str]:
@@ -131,7 +119,7 @@ def _facts(summary: SweepSummary) -> dict[str, str]:
 
 def _configuration(worst: WorstConfiguration) -> str:
     outer = ("object", "environment", "model")
-    names = [f"{name} {_value(one.value)}" for name, one in worst.values.items() if name not in outer]
+    names = [f"{name} {wording.value_text(one.value)}" for name, one in worst.values.items() if name not in outer]
     return ", ".join(
         [*(wording.short_name(worst.values[name].value) for name in outer if name in worst.values), *names]
     )

@@ -57,7 +57,6 @@ from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, fi
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import attack_of, read_answer
 from advsearch.scene.description import ENVIRONMENT
-from advsearch.scene.settings import Parameter
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task
@@ -114,7 +113,10 @@ def sweep(
     options = {name: value for name, value in settings.items() if value is not None}
     if not isinstance(grid, (Mapping, type(None))):
         raise InputError(f"grid: expected a mapping from parameters to values, got {type(grid).__name__}")
-    brought = _brought(answer_of, varies=bool(grid) or bool(controls))
+    folder, brought = _folder(answer_of), dict[str, Any]()
+    if folder is not None:
+        theirs = AttackConfig.from_yaml(find_run(folder) / CONFIG)
+        brought = SweepConfig.of_answer(theirs, varies=bool(grid) or bool(controls))
     if scene is None and not brought:
         raise InputError("scene: expected what load_scene returns or takes, got nothing; name one")
     if scene is not None:
@@ -133,10 +135,14 @@ def sweep(
         "controls": settings_of(controls),
         "grid": dict(grid or {}),
         "samples": samples,
-        "answer_of": _folder(answer_of),
+        "answer_of": folder,
         "metrics": metrics_as_settings(metrics or {}),
     }
-    loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
+    loaded = tuple(
+        NamedScene(one.description.object_name, one.description.environment_name, one)
+        for one in scenes
+        if isinstance(one, Scene)
+    )
     if loaded:
         check_not_of_scene(options)
         described |= _described(loaded)
@@ -164,11 +170,11 @@ def sweep(
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     asked = task if isinstance(task, Task) else config.task
-    with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as folder:
+    with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as begun_in:
         job = _job(config, loaded or _places(config), several(networks), asked, controls)
         job = replace(job, metrics=load_metrics(config.metrics, metrics))
         if config.run is not None:
-            return _kept(config, job, progress, folder)
+            return _kept(config, job, progress, begun_in)
         with executor_for(config, ANSWERING, progress) as executor:
             return carry_out(job, None, progress, executor)
 
@@ -193,14 +199,6 @@ def _folder(answer: str | Path | AttackResult | None) -> str | None:
         raise InputError("answer_of: expected an attack that was kept, got one that was not; give it a `run`")
     kept = answer.run if isinstance(answer, AttackResult) else answer
     return None if kept is None else str(kept)
-
-
-def _brought(answer: str | Path | AttackResult | None, *, varies: bool) -> dict[str, Any]:
-    """The settings that an answer brings with it; none without one."""
-    folder = _folder(answer)
-    if folder is None:
-        return {}
-    return SweepConfig.of_answer(AttackConfig.from_yaml(find_run(folder) / CONFIG), varies=varies)
 
 
 def _beside_answer(
@@ -234,12 +232,6 @@ def _several(given: Any) -> list[Any]:
     if not listed:
         raise InputError("scene and model: expected at least one of each, got an empty list")
     return listed
-
-
-def _place(scene: Scene) -> NamedScene:
-    described = scene.description
-    object_name = described.object_name
-    return NamedScene(object_name, described.environment_name, scene)
 
 
 def _described(places: Sequence[NamedScene]) -> dict[str, object]:
@@ -288,7 +280,10 @@ def _job(
     places = _beside_answer(config, places, drawn, axes)
     check_scenes(places, drawn, axes)
     sized = all(place.scene.description.object.metres is not None for place in places)
-    axes = tuple(replace(one, parameter=_in_units(one, sized)) for one in axes)
+    axes = tuple(
+        replace(one, parameter=measured_in(one.parameter, sized)) if one.control == CameraControl.kind else one
+        for one in axes
+    )
     made = make_task(task)
     networks, warnings = _models(models, config, made)
     scenes = [place.scene for place in places]
@@ -311,11 +306,6 @@ def _job(
         aovs=aovs_of(config.aov),
         warnings=tuple(dict.fromkeys(warnings)),
     )
-
-
-def _in_units(axis: Axis, metres: bool) -> Parameter:
-    """The parameter of an axis, as it is around objects that have a size in metres, or have not."""
-    return measured_in(axis.parameter, metres) if axis.control == CameraControl.kind else axis.parameter
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:

@@ -309,7 +309,15 @@ def sarif(result: SuiteResult) -> str:
             ],
             "partialFingerprints": {"claim/v1": one.name},
             "baselineState": "unchanged" if one.accepted else "new",
-            "properties": {name: value for name, value in _properties(result, one).items() if value},
+            "properties": {
+                name: value
+                for name, value in (
+                    ("picture", _picture(result, one)),
+                    ("repeat", one.repeat),
+                    ("pictures", one.pictures),
+                )
+                if value
+            },
         }
         for one in result.claims
         if one.answer != HELD
@@ -328,10 +336,6 @@ def markdown(result: SuiteResult) -> str:
     again = [one.repeat for one in result.claims if one.answer != HELD and one.repeat]
     lines += ["", "```sh", *again, "```"] if again else []
     return "\n".join(lines) + "\n"
-
-
-def _properties(result: SuiteResult, one: ClaimAnswer) -> dict[str, object]:
-    return {"picture": _picture(result, one), "repeat": one.repeat, "pictures": one.pictures}
 
 
 def _picture(result: SuiteResult, one: ClaimAnswer) -> str:

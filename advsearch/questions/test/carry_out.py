@@ -77,7 +77,11 @@ def test_from_config(
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage("reading the suite")
     noted = None if resumed is None else _noted(resumed)
-    described = (suite or _seeded(read_suite(config.suite), config)) if noted is None else noted
+    described = noted or suite
+    if described is None:
+        described = read_suite(config.suite)
+        seed = secrets.randbelow(2**31) if config.fresh else described.seed if config.seed is None else config.seed
+        described = described.model_copy(update={"seed": seed})
     seconds = config.seconds or described.seconds or math.inf
     added = None if config.add is None else add(config.suite, config.add)
     try:
@@ -154,11 +158,13 @@ class _SuiteRun:
             return self._not_tried(one, NOT_TRIED)
         if self.trial.late():
             return self._not_tried(one, f"{TIME_OVER} before it began")
+        asked, begun = self._not_tried(one, ""), time.perf_counter()
         if one.one is None:
-            found = self.trial.claim(one.name, self.suite.claims[one.name], one.config)
+            found = self.trial.claim(asked, self.suite.claims[one.name], one.config)
         else:
             assert isinstance(one.config, AttackConfig)
-            found = self.trial.counterexample(one.one, one.config)
+            found = self.trial.counterexample(asked, one.one, one.config)
+        found = found.model_copy(update={"seconds": time.perf_counter() - begun})
         if TIME_OVER not in found.reason and found.reason != STOPPED:
             results.put(key, found.to_dict())
         if found.reason == STOPPED:
@@ -216,11 +222,6 @@ def _noted(path: Path) -> Suite | None:
     with Store(path / STORE, read_only=True) as store:
         noted = store.noted(NOTE)
     return None if noted is None else suite_of(noted, f"{path}: the suite that it began with")
-
-
-def _seeded(suite: Suite, config: SuiteConfig) -> Suite:
-    seed = secrets.randbelow(2**31) if config.fresh else suite.seed if config.seed is None else config.seed
-    return suite.model_copy(update={"seed": seed})
 
 
 def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[PlannedClaim]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -33,7 +32,6 @@ from advsearch.questions.test.answer import (
     difference_reason,
     right_reason,
     search_answer,
-    statement,
     tried_reason,
 )
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
@@ -58,12 +56,10 @@ class Trial:
     """What claims are tried with.
 
     Attributes:
-        run: keeps every answer.
         confidence: of each claim that pictures decide.
         late: whether the time of the suite is over.
         left: seconds until then; infinite without a limit.
         workers, cluster: who shares the pictures of a claim.
-        progress: told how far it is.
         warnings: gets sentences that a reader has to know.
     """
 
@@ -76,20 +72,14 @@ class Trial:
     progress: Progress
     warnings: list[str] = field(default_factory=list)
 
-    def claim(self, name: str, claim: AnyClaim, config: SceneConfig) -> ClaimAnswer:
-        """Try a claim; what was asked before is read back."""
-        begun = time.perf_counter()
-        asked = ClaimAnswer(
-            name=name, kind=claim.claim, statement=statement(claim, config), answer=UNDECIDED, reason=""
-        )
+    def claim(self, asked: ClaimAnswer, claim: AnyClaim, config: SceneConfig) -> ClaimAnswer:
+        """Try a claim that is asked and undecided; what was asked before is read back."""
         if isinstance(claim, RightClaim):
-            found = self._right(asked, claim, config)
-        elif isinstance(claim, NoWorseClaim):
-            found = self._no_worse(asked, claim, config)
-        else:
-            assert isinstance(config, AttackConfig)
-            found = self._not_broken(asked, config)
-        return found.model_copy(update={"seconds": time.perf_counter() - begun})
+            return self._right(asked, claim, config)
+        if isinstance(claim, NoWorseClaim):
+            return self._no_worse(asked, claim, config)
+        assert isinstance(config, AttackConfig)
+        return self._not_broken(asked, config)
 
     def _right(self, asked: ClaimAnswer, claim: RightClaim, config: SceneConfig) -> ClaimAnswer:
         problem, shared = self._problem(config), self._shared(config)
@@ -167,13 +157,9 @@ class Trial:
 
     def _not_broken(self, asked: ClaimAnswer, config: AttackConfig) -> ClaimAnswer:
         seconds = min(self.left(), config.seconds or math.inf)
-        own = config.model_copy(
-            update={
-                "seconds": seconds if math.isfinite(seconds) else None,
-                "workers": self.workers,
-                "cluster": self.cluster,
-            }
-        ).with_only_here(config.only_here)
+        shared = {"workers": self.workers, "cluster": self.cluster}
+        limited = {**shared, "seconds": seconds if math.isfinite(seconds) else None}
+        own = config.model_copy(update=limited).with_only_here(config.only_here)
         path = self.run.path / PARTS / asked.name
         summary = carry_out_part(path, own, self.progress)
         assert isinstance(summary, AttackSummary)
@@ -191,16 +177,9 @@ class Trial:
             }
         )
 
-    def counterexample(self, one: Counterexample, config: AttackConfig) -> ClaimAnswer:
+    def counterexample(self, asked: ClaimAnswer, one: Counterexample, config: AttackConfig) -> ClaimAnswer:
         """Try a counterexample: the model should be right on it."""
-        begun = time.perf_counter()
-        asked = ClaimAnswer(
-            name=one.name,
-            kind="counterexample",
-            statement=f"{config.model} is right where it said {one.said}",
-            answer=UNDECIDED,
-            reason="",
-        )
+        asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {one.said}"})
         parts = parts_of(config)
         if not same_scene(one, parts.scene):
             reason = "its scene is another one now; remove it, or add the answer of a new run"
@@ -223,16 +202,8 @@ class Trial:
         answer, reason = tried_reason(right, tried - right, label)
         if tried < count and not 0 < right < tried:
             answer, reason = UNDECIDED, TIME_OVER
-        return asked.model_copy(
-            update={
-                "answer": answer,
-                "reason": reason,
-                "pictures": tried,
-                "spp": one.spp,
-                "picture": picture,
-                "seconds": time.perf_counter() - begun,
-            }
-        )
+        said = {"answer": answer, "reason": reason, "pictures": tried, "spp": one.spp, "picture": picture}
+        return asked.model_copy(update=said)
 
     def _problem(self, config: SceneConfig) -> Problem:
         whole = AttackConfig.of(config)

@@ -240,11 +240,8 @@ class Suite(_Described):
         return value
 
     def config_of(self, name: str, **changes: object) -> SceneConfig:
-        """Return what a claim's pictures are made with.
-
-        Args:
-            name: of the claim.
-            **changes: settings that the command says for all claims; None says nothing.
+        """Return what a claim's pictures are made with; settings that the command says for all claims go over its own,
+        None says nothing.
 
         Raises:
             InputError: a setting is unknown, impossible, or the suite's own.
