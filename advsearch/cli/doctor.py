@@ -115,7 +115,8 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False)
         output, errors, status = done.stdout, done.stderr, done.returncode
     except subprocess.TimeoutExpired as expired:
-        output, errors, status = _text(expired.stdout), "", None
+        text = expired.stdout.decode("utf-8", "replace") if isinstance(expired.stdout, bytes) else expired.stdout or ""
+        output, errors, status = text, "", None
     tried = {}
     for line in output.splitlines():
         try:
@@ -285,10 +286,6 @@ def _ending(status: int | None, errors: str) -> str:
     how = f"signal {signal.Signals(-status).name}" if status < 0 else f"status {status}"
     telling = [line.strip() for line in errors.splitlines() if "ERROR" in line or "Error" in line]
     return f"the trial ended with {how}" + (f" ({telling[0][:120]})" if telling else "")
-
-
-def _text(output: str | bytes | None) -> str:
-    return output.decode("utf-8", "replace") if isinstance(output, bytes) else output or ""
 
 
 def _print_table(parts: list[Component], good: bool) -> None:

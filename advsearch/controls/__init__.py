@@ -32,14 +32,9 @@ SHARED = (
 """Modules of this folder that are no control."""
 
 
-def _class_of(kind: str) -> str:
-    """Return ``WhiteBalanceControl`` for ``white_balance``."""
-    return "".join(map(str.capitalize, kind.split("_"))) + "Control"
-
-
 _modules = (one.name for one in iter_modules(__path__) if one.name not in SHARED)
 OWN = {
-    kind: _class_of(kind)
+    kind: "".join(map(str.capitalize, kind.split("_"))) + "Control"
     for kind in sorted(_modules, key=lambda kind: (ORDER.index(kind) if kind in ORDER else len(ORDER), kind))
 }
 """The package's own controls, one for each other module: the word on the command line is the module's name, and this is

@@ -122,7 +122,7 @@ class CameraControl(NumberControl):
         fov = values["fov"]
         if "focal_length" in self.specs:
             fov = _fov_of(values["focal_length"])
-        if self._distance_is_free(scene):
+        if "distance" in self.specs or not self.asked or "camera.distance" in scene.given:
             distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
@@ -150,9 +150,6 @@ class CameraControl(NumberControl):
         found |= {name: values[name] for name in COEFFICIENTS if name in self.specs}
         found |= {"cx": found["cx"] + values["shift_x"], "cy": found["cy"] + values["shift_y"]}
         return torch.stack([found[name].to(fov) for name in NUMBERS])
-
-    def _distance_is_free(self, scene: SceneDescription) -> bool:
-        return "distance" in self.specs or not self.asked or "camera.distance" in scene.given
 
     def _described(self, scene: SceneDescription) -> SceneDescription:
         """The scene with a fixed lens, for which the distance is worked out as for the same setting."""

@@ -328,15 +328,11 @@ def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
     corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner
     noise = torch.rand(tall, wide, 2, generator=source) * 2.0 - 1.0
     waves = ndimage.gaussian_filter(noise.numpy(), (smooth, smooth, 0.0), mode="reflect", truncate=3.0)
-    shift = torch.from_numpy(waves) * wrinkle + _shear(tall, wide, corners)
-    return resized(shift, height, width)
-
-
-def _shear(height: int, width: int, corners: Tensor) -> Tensor:
-    """(H, W, 2) the affine shift that moves three corners of the middle square, (+, +), (+, -), (-, -), as asked."""
     third = REFERENCE // 3
     by_row = (corners[0] - corners[1]) / (2 * third)
     by_column = (corners[0] - corners[2]) / (2 * third) - by_row
-    rows = torch.arange(height)[:, None, None] - (height - 1) / 2.0
-    columns = torch.arange(width)[None, :, None] - (width - 1) / 2.0
-    return (corners[0] + corners[2]) / 2.0 + rows * by_row + columns * by_column
+    rows = torch.arange(tall)[:, None, None] - (tall - 1) / 2.0
+    columns = torch.arange(wide)[None, :, None] - (wide - 1) / 2.0
+    shear = (corners[0] + corners[2]) / 2.0 + rows * by_row + columns * by_column
+    shift = torch.from_numpy(waves) * wrinkle + shear
+    return resized(shift, height, width)

@@ -229,7 +229,11 @@ class Preconditioner:
         laplacian = sparse.diags(np.asarray(adjacency.sum(axis=1)).reshape(-1)) - adjacency
         strength = (SMOOTHING_LENGTH * solid.extent / mean) ** 2
         self._factor = sparse_linalg.splu((sparse.identity(count) + strength * laplacian).tocsc())
-        self._rigid = torch.from_numpy(_rigid_motions(solid.places))
+        centred = solid.places - solid.places.mean(axis=0)
+        shifts = [np.broadcast_to(axis, solid.places.shape) for axis in np.eye(3)]
+        turns = [np.cross(axis, centred) for axis in np.eye(3)]
+        rigid_motions = np.asarray(linalg.orth(np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)))
+        self._rigid = torch.from_numpy(rigid_motions)
 
     def __call__(self, pushes: Tensor) -> Tensor:
         """Return displacements (P, 3) for pushes (P, 3), float64; differentiable."""
@@ -238,14 +242,6 @@ class Preconditioner:
         flat = smooth.reshape(-1)
         rigid = self._rigid.to(flat.device)
         return (flat - rigid @ (rigid.T @ flat)).reshape(smooth.shape)
-
-
-def _rigid_motions(places: Doubles) -> Doubles:
-    """Orthonormal basis (3 P, <= 6) of translations and rotations."""
-    centred = places - places.mean(axis=0)
-    shifts = [np.broadcast_to(axis, places.shape) for axis in np.eye(3)]
-    turns = [np.cross(axis, centred) for axis in np.eye(3)]
-    return np.asarray(linalg.orth(np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)))
 
 
 class _Solve(torch.autograd.Function):

@@ -95,7 +95,9 @@ class LensControl(NumberControl):
         return with_dots(image, self._placed(values))
 
     def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {self.name: with_dots(_board(), self._placed(values))}
+        square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
+        dark = (square[:, None] + square[None, :]) % 2
+        return {self.name: with_dots((0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3), self._placed(values))}
 
     def _placed(self, values: Values) -> dict[str, Tensor]:
         """The values, with the dots spread over the picture along an axis about which nothing was said."""
@@ -139,13 +141,6 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
     ):
         light = light + cover[..., None] * (shade - light)
     return linear_to_srgb(light)
-
-
-def _board() -> Tensor:
-    """A grey chequerboard, on which white and black dots both show; (STICKER_SIDE, STICKER_SIDE, 3) sRGB."""
-    square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
-    dark = (square[:, None] + square[None, :]) % 2
-    return (0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3)
 
 
 def _covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:

@@ -80,7 +80,9 @@ class MaterialControl(NumberControl):
         inputs: dict[str, Tensor] = {}
         for name in NUMBERS:
             if self._varies(name):
-                inputs[f"{self.mesh}.{name}"] = _rendered(name, values[name]).reshape(1)
+                value = values[name]
+                low, high = RENDERED.get(name, (0.0, 1.0))
+                inputs[f"{self.mesh}.{name}"] = (value + (value.clamp(low, high) - value).detach()).reshape(1)
             elif self._names_a_material():
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(own, name))])
         if self._colours():
@@ -129,12 +131,6 @@ class MaterialControl(NumberControl):
             own = self.mesh_in(scene).base_color
             return srgb_to_linear(torch.from_numpy(own.copy())) if before is None else before
         return _linear_covering(self.mesh_in(scene).mesh, which)
-
-
-def _rendered(name: str, value: Tensor) -> Tensor:
-    """Move a value into the range that is rendered; the derivative passes as if it had not been moved."""
-    low, high = RENDERED.get(name, (0.0, 1.0))
-    return value + (value.clamp(low, high) - value).detach()
 
 
 @lru_cache(maxsize=len(PATTERNS))

@@ -90,17 +90,13 @@ def made(name: str) -> ObjectAsset:
     if name == "card":
         texels = np.array([0.70, 0.53, 0.36]) + generator.normal(0.0, 0.012, (64, 64, 1)) * np.ones(3)
         texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]  # the flutes under the paper
-        return ObjectAsset(name, _card(), texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
+        uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
+        vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
+        normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
+        card = Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
+        return ObjectAsset(name, card, texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
     return ObjectAsset(name, sphere(24, 48), grey, Material(roughness=0.6))
-
-
-def _card() -> Mesh:
-    """A square in the y-z plane that faces +x."""
-    uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
-    vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
-    normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
-    return Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
 
 
 def sphere(rows: int, columns: int) -> Mesh:
@@ -258,7 +254,8 @@ class OcclusionControl(NumberControl):
             return Placement(np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True)
         points = mesh.vertices.astype(np.float64) @ _about_upright(asked["turn"]).T
         size, distance = _fitting(points, asked["size"], asked["distance"] * seen.far, seen.near)
-        cover = silhouette(_ahead(points, size, distance), mesh.faces)
+        ahead = np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
+        cover = silhouette(ahead, mesh.faces)
         if cover is None:
             return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
         return _solved(seen, cover, asked, size, distance)
@@ -367,11 +364,6 @@ def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: fl
         angle = outside + (angle - outside) * asked["coverage"] / EASE
     hidden = float(sweep.coverage(np.array([angle]))[0])
     return Placement(axes, angle, size, distance, hidden, False)
-
-
-def _ahead(points: Doubles, size: float, distance: float) -> Doubles:
-    """Mesh points in camera coordinates when the occluder is straight ahead: its x axis points to the camera."""
-    return np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
 
 
 def _fitting(points: Doubles, size: float, distance: float, near: float) -> tuple[float, float]:

@@ -92,7 +92,12 @@ def features_of(model: Model) -> Features:
                 size = read(x).shape[1]
                 return Features(model, read, size, f"the {where}, {size} numbers")
     why = f"the logits, {model.classes} numbers: no layer before them can be read in a {type(model.module).__name__}"
-    return Features(model, _centred_logits(model), model.classes, why, penultimate=False)
+
+    def read(x: Tensor) -> Tensor:
+        logits: Tensor = model.ask(x)
+        return logits - logits.mean(dim=1, keepdim=True)
+
+    return Features(model, read, model.classes, why, penultimate=False)
 
 
 def _layer(model: Model, x: Tensor) -> tuple[Read, str] | None:
@@ -185,11 +190,3 @@ def _pooled(value: Tensor, axis: int) -> Tensor:
     """Return features (N, F): the mean over all axes but the first and `axis`."""
     channels_last = value.movedim(axis, -1)
     return channels_last.flatten(1, -2).mean(dim=1) if value.dim() > 2 else channels_last
-
-
-def _centred_logits(model: Model) -> Read:
-    def read(x: Tensor) -> Tensor:
-        logits: Tensor = model.ask(x)
-        return logits - logits.mean(dim=1, keepdim=True)
-
-    return read

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import io
 import logging
 import os
 import re
@@ -62,7 +61,11 @@ def load_file(path: Path) -> Source:
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
         if _kind(archive) == "torchscript":
             return _load_torchscript(path, archive)
-        return _load_exported(path, archive)
+        checked = exported.rewritten(archive)
+        with _damaged(path, "torch.export"), without_unpickling(), _quiet_export():
+            program = torch.export.load(checked)
+            module = program.module()
+        return _with_signature(source_of(module, path.stem), program)
 
 
 def _opened(path: Path) -> BinaryIO:
@@ -119,29 +122,17 @@ def _near_files(path: Path) -> str:
 def _load_torchscript(path: Path, archive: Archive) -> Source:
     checked = torchscript.rewritten(archive)
     if torchscript.runs_while_loading(archive):
-        _try_to_load(path, checked)
+        try:
+            wrong = try_torchscript(checked)
+        except TookTooLong as error:
+            wrong = str(error)
+        if wrong:
+            raise FileFormatError(f"model file {path}: {wrong}")
     with warnings.catch_warnings(), _damaged(path, "TorchScript"):
         for kind in (DeprecationWarning, FutureWarning):  # the second from torch 2.14 on
             warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=kind)
         module = torch.jit.load(checked, map_location="cpu")
     return source_of(module, path.stem)
-
-
-def _try_to_load(path: Path, checked: io.BytesIO) -> None:
-    try:
-        wrong = try_torchscript(checked)
-    except TookTooLong as error:
-        wrong = str(error)
-    if wrong:
-        raise FileFormatError(f"model file {path}: {wrong}")
-
-
-def _load_exported(path: Path, archive: Archive) -> Source:
-    checked = exported.rewritten(archive)
-    with _damaged(path, "torch.export"), without_unpickling(), _quiet_export():
-        program = torch.export.load(checked)
-        module = program.module()
-    return _with_signature(source_of(module, path.stem), program)
 
 
 def _with_signature(source: Source, program: torch.export.ExportedProgram) -> Source:

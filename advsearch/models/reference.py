@@ -53,7 +53,11 @@ class ReferenceNet(nn.Module):
         self.features = nn.Sequential(*layers)
         self.dropout = nn.Dropout(dropout)
         self.head = nn.Linear(width, classes)
-        self._initialise()
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        nn.init.normal_(self.head.weight, std=0.01)
+        nn.init.zeros_(self.head.bias)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return logits (N, classes) of images (N, 3, H, W), display-referred sRGB in [0, 1]; H and W at least 32."""
@@ -61,17 +65,6 @@ class ReferenceNet(nn.Module):
         features: Tensor = self.features(x).mean(dim=(2, 3))
         logits: Tensor = self.head(self.dropout(features))
         return logits
-
-    def _initialise(self) -> None:
-        """He initialisation. Residual branches start at full gain: from zero, so shallow a network learns far slower.
-
-        Measured on drawn shapes, loss after 160 steps: 0.11 against 1.15.
-        """
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-        nn.init.normal_(self.head.weight, std=0.01)
-        nn.init.zeros_(self.head.bias)
 
 
 class _Convolution(nn.Module):

@@ -48,7 +48,7 @@ def attack_verdict(summary: AttackSummary) -> str:
         return f"Interrupted after {count(summary.steps, 'step')}. The answer so far is not verified: the model {says}."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
-    rate = rate_text(verified) + _each(summary)
+    rate = rate_text(verified) + (f", each with another {' and '.join(summary.over)}" if summary.over else "")
     claim = _claim(summary, thing)
     if ending == "found":
         return f"{_how_it_errs(summary, verified, thing)} in {rate}."
@@ -323,11 +323,6 @@ def _wanted(summary: AttackSummary, thing: str) -> str:
 
 def _a_target(summary: AttackSummary) -> str:
     return " or ".join(with_article(name) for name in summary.target or ())
-
-
-def _each(summary: AttackSummary) -> str:
-    """Return what is said of the renders of an answer that holds for many conditions."""
-    return f", each with another {' and '.join(summary.over)}" if summary.over else ""
 
 
 def _against_random(summary: AttackSummary) -> list[str]:

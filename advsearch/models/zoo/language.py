@@ -98,7 +98,9 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
         module = _Free(reader, processor.tokenizer, _ends(loaded.network), purpose.tokens) if free else named
         with torch.no_grad():
             _check(loaded, named, side)
-            seconds = _seconds(module, side)
+            begun = time.perf_counter()
+            module(torch.zeros((1, 3, *side)))
+            seconds = time.perf_counter() - begun
     except (InputError, ModelError):
         raise
     except Exception as error:  # any network may raise anything
@@ -394,12 +396,6 @@ def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
     size = max(TOLERANCE, 8.0 * torch.finfo(loaded.network.dtype).eps) * max(1.0, abs(own))
     if not abs(own - ours) <= size:
         raise _another(loaded, f"goes on otherwise after what it has kept ({ours:.6g} for {own:.6g})")
-
-
-def _seconds(module: nn.Module, side: tuple[int, int]) -> float:
-    begun = time.perf_counter()
-    module(torch.zeros((1, 3, *side)))
-    return time.perf_counter() - begun
 
 
 def _another(loaded: Loaded, what: str) -> ModelError:
