@@ -12,9 +12,9 @@ from pkgutil import iter_modules
 from typing import Any
 
 from advsearch.controls.base import BoundControl, Budget, Choice, Control, Group, Parameter
-from advsearch.controls.clean import Moved, check_prepared
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
+from advsearch.controls.values import Moved, check_prepared
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import by_key
 from advsearch.registry import Registry
@@ -26,8 +26,8 @@ ORDER = (
 )
 """In which lists have controls; one that is not named comes last."""
 SHARED = (
-    *("base", "clean", "numbers", "space", "values"),
-    *("corruption_filters", "corruption_weather", "geometry_modes", "material_patterns", "patch_sticker"),
+    *("base", "numbers", "space", "values"),
+    *("corruption_filters", "geometry_modes", "material_patterns", "patch_sticker"),
 )
 """Modules of this folder that are no control."""
 

@@ -19,8 +19,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from advsearch.controls.clean import Moved
-from advsearch.controls.values import is_number, is_whole
+from advsearch.controls.values import Moved, is_number, is_whole
 from advsearch.described import Value as Value
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import OBJECT, SceneDescription

@@ -7,7 +7,7 @@ The corruptions and the numbers that a severity stands for are those of ImageNet
 Benchmarking neural network robustness to common corruptions and perturbations, arXiv 1903.12261, section 4 and
 appendix A). They were made for a fixed list of pictures on disk; here they are functions of the picture in torch, so
 that a search can follow them back into the scene. Those of brightness, contrast, colour and file formats are here,
-the others in `corruption_filters` and `corruption_weather`.
+the others in `corruption_filters`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from advsearch.controls.corruption_filters import (
     at_level,
     defocus_blur,
     elastic,
+    fog,
+    frost,
     gaussian_blur,
     gaussian_noise,
     glass_blur,
@@ -37,10 +39,10 @@ from advsearch.controls.corruption_filters import (
     picture,
     planes,
     shot_noise,
+    snow,
     speckle_noise,
     zoom_blur,
 )
-from advsearch.controls.corruption_weather import fog, frost, snow
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, OneOf
 from advsearch.scene.description import SceneDescription

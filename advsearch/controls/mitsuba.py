@@ -17,9 +17,8 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Parameter
-from advsearch.controls.clean import Moved
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Slot, Values
-from advsearch.controls.values import LARGEST, Fixed, OneOf
+from advsearch.controls.values import LARGEST, Fixed, Moved, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.keys import plugin_numbers

@@ -22,17 +22,21 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, WHOLE_RANGE, BoundControl, Budget, Choice, Control, Group, Parameter, Value
-from advsearch.controls.clean import Moved, apart, check_start, nearest, same
 from advsearch.controls.values import (
     Fixed,
+    Moved,
     Number,
     OneOf,
     Range,
     Spec,
+    apart,
+    check_start,
     in_words,
+    nearest,
     option_index,
     plain,
     read,
+    same,
     to_unit,
     to_value,
 )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Group, Value
-from advsearch.controls.clean import Moved
+from advsearch.controls.values import Moved
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
 

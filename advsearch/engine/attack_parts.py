@@ -25,7 +25,7 @@ from advsearch.config.attack import OVER_NUMBERS, OVER_ONE, OVER_PREDICTED, OVER
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
-from advsearch.controls.clean import sentences
+from advsearch.controls.values import sentences
 from advsearch.engine import run_settings
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
 from advsearch.engine.loading import (

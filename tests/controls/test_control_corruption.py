@@ -16,8 +16,7 @@ from torch import Tensor
 
 from advsearch.controls import corruption, corruption_filters, make_space
 from advsearch.controls.corruption import NAMES, STEPPED, CorruptionControl, corrupted
-from advsearch.controls.corruption_filters import blurred, poisson
-from advsearch.controls.corruption_weather import fractal
+from advsearch.controls.corruption_filters import blurred, fractal, poisson
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription, describe
 

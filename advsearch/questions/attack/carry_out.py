@@ -16,7 +16,7 @@ from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, SceneConfig
-from advsearch.controls.clean import sentences
+from advsearch.controls.values import sentences
 from advsearch.engine.attack_parts import (
     LOADING,
     AttackParts,
