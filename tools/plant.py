@@ -144,7 +144,7 @@ FAULTS = (
     ),
     Fault(
         "models: the gradient of all models but the first is lost",
-        "advsearch/models/ensemble.py",
+        "advsearch/tasks/together.py",
         "return [model(images) for model in self.models]",
         "return [model(images.detach() if number else images) for number, model in enumerate(self.models)]",
         ("tests/tasks/test_together.py",),

@@ -48,7 +48,6 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.models.ensemble import together
 from advsearch.options import as_setting
 from advsearch.progress import Progress
 from advsearch.runs.directory import CONFIG
@@ -59,7 +58,7 @@ from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Together, together
 
 LOADING = "loading the scene and the model"
 """What a person who waits is told first."""

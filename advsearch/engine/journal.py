@@ -31,10 +31,10 @@ from advsearch.engine.rows import LOST, judged, judgement_of, trial_row
 from advsearch.engine.sharing import Shared
 from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.models.ensemble import Ensemble
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
+from advsearch.tasks.together import Ensemble
 
 MADE_OF = "made of"
 """The note of functions and weights."""

@@ -15,12 +15,11 @@ from advsearch.controls import CONTROLS
 from advsearch.engine.loading import MODEL, Scene, lent, load_scene
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
-from advsearch.models.ensemble import together
 from advsearch.models.loading import named_code
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
 from advsearch.tasks import Task
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Together, together
 
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:

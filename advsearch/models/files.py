@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError
 from advsearch.files import open_regular
-from advsearch.models import exported, torchscript
-from advsearch.models.archive import LARGEST, Archive, open_archive, refused
+from advsearch.models import exported
+from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript, runs_while_loading
 from advsearch.models.guards import TookTooLong, try_torchscript
 from advsearch.models.labels import names_in
 from advsearch.models.probe import first_line
@@ -120,8 +120,8 @@ def _near_files(path: Path) -> str:
 
 
 def _load_torchscript(path: Path, archive: Archive) -> Source:
-    checked = torchscript.rewritten(archive)
-    if torchscript.runs_while_loading(archive):
+    checked = rewritten_torchscript(archive)
+    if runs_while_loading(archive):
         try:
             wrong = try_torchscript(checked)
         except TookTooLong as error:

@@ -12,14 +12,14 @@ from typing import Any
 from torch import nn
 
 from advsearch.errors import InputError, UnknownNameError, resembling
-from advsearch.models import files, imported, reference
+from advsearch.models import files, reference
 from advsearch.models import preprocessing as pre
 from advsearch.models.guards import called_under, plainly, turned_by_code
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
 from advsearch.models.model import Model, Preprocessing, Read
 from advsearch.models.probe import probe
-from advsearch.models.source import Purpose, Source, source_of
-from advsearch.models.zoo import timm, torchvision, transformers
+from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
+from advsearch.models.zoo import named, transformers
 from advsearch.registry import Registry
 
 #: Size of the input where neither the model nor the caller says.
@@ -27,7 +27,7 @@ DEFAULT_INPUT_SIZE = (224, 224)
 
 SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
     "advsearch.models",
-    {"torchvision": torchvision.load, "timm": timm.load, "hf": transformers.load},
+    {"torchvision": named.load_torchvision, "timm": named.load_timm, "hf": transformers.load},
     "a function from the whole text, such as 'zoo:resnet18', to a Source or a Model",
     lambda name, entry: callable(entry),
 )
@@ -155,7 +155,7 @@ def named_code(spec: str) -> str | None:
     text = spec.strip()
     if text.partition(":")[0].lower() in SOURCES or not re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text):
         return None
-    return imported.split_weights(text)[0]
+    return split_weights(text)[0]
 
 
 def _find(spec: object) -> Source | Model:
@@ -163,14 +163,14 @@ def _find(spec: object) -> Source | Model:
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
-        return transformers.of_network(spec) or timm.of_network(spec) or source_of(spec, type(spec).__name__)
+        return transformers.of_network(spec) or named.of_timm(spec) or source_of(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
         got = f"the class {spec.__name__} (pass an instance)" if isinstance(spec, type) else type(spec).__name__
         raise InputError(f"model: expected a name, a path, an nn.Module or a Model, got {got}. {FORMS}")
     text = spec.strip()
-    network, weights = imported.split_weights(text)
+    network, weights = split_weights(text)
     if network == "reference":
         return reference.load(weights=weights)
     source = text.partition(":")[0].lower()
@@ -179,7 +179,7 @@ def _find(spec: object) -> Source | Model:
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'")
     if named_code(text) is not None:
-        return imported.load_callable(text, SOURCES)
+        return load_callable(text, SOURCES)
     if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
     known = ["reference", *(f"{source}:{'REPOSITORY' if source == 'hf' else 'NAME'}" for source in SOURCES)]

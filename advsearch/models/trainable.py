@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 from advsearch.errors import ModelError
 from advsearch.models import reference
-from advsearch.models.imported import split_weights
 from advsearch.models.model import Model, logits_of
-from advsearch.models.source import frozen, sharing_copy
+from advsearch.models.source import frozen, sharing_copy, split_weights
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from advsearch import files
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.models.zoo.features import PARTS, pooled
+from advsearch.models.zoo.outputs import PARTS, pooled
 from advsearch.options import FROM_RUN
 from advsearch.pictures import upright
 from advsearch.tasks.base import Facts, Judgement

@@ -5,16 +5,64 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, final
 
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.models import Model
-from advsearch.models.ensemble import Ensemble, Outputs, by_picture, of_each
+from advsearch.models import Model, Preprocessing
+from advsearch.models.model import joined
 from advsearch.options import FROM_RUN, JOINED
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task, Truth
+
+Outputs = tuple[Any, ...]
+"""What each of several models answers to one picture."""
+
+
+@final
+class Ensemble:
+    """Asks several models; what `Model.module` is of `together`.
+
+    Args:
+        models: at least one; each resizes and normalises for itself.
+    """
+
+    def __init__(self, models: Sequence[Model]) -> None:
+        self.models = tuple(models)
+
+    def __call__(self, images: Tensor) -> list[Any]:
+        """Return the output of each model for pictures (N, H, W, 3) sRGB in [0, 1]."""
+        return [model(images) for model in self.models]
+
+
+def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Model:
+    """Return several models as one, whose output is a list with a tuple of the models' outputs for each picture.
+
+    Args:
+        models: at least one.
+        size: (height, width) in pixels of the pictures; None for the largest that a model takes.
+    """
+    high, wide = (max(model.input_size[side] for model in models) for side in (0, 1))
+    return Model(
+        module=Ensemble(models),
+        name=" and ".join(model.name for model in models),
+        labels=(),
+        preprocessing=Preprocessing(size or (high, wide), layout="NHWC"),
+        differentiable=all(model.differentiable for model in models),
+        read=by_picture,
+    )
+
+
+def by_picture(answer: list[Any], count: int) -> list[Outputs]:
+    """Return the outputs by picture of `count` pictures, from those by model."""
+    return [tuple(output[k : k + 1] for output in answer) for k in range(count)]
+
+
+def of_each(outputs: Sequence[Outputs]) -> list[Any]:
+    """Return the output of each model for N pictures, from what each of them got."""
+    return [joined(parts) for parts in zip(*outputs, strict=True)]
+
 
 Truths = tuple[Truth, ...]
 
@@ -27,7 +75,7 @@ class Together(Task):
     largest of the models' margins, and the score the least of their scores.
 
     Args:
-        parts: the task of each model, in the order of the outputs of `advsearch.models.ensemble.together`.
+        parts: the task of each model, in the order of the outputs of `advsearch.tasks.together.together`.
         models: that are asked.
         tasks: the parts on these, by `on`.
     """
@@ -47,7 +95,7 @@ class Together(Task):
         return JOINED.join(names) if len(set(names)) > 1 else self.name
 
     def read(self, answer: Any, count: int) -> list[Outputs]:
-        """See `advsearch.models.ensemble.by_picture`."""
+        """See `advsearch.tasks.together.by_picture`."""
         return by_picture(answer, count)
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Together:

@@ -23,7 +23,7 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models.model import ModelWarning
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
-from advsearch.models.zoo.loaded import Loaded, Measured, measured
+from advsearch.models.zoo.library import Loaded, Measured, measured
 from advsearch.models.zoo.zero_shot import spoken
 
 QUESTION = "What is this? Answer with its name only."

@@ -19,9 +19,8 @@ from torch.nn import functional
 from advsearch.errors import ModelError, resembling
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
-from advsearch.models.zoo import features, language, pixels, timm, zero_shot
-from advsearch.models.zoo.library import library, reading
-from advsearch.models.zoo.loaded import Loaded, in_pixels, processor_of
+from advsearch.models.zoo import language, named, outputs, zero_shot
+from advsearch.models.zoo.library import Loaded, in_pixels, library, processor_of, reading
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ def load(spec: str) -> Source:
             where["local_files_only"] = True
         told = _config(transformers, name, spec, where)
         if told.get("model_type") == "timm_wrapper" and "architectures" not in told:  # which timm itself has saved
-            return timm.load_repository(spec, name, revision)
+            return named.timm_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
@@ -264,16 +263,16 @@ NETWORKS = (
     Family(
         _called("TimmWrapperForImageClassification"),
         "AutoModelForImageClassification",
-        lambda loaded: timm.of_wrapped(loaded, names_of(loaded.network.config)),
+        lambda loaded: named.wrapped_timm(loaded, names_of(loaded.network.config)),
     ),
     Family(
-        _called("ForImageClassification"), "AutoModelForImageClassification", features.also(_with_names(_Classifier))
+        _called("ForImageClassification"), "AutoModelForImageClassification", outputs.also(_with_names(_Classifier))
     ),
     Family(_called("ForSemanticSegmentation"), "AutoModelForSemanticSegmentation", _with_names(_Segmenter)),
     Family(
-        pixels.is_ours,
+        outputs.is_ours,
         "AutoModelForUniversalSegmentation",
-        lambda loaded: pixels.mask_source(loaded, names_of(loaded.network.config) or None),
+        lambda loaded: outputs.mask_source(loaded, names_of(loaded.network.config) or None),
     ),
     Family(
         lambda architecture, network: zero_shot.finds(architecture),
@@ -282,13 +281,13 @@ NETWORKS = (
     ),
     Family(_called("ForObjectDetection"), "AutoModelForObjectDetection", _with_names(_Detector)),
     Family(language.speaks, "AutoModelForImageTextToText", language.source),
-    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", pixels.depth_source),
+    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", outputs.depth_source),
     Family(
         lambda architecture, network: zero_shot.compares(network),
         "AutoModel",
-        features.also(zero_shot.source, reads_text=True),
+        outputs.also(zero_shot.source, reads_text=True),
     ),
-    Family(features.answers_with_features, "", features.source),
+    Family(outputs.answers_with_features, "", outputs.source),
 )
 """Every kind that is read, the particular ones first."""
 

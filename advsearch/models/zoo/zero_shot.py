@@ -19,7 +19,7 @@ from advsearch.models.labels import patterns
 from advsearch.models.model import ModelWarning
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, sharing_copy, source_of
-from advsearch.models.zoo.loaded import Loaded, Measured, in_pixels
+from advsearch.models.zoo.library import Loaded, Measured, in_pixels
 
 TEXTS = 64
 """Texts that are embedded at once."""
