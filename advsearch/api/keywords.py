@@ -36,8 +36,8 @@ from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import told
+from advsearch.progress import watched
 from advsearch.settings import Config, as_python, is_shallow, settings
-from advsearch.watching import watched
 
 Names = str | Sequence[str]
 """Names in a list, or in a text with commas between them."""

@@ -21,8 +21,7 @@ from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
 from advsearch.errors import AdvsearchError, StorageError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.progress import NullProgress, Progress
-from advsearch.watching import bars, lines
+from advsearch.progress import NullProgress, Progress, bars, lines
 
 if TYPE_CHECKING:
     from advsearch.runs.results.base import Result

@@ -8,10 +8,8 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import FEWEST_TRIALS, AttackConfig
-from advsearch.config.derivative import DerivativeConfig
-from advsearch.config.rendering import RenderConfig
-from advsearch.config.scene import ControlsByName, SceneConfig
+from advsearch.config.attack import FEWEST_TRIALS, AttackConfig, DerivativeConfig
+from advsearch.config.scene import ControlsByName, RenderConfig, SceneConfig
 from advsearch.files import MESHES, either
 from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.config import SceneConfig
-from advsearch.config.rendering import PICTURE_SPP, PICTURES
+from advsearch.config.scene import PICTURE_SPP, PICTURES
 from advsearch.controls import Control, Space, compose
 from advsearch.controls.values import sentences
 from advsearch.described import Value

@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from advsearch.settings.configuration import FILES, Config
-from advsearch.settings.declaration import Clash, Setting, setting, setting_as_in, settings
+from advsearch.settings.configuration import FILES, Clash, Config, Setting, setting, setting_as_in, settings
 from advsearch.settings.values import (
     HEADER,
     all_finite,

@@ -26,10 +26,13 @@ from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
 from advsearch.tasks.boxes import (
     FORMS,
+    HEADS,
     KNOWN,
+    LAYOUTS,
     UNITS,
     Reading,
     left_over,
+    names_head,
     overlap,
     share_inside,
     strongest,
@@ -49,7 +52,6 @@ from advsearch.tasks.detector_answers import (
     order_in,
     settled,
 )
-from advsearch.tasks.yolo_heads import HEADS, LAYOUTS, names_head
 
 GOALS = {
     "vanish": "no right box is found where the object is",
@@ -273,7 +275,7 @@ class Detection(ClassTask):
 
     @property
     def _head(self) -> str:
-        """The head of `yolo_heads.HEADS`, or the one of `QUERIES`, that `order` says; "" where it says none."""
+        """The head of `boxes.HEADS`, or the one of `QUERIES`, that `order` says; "" where it says none."""
         order = " ".join(checked_order(self.order)) if self.order else ""
         return order if self._told_by_classes(order) else ""
 

@@ -15,8 +15,7 @@ from pathlib import Path
 from advsearch import rooms
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_bytes
-from advsearch.report.charts import NARROW, WIDE, study_chart
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
 from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, PARTS, REPORT
 from advsearch.runs.files import placed_by, write_bytes, write_text

@@ -1,21 +1,28 @@
-"""Requests that the dashboard's server does not answer as asked.
-
-`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
+"""`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
 
 What it answers: GET and HEAD of the list, of a run's page, of its rows and pictures, POST of a photograph, and nothing
 else. No part of an address becomes a path: runs are looked up by name among those that it was given, pictures by
 number. A request whose `Host` is not this server's is refused, so that a page elsewhere whose name is made to lead here
 (DNS rebinding) reads nothing; so is one that another origin's page sends. Beyond this machine every request needs the
 token, and goes over HTTPS. A photograph has to come from this server's own page, which alone knows the key for it.
+
+A browser opens a camera on another machine for nothing less than HTTPS. The certificate is made by the `openssl`
+program, which about every machine has, rather than by a package that would be installed for this alone. It is good for
+as long as the server runs: its key lies in a folder that only this user can read, until it is loaded, and is deleted
+then. A browser can't know it, and asks; what it should show is printed.
 """
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import ipaddress
 import re
 import secrets
+import socket
 import ssl
+import subprocess
+import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -24,7 +31,6 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from queue import Queue
-from socket import socket
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
@@ -34,11 +40,66 @@ from advsearch.files import open_regular
 from advsearch.report.markup import element
 from advsearch.runs import files, listing
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
-from advsearch.viewer.certificate import https_context, is_address, reachable
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.dashboard import START, following_page, is_under_way, list_page, progress_json
 from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
 from advsearch.viewer.thumbnails import cover, kept_pictures, path_of
+
+DAYS = 7
+"""For which a certificate is good."""
+
+
+def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
+    """Return what speaks HTTPS under some names and addresses, and the SHA-256 fingerprint of its new certificate.
+
+    Raises:
+        InputError: there is no `openssl`, or it makes none.
+    """
+    names = ",".join(f"IP:{host}" if is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
+    with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
+        key, certificate = Path(folder) / "key.pem", Path(folder) / "certificate.pem"
+        key.touch(mode=0o600)
+        command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
+        command += ["-keyout", str(key), "-out", str(certificate), "-days", str(DAYS), "-subj", "/CN=advsearch"]
+        command += ["-addext", f"subjectAltName={names}", "-addext", "extendedKeyUsage=serverAuth"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, timeout=30.0, stdin=subprocess.DEVNULL)
+        except FileNotFoundError:
+            raise InputError(
+                "https: needs the program openssl, which makes the certificate; apt-get install openssl, or leave "
+                "`host` and `https` out"
+            ) from None
+        except (OSError, subprocess.SubprocessError) as error:
+            text = (getattr(error, "stderr", None) or b"").decode(errors="replace")[-300:]
+            raise InputError(f"https: openssl made no certificate: {text or error}") from None
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.load_cert_chain(certificate, key)
+        data = ssl.PEM_cert_to_DER_cert(certificate.read_text(encoding="ascii"))
+    digest = hashlib.sha256(data).hexdigest().upper()
+    return context, ":".join(digest[place : place + 2] for place in range(0, len(digest), 2))
+
+
+def reachable(host: str) -> str:
+    """Return the address under which others reach what listens at `host`: of any address, the one that leads out."""
+    if host not in ("0.0.0.0", "::", ""):
+        return host
+    family, far = (socket.AF_INET6, "2001:db8::1") if host == "::" else (socket.AF_INET, "192.0.2.1")
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((far, 9))  # chooses an address; nothing is sent
+            return str(probe.getsockname()[0])
+    except OSError:
+        return "::1" if host == "::" else "127.0.0.1"
+
+
+def is_address(host: str) -> bool:
+    """Whether a host is a number and no name."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
 
 
 class Refused(Exception):
@@ -116,7 +177,7 @@ class Dashboard(HTTPServer):
         if https or self.token:
             names = (reachable(host), "localhost", LOOPBACK)
             self._context, self.fingerprint = https_context(names)
-        self._waiting: Queue[tuple[socket, Any] | None] = Queue(WAITING)
+        self._waiting: Queue[tuple[socket.socket, Any] | None] = Queue(WAITING)
         try:
             super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:

@@ -18,8 +18,7 @@ from pathlib import Path
 from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
-from advsearch.report.charts import NARROW, WIDE, study_chart
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
 from advsearch.report.phrases import answer_text, beside_text, is_command, percent
 from advsearch.report.sweeps import (
     DRIVE_HEADS,

@@ -36,14 +36,13 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress
 from advsearch.questions.gap.settings import GapConfig
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.parameters import Parameter
 from advsearch.settings import Config, settings
-from advsearch.watching import BarProgress, LineProgress
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL")
 
@@ -991,7 +990,7 @@ def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
 def test_lines_come_where_nothing_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr("sys.stderr", stream)
-    monkeypatch.setattr("advsearch.watching.PATIENCE", 0.0)
+    monkeypatch.setattr("advsearch.progress.PATIENCE", 0.0)
     with watch_progress() as progress:
         progress.stage("compiling")
         for _ in range(100):

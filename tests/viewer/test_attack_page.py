@@ -33,8 +33,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.questions.attack.page import LARGE_PICTURE, SMALLER_SIDE
 from advsearch.report import wording
-from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
-from advsearch.report.markup import Html, element, figure_of_answer, join_html
+from advsearch.report.markup import NARROW, WIDE, Curve, Html, element, figure_of_answer, join_html, objective_chart
 from advsearch.report.phrases import objective_label, percent
 from advsearch.report.shown import shown
 from advsearch.runs.directory import OBJECT_FILE

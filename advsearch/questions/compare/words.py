@@ -14,9 +14,8 @@ from advsearch.questions.compare.answer import (
     PairRule,
 )
 from advsearch.report import wording
-from advsearch.report.claims import Claim, Extent
 from advsearch.report.phrases import percent, percent_number
-from advsearch.report.shown import AnswerPart, Column, Picture, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, Column, Extent, Picture, ShownAnswer
 from advsearch.report.wording import conditions_text
 from advsearch.runs.results.base import Interval
 from advsearch.runs.results.sweep import AxisValue

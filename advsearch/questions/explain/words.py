@@ -12,9 +12,18 @@ from advsearch.questions.explain.answer import (
     RuleRow,
 )
 from advsearch.report import wording
-from advsearch.report.claims import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.report.phrases import percent, percent_number
-from advsearch.report.shown import AnswerPart, Column, Picture, ShownAnswer
+from advsearch.report.shown import (
+    AnswerPart,
+    Claim,
+    Column,
+    Extent,
+    Picture,
+    ShownAnswer,
+    claim,
+    nothing_claimed,
+    share_text,
+)
 from advsearch.report.wording import conditions_text, interval_text
 
 CHOSEN = (

@@ -7,10 +7,9 @@ from typing import Any
 
 from advsearch.questions.gap.answer import GapResult, GapRow
 from advsearch.report import wording
-from advsearch.report.claims import Claim, average_claim, case_claim, searches_text
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import margin_text, percent
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, Column, ShownAnswer, average_claim, case_claim, searches_text
 
 NOTE = (
     "On average: configurations drawn at random from the whole space and budget. Worst: trials of the configuration "

@@ -7,10 +7,9 @@ from typing import Any
 
 from advsearch.questions.harden.answer import HardenResult, Share
 from advsearch.report import wording
-from advsearch.report.claims import NO_PROOF, Claim, Extent, claim, share_text
 from advsearch.report.figures import BLUE, RED, Figures, drawn
 from advsearch.report.phrases import percent
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import NO_PROOF, AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
 
 ROBUST = (
     "Robust: the plain picture of a held-out scene is right, and the search finds no wrong one. 95 % Clopper-Pearson "

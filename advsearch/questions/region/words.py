@@ -6,10 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from advsearch.questions.region.answer import BoxSide, MarginMap, RegionResult
-from advsearch.report.claims import Claim, Extent, claim, share_text
 from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
 from advsearch.report.phrases import percent
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
 
 
 def shown(result: RegionResult) -> ShownAnswer:

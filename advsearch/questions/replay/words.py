@@ -7,8 +7,7 @@ from pathlib import PurePath
 
 from advsearch.questions.replay.answer import NOT_DONE, ReplayResult, ReplayRow
 from advsearch.report import wording
-from advsearch.report.claims import Claim, case_claim
-from advsearch.report.shown import AnswerPart, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, ShownAnswer, case_claim
 
 HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "answer")
 """Of the columns."""

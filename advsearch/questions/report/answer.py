@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report.claims import Claim
+from advsearch.report.shown import Claim
 from advsearch.runs.results.base import Fields, Result
 
 

@@ -18,7 +18,7 @@ from advsearch.options import FROM_RUN
 
 if TYPE_CHECKING:
     from advsearch.questions.report.answer import Evidence, EvidenceRun
-    from advsearch.report.claims import Claim
+    from advsearch.report.shown import Claim
 
 HELP = "write what runs show, and no more than that, for a model card or a safety case"
 MORE = ": a page, Markdown and JSON"
@@ -129,7 +129,7 @@ def _run(folder: Path) -> EvidenceRun:
     # late, so that --help answers at once
     from advsearch.questions.report.answer import EvidenceRun
     from advsearch.questions.report.evidence import NOT_NOTED, QUICK, claims_of, evidence_of
-    from advsearch.report.claims import nothing_claimed
+    from advsearch.report.shown import nothing_claimed
     from advsearch.runs.directory import CONFIG, typed_name
     from advsearch.runs.summary import NAME as SUMMARY
     from advsearch.runs.summary import read_result

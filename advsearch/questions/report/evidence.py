@@ -13,8 +13,8 @@ from advsearch import rooms
 from advsearch.questions.photographs.answer import PhotoAgreement
 from advsearch.questions.report.answer import Evidence, EvidenceRun
 from advsearch.report import wording
-from advsearch.report.claims import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.report.markup import Html, element, join_html
+from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.report.wording import interval_text
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result, VariedValue

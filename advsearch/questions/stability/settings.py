@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from pydantic import field_validator
 
-from advsearch.config.derivative import TimedConfig
+from advsearch.config.attack import TimedConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
 

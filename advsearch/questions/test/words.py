@@ -17,9 +17,8 @@ from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer, SuiteResult
 from advsearch.questions.test.settings import AnyClaim, NoWorseClaim, RightClaim
-from advsearch.report.claims import Claim, Kind
 from advsearch.report.phrases import percent, with_article
-from advsearch.report.shown import AnswerPart, Picture, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, Kind, Picture, ShownAnswer
 from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
 from advsearch.runs.results.attack import AttackSummary
 
