@@ -87,6 +87,10 @@ class Judgement:
         return self.answer.label == NOT_A_NUMBER
 
 
+Said = tuple[Answer, JsonValue]
+"""What a model says of a picture, and what else is kept of it."""
+
+
 @dataclass(frozen=True)
 class Mark:
     """What a picture shows of an answer, or of what is true: a box, or the pixels of a mask.
@@ -244,6 +248,17 @@ class Task(ABC):
     minimise: bool = field(default=False, metadata=FROM_RUN)
     target: Truth = field(default=None, metadata=FROM_RUN)
 
+    def check_numbers(self, fits: Callable[[float], bool], expected: str, *names: str) -> None:
+        """Check options that are numbers.
+
+        Raises:
+            InputError: one is none, or does not fit; it says what was `expected`.
+        """
+        for name in names:
+            value: object = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not fits(value):
+                raise InputError(f"task {self.name}: {name}: expected {expected}, got {value!r}")
+
     # ---- what a task has to say -------------------------------------------------------------------------------------
 
     @abstractmethod
@@ -382,12 +397,14 @@ class Task(ABC):
 
     def judge(self, output: Output, truth: Truth) -> list[Judgement]:
         """Return what is to be said of each of N outputs."""
-        scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
-        answers, payloads = self.answers(output), self.payloads(output)
-        return [
-            Judgement.of(score, margin, first, payload)
-            for score, margin, (first, *_), payload in zip(scores, margins, answers, payloads, strict=True)
-        ]
+        with torch.no_grad():
+            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+            each = zip(scores, margins, self.said(output, truth, margins), strict=True)
+            return [Judgement.of(score, margin, *said) for score, margin, said in each]
+
+    def said(self, output: Output, truth: Truth, margins: Sequence[float]) -> list[Said]:
+        """Return the answer to each of N pictures, and what is kept beside it; `margins` are theirs."""
+        return [(first, kept) for (first, *_), kept in zip(self.answers(output), self.payloads(output), strict=True)]
 
 
 def typical(judgements: Sequence[Judgement]) -> Judgement:

@@ -20,11 +20,19 @@ from torch import Tensor
 
 from advsearch.models.labels import sets_of
 
+Labels = tuple[int, ...]
+Box = tuple[float, float, float, float]
 Detections = Mapping[str, Tensor]
 """What is found in a picture, see `advsearch.tasks.detector_answers`."""
 
 FORMS = ("xyxy", "xywh", "cxcywh", "yxyx")
 """How a box may be given: corners; a corner or the middle with width and height; corners with y first."""
+
+SMALLEST = 1e-6
+"""Scores and overlaps below this, or as near to 1, count as this: log-odds of 13.8."""
+
+AMONG = 500
+"""Among how many of the best scores boxes are looked for."""
 
 MOST = 2000
 """Most boxes of a class that are looked at in suppression, the best ones: a network that has learnt has fewer."""
@@ -101,6 +109,81 @@ def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     left = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
     left[order] = kept
     return left
+
+
+@dataclass(frozen=True)
+class Place:
+    """What is to be found in a picture: the truth of detection.
+
+    Attributes:
+        labels: indices of the right classes.
+        box: smallest box round what is seen of the object, x0, y0, x1, y1 in pixels; None where nothing is.
+        size: (height, width) of the picture in pixels.
+    """
+
+    labels: Labels
+    box: tuple[int, int, int, int] | None
+    size: tuple[int, int]
+
+    @property
+    def shares(self) -> Tensor | None:
+        """The box as shares of width and height, (4,)."""
+        if self.box is None:
+            return None
+        height, width = self.size
+        return torch.tensor(self.box) / torch.tensor([width, height, width, height])
+
+
+def overlap_with(one: Detections, truth: Place) -> Tensor:
+    """Return intersection over union with the true box, which there is, (D,)."""
+    assert truth.shares is not None
+    return overlap(one["boxes"], truth.shares.to(one["boxes"]))
+
+
+def suppressed(one: Detections, least: float, iou: float) -> Detections:
+    """Return what suppression leaves of boxes with a score of every class: the score of one that it removes is 0.
+
+    What has a score under `least` counts for nobody and is left alone. The choice has no derivative; what is left has.
+    Boxes that come with their labels are left as they are, and so are all where `iou` is 1.
+    """
+    if "labels" in one or iou == 1.0 or not len(one["boxes"]):
+        return one
+    scores, boxes = one["scores"].detach(), one["boxes"].detach()
+    rows, classes = (scores >= least).nonzero(as_tuple=True)
+    removed = torch.zeros_like(scores, dtype=torch.bool)
+    for label in classes.unique().tolist():
+        mine = rows[classes == label]
+        if len(mine) > 1:
+            removed[mine, label] = ~left_over(boxes[mine], scores[mine, label], iou)
+    return {**one, "scores": torch.where(removed, 0.0, one["scores"])}
+
+
+def listed(one: Detections, count: int, least: float, iou: float) -> list[tuple[Box, int, float]]:
+    """Return the best boxes, of a class and a place one: shares of width and height, class, score."""
+    boxes, scores = one["boxes"].detach(), one["scores"].detach()
+    best, places = scores.flatten().topk(min(AMONG, scores.numel()))
+    each = 1 if "labels" in one else scores.shape[1]
+    rows = places // each
+    classes = one["labels"][rows] if "labels" in one else places % each
+    found: list[tuple[Box, int, float]] = []
+    for label in classes[best >= least].unique().tolist():
+        mine = ((classes == label) & (best >= least)).nonzero().flatten()
+        for place in mine[strongest(boxes[rows[mine]], best[mine], count, iou)].tolist():
+            x0, y0, x1, y1 = boxes[rows[place]].tolist()
+            found.append(((x0, y0, x1, y1), label, float(best[place])))
+    return sorted(found, key=lambda row: -row[2])[:count]
+
+
+def log_odds(shares: Tensor) -> Tensor:
+    """Return log(p / (1 - p)), with what lies outside [0, 1] taken for its end."""
+    inside = shares.clamp(SMALLEST, 1.0 - SMALLEST)
+    return inside.log() - torch.log1p(-inside)
+
+
+def best_of(values: Tensor, among: Tensor | None = None) -> Tensor:
+    """Return the largest of values (D,), or of those where `among` is true; 0 where there are none."""
+    chosen = values if among is None else torch.where(among, values, 0.0)
+    return torch.cat([chosen, chosen.new_zeros(1)]).amax()
 
 
 # ---- how they are read -----------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task
+from advsearch.tasks.base import Answer, Facts, Mark, Said, Task
 
 ASIDE = 0.1
 """Cosine of the angle to the camera's axis from which on z-depth is no distance any more."""
@@ -143,10 +143,8 @@ class Depth(Task):
     missing: str = field(default="", metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
-        for name, low, high in (("tolerance", 0.0, LARGEST), ("size", -1e-9, 1e6)):
-            value: object = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low < value < high:
-                raise InputError(f"task depth: {name}: expected a number over 0, under {high:g}, got {value!r}")
+        self.check_numbers(lambda value: 0.0 < value < LARGEST, "a number over 0, under 100", "tolerance")
+        self.check_numbers(lambda value: -1e-9 < value < 1e6, "a number over 0, under 1e+06", "size")
         for name, known in (("kind", KINDS), ("seek", GOALS)):
             if getattr(self, name) not in ("", *known):
                 raise InputError(f"task depth: {name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
@@ -348,17 +346,13 @@ class Depth(Task):
             return Answer(NOT_A_NUMBER)
         return Answer(f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}")
 
-    def judge(self, output: Sequence[Map], truth: Distances) -> list[Judgement]:
-        """See `Task.judge`; the payload has the factor by which the distance is off, what is left of the relief, and
+    def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[Said]:
+        """See `Task.said`; the payload has the factor by which the distance is off, what is left of the relief, and
         where scale and shift were found."""
-        with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
-            return [
-                Judgement.of(score, margin, *self._said(one, truth, right=margin <= 0.0))
-                for score, margin, one in zip(scores, margins, output, strict=True)
-            ]
+        each = zip(output, margins, strict=True)
+        return [self._said(one, truth, right=margin <= 0.0) for one, margin in each]
 
-    def _said(self, one: Map, truth: Distances, *, right: bool) -> tuple[Answer, Any]:
+    def _said(self, one: Map, truth: Distances, *, right: bool) -> Said:
         if not truth.seen:
             return Answer("out of view"), None
         factors = self._factors(one, truth)

@@ -62,6 +62,11 @@ WORDS = {"boxes": ("box",), "scores": ("score", "conf", "prob", "logit"), "label
 NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 
 
+def told_by_classes(order: str) -> bool:
+    """Whether an order is of answers that the number of classes explains; their boxes have a middle and sides."""
+    return names_head(order) or order in QUERIES
+
+
 def checked_order(text: str) -> tuple[str, ...]:
     """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture.
 
@@ -71,7 +76,7 @@ def checked_order(text: str) -> tuple[str, ...]:
         ValueError: it names others.
     """
     parts = tuple(text.replace(",", " ").split())
-    if names_head(" ".join(parts)) or " ".join(parts) in QUERIES:
+    if told_by_classes(" ".join(parts)):
         return parts
     if sorted(parts) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
         raise ValueError(

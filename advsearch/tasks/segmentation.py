@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.described import NOT_A_NUMBER
-from advsearch.errors import InputError
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark
+from advsearch.tasks.base import Answer, Facts, Mark, Said
 from advsearch.tasks.classification import NO, ClassTask, Labels, members, target_lead, wrong_lead
 
 EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
@@ -66,9 +65,7 @@ class Segmentation(ClassTask):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        value: object = self.accuracy
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= 1.0:
-            raise InputError(f"task segmentation: accuracy: expected a number over 0, up to 1, got {value!r}")
+        self.check_numbers(lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "accuracy")
 
     def read(self, answer: Any, count: int) -> Tensor:
         """Return the logits (N, classes, h, w) in what a network answered.
@@ -161,20 +158,16 @@ class Segmentation(ClassTask):
             found.append(listed or (Answer("nothing" if len(said) else NOT_A_NUMBER),))
         return found
 
-    def judge(self, output: Tensor, truth: Region) -> list[Judgement]:
-        """See `Task.judge`.
+    def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[Said]:
+        """See `Task.said`.
 
         The answer is the class of most of the object's pixels; a wrong one where too few are right, and "no bottle"
         where most of these are background. Its probability is the share of the object's pixels that are right.
         """
-        with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
-            return [
-                Judgement.of(score, margin, *self._said(one, truth, right=margin <= 0.0))
-                for score, margin, one in zip(scores, margins, output, strict=True)
-            ]
+        each = zip(output, margins, strict=True)
+        return [self._said(one, truth, right=margin <= 0.0) for one, margin in each]
 
-    def _said(self, logits: Tensor, truth: Region, *, right: bool) -> tuple[Answer, Any]:
+    def _said(self, logits: Tensor, truth: Region, *, right: bool) -> Said:
         """The answer of one picture, and what else is kept: shares of the object's pixels by class, and the overlap."""
         pixels = self._pixels(logits[None], truth)
         if pixels is None:

@@ -274,11 +274,10 @@ class Similarity(Classification):
             raise InputError(f"task similarity: k: expected a whole number of at least 1, got {self.k!r}")
         if self.method == "linear" and self.k != 1:
             raise InputError("task similarity: k: belongs to `method: nearest`; leave one of the two out")
-        bar = self.threshold
-        if bar is not None and (isinstance(bar, bool) or not isinstance(bar, (int, float)) or not -1.0 < bar < 1.0):
-            raise InputError(f"task similarity: threshold: expected a cosine between -1 and 1, got {bar!r}")
-        if bar is not None and self.references:
-            raise InputError("task similarity: threshold: compares with the clean picture; leave `references` out")
+        if self.threshold is not None:
+            self.check_numbers(lambda bar: -1.0 < bar < 1.0, "a cosine between -1 and 1", "threshold")
+            if self.references:
+                raise InputError("task similarity: threshold: compares with the clean picture; leave `references` out")
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Similarity:
         """See `Task.on`; references are read and shown to the model, once.

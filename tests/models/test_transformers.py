@@ -21,7 +21,7 @@ from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.zoo import named
 from advsearch.models.zoo.transformers import PATIENCE
 from advsearch.tasks import Detection, Similarity
-from advsearch.tasks.detection import Place
+from advsearch.tasks.boxes import Place
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 huggingface_hub = pytest.importorskip("huggingface_hub")

@@ -16,7 +16,7 @@ from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.tasks import Answer, Detection
-from advsearch.tasks.detection import Place
+from advsearch.tasks.boxes import Place
 from advsearch.tasks.detector_answers import Detections, detections_in, settled
 
 CUP, BOWL = [20.0, 40.0, 60.0, 90.0], [65.0, 10.0, 90.0, 35.0]
