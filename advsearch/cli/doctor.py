@@ -21,11 +21,15 @@ from dataclasses import asdict, dataclass
 from importlib import metadata, resources
 from pathlib import Path
 
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
 from advsearch import __version__, threads
 from advsearch.cli import output
+from advsearch.cli.question import Command
 from advsearch.errors import AdvsearchError
-
-HELP = "check every part that a run needs, with versions and how to mend it"
+from advsearch.scene.mitsuba_backend.llvm import VARIABLE, ensure_llvm, find, install_command
 
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
 """The states of a part. A warning does not keep anything from running."""
@@ -64,11 +68,7 @@ class Component:
     fix: str = _NO_FIX_NEEDED
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    output.add_flags(parser)
-
-
-def run(args: argparse.Namespace) -> int:
+def _doctor(args: argparse.Namespace) -> int:
     """Check, print, and return the checks' exit status."""
     print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
     return told(as_json=args.json)
@@ -190,9 +190,6 @@ def _reinstall(name: str) -> str:
 
 def check_llvm() -> Component:
     """The libLLVM that will be used, what else there is, and why that is not used."""
-    # late, so that --help answers at once
-    from advsearch.scene.mitsuba_backend.llvm import VARIABLE, ensure_llvm, find, install_command
-
     given = os.environ.get(VARIABLE, "")
     others = find()
     try:
@@ -212,8 +209,7 @@ def bundled_scenes() -> Component:
     """The objects and environments that travel inside the package."""
     name, fix = "bundled scenes", "reinstall advsearch; in a checkout: git restore scenes/data"
     try:
-        # late, so that --help answers at once
-        from advsearch.scene.library import list_environments, list_objects
+        from advsearch.scene.library import list_environments, list_objects  # what is tried
 
         objects, environments = list_objects(), list_environments()
     except (ImportError, OSError, ValueError, KeyError, AdvsearchError) as error:
@@ -290,11 +286,6 @@ def _ending(status: int | None, errors: str) -> str:
 
 def _print_table(parts: list[Component], good: bool) -> None:
     """Print the parts as a table, and below it what has to be done."""
-    # late, so that --help answers at once
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     colours = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
     table = Table(box=None, pad_edge=False)
     for heading in ("part", "version", "", "detail"):
@@ -308,3 +299,6 @@ def _print_table(parts: list[Component], good: bool) -> None:
     for part in (part for part in parts if part.fix):
         console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
     console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
+
+
+DOCTOR = Command(output.add_flags, _doctor)

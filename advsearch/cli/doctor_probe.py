@@ -1,7 +1,8 @@
 """What `advsearch doctor` tries in a process of its own, because a libLLVM that is too old takes its process down.
 
 Each part that was tried prints one line of JSON: its name, whether it worked, and a detail or the error. A line that is
-missing at the end names the part that ended the process. Run by `advsearch.cli.doctor`, never imported by it.
+missing at the end names the part that ended the process. Run by `advsearch.cli.doctor`, never imported by it. Trials import
+what they try.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ NOISE = 0.08
 
 def numpy() -> str:
     """Solve a small system."""
-    # what is probed
     import numpy as np
 
     if not np.allclose(np.linalg.solve(np.diag([2.0, 4.0]), [2.0, 4.0]), 1.0):
@@ -30,11 +30,9 @@ def numpy() -> str:
 
 def torch() -> str:
     """A convolution and its gradient; say which build it is and how many threads it uses."""
-    # what is probed
     from advsearch import threads
 
     threads.configure()
-    # what is probed
     import torch
 
     image = torch.ones(1, 3, PIXELS, PIXELS, requires_grad=True)
@@ -48,11 +46,9 @@ def torch() -> str:
 
 def probe_renderer() -> str:
     """Render a few pixels of a lit wall and differentiate them with respect to its colour, which is linear."""
-    # what is probed
     from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
 
     mi = mitsuba()
-    # what is probed
     import drjit as dr
 
     wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
@@ -77,7 +73,6 @@ def probe_renderer() -> str:
 
 def probe_denoiser() -> str:
     """Denoise a constant picture, which must stay what it is."""
-    # what is probed
     import mitsuba_oidn
     import numpy as np
 
@@ -89,10 +84,8 @@ def probe_denoiser() -> str:
 
 def openexr() -> str:
     """Write a linear picture to a file and read it back."""
-    # what is probed
     import tempfile
 
-    # what is probed
     import numpy as np
     import OpenEXR
 
@@ -108,7 +101,6 @@ def openexr() -> str:
 
 def imageio() -> str:
     """Encode a picture as PNG and decode it."""
-    # what is probed
     import imageio.v3 as iio
     import numpy as np
 
@@ -120,10 +112,8 @@ def imageio() -> str:
 
 def pyarrow() -> str:
     """Write a Parquet table and read it back."""
-    # what is probed
     import io
 
-    # what is probed
     import pyarrow
     import pyarrow.parquet
 
@@ -137,10 +127,8 @@ def pyarrow() -> str:
 
 def matplotlib() -> str:
     """Draw an empty figure."""
-    # what is probed
     import io
 
-    # what is probed
     from matplotlib.figure import Figure
 
     stream = io.BytesIO()
@@ -150,7 +138,6 @@ def matplotlib() -> str:
 
 def cma() -> str:
     """Import the library of evolution strategies."""
-    # what is probed
     import cma as library
 
     return f"pycma {library.__version__.split()[0]}"
@@ -158,7 +145,6 @@ def cma() -> str:
 
 def xatlas() -> str:
     """Unwrap a triangle."""
-    # what is probed
     import numpy as np
     import xatlas
 

@@ -22,6 +22,23 @@ FELL_SHORT = 3
 
 
 @dataclass(frozen=True)
+class Command:
+    """A command that asks no question.
+
+    Attributes:
+        add_arguments: adds its arguments to a parser.
+        run: does what they say, and returns the exit status.
+        more: what its help says after what it does.
+        examples: lines of a shell, without `advsearch`.
+    """
+
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+    more: str = ""
+    examples: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Positional:
     """How a setting is given without its flag.
 
@@ -49,6 +66,7 @@ class QuestionCommand:
         about: the setting that names runs, or a file, which the question is about; Python code that the first of them
             names is imported only if `--code` or `--model` names it too.
         place: how that setting is given without its flag.
+        more, examples: as of `Command`.
     """
 
     name: str
@@ -56,6 +74,8 @@ class QuestionCommand:
     short: Callable[[Any], bool] = lambda result: False
     about: str = ""
     place: Positional | None = None
+    more: str = ""
+    examples: tuple[str, ...] = ()
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add a flag for each of the settings, and those that commands share."""

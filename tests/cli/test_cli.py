@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import importlib
 import io
 import json
 import os
@@ -27,9 +26,9 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 
 import advsearch
 from advsearch import __version__
-from advsearch.cli import list as listing
+from advsearch.cli import names
 from advsearch.cli.flags import with_flags
-from advsearch.cli.main import COMMANDS, main
+from advsearch.cli.main import COMMANDS, help_of, main
 from advsearch.cli.output import aligned, finish, watch_progress
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig, SweepConfig
@@ -119,7 +118,7 @@ def test_help_has_four_groups_and_each_command_once_with_its_whole_help(
     shown = re.findall(r"^  ([a-z0-9-]+) +(.+(?:\n {4,}.*)*)", listing, re.M)
     assert [name for name, _ in shown] == list(COMMANDS)
     for name, text in shown:
-        assert " ".join(text.split()) == importlib.import_module(COMMANDS[name]).HELP
+        assert " ".join(text.split()) == help_of(name)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -811,7 +810,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_the_listed_models_can_be_loaded_by_that_name() -> None:
-    assert list(listing.MODELS) == [AttackConfig(object="mug").model]
+    assert list(names.MODELS) == [AttackConfig(object="mug").model]
 
 
 @pytest.mark.usefixtures("registries")
