@@ -29,7 +29,7 @@ from advsearch import __version__, threads
 from advsearch.cli import output
 from advsearch.cli.question import Command
 from advsearch.errors import AdvsearchError
-from advsearch.scene.mitsuba_backend.llvm import VARIABLE, ensure_llvm, find, install_command
+from advsearch.scene.mitsuba_backend import llvm
 
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
 """The states of a part. A warning does not keep anything from running."""
@@ -190,16 +190,16 @@ def _reinstall(name: str) -> str:
 
 def check_llvm() -> Component:
     """The libLLVM that will be used, what else there is, and why that is not used."""
-    given = os.environ.get(VARIABLE, "")
-    others = find()
+    given = os.environ.get(llvm.VARIABLE, "")
+    others = llvm.find()
     try:
-        chosen = ensure_llvm()
+        chosen = llvm.ensure_llvm()
     except AdvsearchError as error:
-        fix = f"unset {VARIABLE}" if given else f"{install_command()} (or name a file in {VARIABLE})"
+        fix = f"unset {llvm.VARIABLE}" if given else f"{llvm.install_command()} (or name a file in {llvm.VARIABLE})"
         return Component("libLLVM", "", BROKEN if others or given else MISSING, str(error), fix)
     refused = [str(c) for c in others if c.refused]
     usable = [str(c) for c in others if not c.refused and c.path != chosen.path.resolve()]
-    detail = f"chosen: {chosen.path}" + (f", named by {VARIABLE}" if given else "")
+    detail = f"chosen: {chosen.path}" + (f", named by {llvm.VARIABLE}" if given else "")
     detail += f"; also usable: {', '.join(usable)}" if usable else ""
     detail += f"; refused: {', '.join(refused)}" if refused else ""
     return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)

@@ -1,8 +1,7 @@
 """What `advsearch doctor` tries in a process of its own, because a libLLVM that is too old takes its process down.
 
 Each part that was tried prints one line of JSON: its name, whether it worked, and a detail or the error. A line that is
-missing at the end names the part that ended the process. Run by `advsearch.cli.doctor`, never imported by it. Trials import
-what they try.
+missing at the end names the part that ended the process. Run by `advsearch.cli.doctor`, never imported by it.
 """
 
 from __future__ import annotations
@@ -12,7 +11,10 @@ import io
 import json
 import os
 import sys
+import tempfile
 from collections.abc import Callable
+
+from advsearch import threads
 
 PIXELS = 8
 NOISE = 0.08
@@ -21,7 +23,7 @@ NOISE = 0.08
 
 def numpy() -> str:
     """Solve a small system."""
-    import numpy as np
+    import numpy as np  # what is probed
 
     if not np.allclose(np.linalg.solve(np.diag([2.0, 4.0]), [2.0, 4.0]), 1.0):
         raise ArithmeticError("a system of two equations came out wrong")
@@ -30,10 +32,8 @@ def numpy() -> str:
 
 def torch() -> str:
     """A convolution and its gradient; say which build it is and how many threads it uses."""
-    from advsearch import threads
-
     threads.configure()
-    import torch
+    import torch  # what is probed
 
     image = torch.ones(1, 3, PIXELS, PIXELS, requires_grad=True)
     torch.nn.functional.conv2d(image, torch.ones(1, 3, 3, 3)).sum().backward()
@@ -46,10 +46,10 @@ def torch() -> str:
 
 def probe_renderer() -> str:
     """Render a few pixels of a lit wall and differentiate them with respect to its colour, which is linear."""
-    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
+    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba  # what is probed
 
     mi = mitsuba()
-    import drjit as dr
+    import drjit as dr  # what is probed
 
     wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
     film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
@@ -73,6 +73,7 @@ def probe_renderer() -> str:
 
 def probe_denoiser() -> str:
     """Denoise a constant picture, which must stay what it is."""
+    # what is probed
     import mitsuba_oidn
     import numpy as np
 
@@ -84,8 +85,7 @@ def probe_denoiser() -> str:
 
 def openexr() -> str:
     """Write a linear picture to a file and read it back."""
-    import tempfile
-
+    # what is probed
     import numpy as np
     import OpenEXR
 
@@ -101,6 +101,7 @@ def openexr() -> str:
 
 def imageio() -> str:
     """Encode a picture as PNG and decode it."""
+    # what is probed
     import imageio.v3 as iio
     import numpy as np
 
@@ -112,8 +113,7 @@ def imageio() -> str:
 
 def pyarrow() -> str:
     """Write a Parquet table and read it back."""
-    import io
-
+    # what is probed
     import pyarrow
     import pyarrow.parquet
 
@@ -127,9 +127,7 @@ def pyarrow() -> str:
 
 def matplotlib() -> str:
     """Draw an empty figure."""
-    import io
-
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # what is probed
 
     stream = io.BytesIO()
     Figure(figsize=(1, 1)).savefig(stream, format="png")
@@ -138,13 +136,14 @@ def matplotlib() -> str:
 
 def cma() -> str:
     """Import the library of evolution strategies."""
-    import cma as library
+    import cma as library  # what is probed
 
     return f"pycma {library.__version__.split()[0]}"
 
 
 def xatlas() -> str:
     """Unwrap a triangle."""
+    # what is probed
     import numpy as np
     import xatlas
 

@@ -1,7 +1,8 @@
 """`advsearch`: find the command, run it, and turn what goes wrong into a message and an exit status.
 
 A question's command is a module with `HELP` (one line), where there is more to say `MORE` (what the description says
-after that) and `EXAMPLES` (lines of a shell), and a `QuestionCommand` called `COMMAND`. It imports what is heavy inside
+after that) and `EXAMPLES` (lines of a shell), and a `QuestionCommand` called `COMMAND`, or else `add_arguments(parser)`
+and `run(args) -> int`. It imports what is heavy inside
 functions, so that `advsearch --help` answers at once. Other commands are a `Command` in this package, which is imported
 when it is asked for; the line is here.
 
@@ -215,8 +216,11 @@ def add_command(
     if not whole:
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))
     command, text = found(name), help_of(name)
-    module = None if " " in COMMANDS[name] else importlib.import_module(COMMANDS[name])
-    more, lines = getattr(module, "MORE", command.more), getattr(module, "EXAMPLES", command.examples)
+    if " " in COMMANDS[name]:
+        more, lines = command.more, command.examples
+    else:
+        module = importlib.import_module(COMMANDS[name])
+        more, lines = getattr(module, "MORE", ""), getattr(module, "EXAMPLES", ())
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
         description=f"{text[0].upper()}{text[1:]}{more}.",
@@ -244,9 +248,10 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
 
 
 def found(name: str) -> Any:
-    """Return what adds the arguments of a command and runs it: its `QuestionCommand` or its `Command`."""
+    """Return what adds the arguments of a command and runs it: its `QuestionCommand` or `Command`, or a module."""
     module, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
-    return getattr(importlib.import_module(module), attribute or "COMMAND")
+    imported = importlib.import_module(module)
+    return getattr(imported, attribute or "COMMAND", imported)
 
 
 def help_of(name: str) -> str:

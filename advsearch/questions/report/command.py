@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch import __version__
 from advsearch.cli import output
-from advsearch.cli.show import photos_of
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.options import FROM_RUN
 
@@ -180,6 +179,7 @@ def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
 
 def _photos(folder: Path) -> list[Claim]:
     # late, so that --help answers at once
+    from advsearch.cli.show import photos_of
     from advsearch.questions.report.evidence import photo_claims
 
     photos = photos_of(folder)
