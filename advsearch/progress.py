@@ -140,20 +140,17 @@ class LineProgress:
         self._done, self._began, self._printed = 0, clock(), clock()
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`."""
         with self._lock:
             self._name, self._total, self._hint, self._at_most = name, total, self._written(hint), at_most
             self._done, self._began, self._announced, self._info = 0, self._clock(), False, ""
 
     def advance(self, n: int = 1, **info: float | str) -> None:
-        """See `Progress.advance`."""
         with self._lock:
             self._done += n
             self._info = info_text(info) if info else self._info
         self.tick()
 
     def message(self, text: str) -> None:
-        """See `Progress.message`."""
         with self._lock:
             self._print(self._written(text))
 
@@ -189,7 +186,6 @@ class BarProgress:
         self._hinted: set[str] = set()
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`."""
         self._end_stage()
         if hint and hint not in self._hinted:
             self._hinted.add(hint)
@@ -202,13 +198,11 @@ class BarProgress:
             self._bars.update(task.id, visible=False)
 
     def advance(self, n: int = 1, **info: float | str) -> None:
-        """See `Progress.advance`."""
         if self._task is not None:
             self._shown = _escaped(info_text(info)) if info else self._shown
             self._bars.update(self._task, advance=n, info=self._shown)
 
     def message(self, text: str) -> None:
-        """See `Progress.message`."""
         self._bars.console.print(_escaped(self._written(text)), markup=False, highlight=False)
 
     def _end_stage(self) -> None:
@@ -234,20 +228,17 @@ class NotebookProgress:
         self._handle = sys.modules["IPython"].display.display(self, display_id=True)
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`."""
         self._name, self._total, self._at_most = name, total, at_most
         self._done, self._info, self._begun = 0, "", time.monotonic()
         self._draw()
 
     def advance(self, n: int = 1, **info: float | str) -> None:
-        """See `Progress.advance`."""
         self._done += n
         self._info = info_text(info) if info else self._info
         if time.monotonic() - self._drawn >= UPDATE:
             self._draw()
 
     def message(self, text: str) -> None:
-        """See `Progress.message`."""
         self._messages.append(text)
         self._draw()
 

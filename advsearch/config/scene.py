@@ -227,7 +227,6 @@ class SceneConfig(Config):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """Object and controls."""
         return self.object, *self.controls
 
     @property

@@ -114,7 +114,6 @@ class SweepConfig(SceneConfig):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The objects, and that it is a sweep."""
         return "-".join(Path(name).stem for name in self.objects), self.command
 
     @property

@@ -2,10 +2,8 @@
 
     sRGB = hsv(hue, saturation, value);   backdrop = linear(sRGB)
 
-The environment keeps lighting the object, so that only what is behind it changes, as in the studies of how much a
-classifier leans on backgrounds (Xiao et al. 2020, Noise or signal, arXiv 2006.09994). Hue, saturation and value are
-the hexcone model of Smith (Color gamut transform pairs, SIGGRAPH 1978), in display-referred values: piecewise linear,
-so that it has a derivative almost everywhere.
+The environment keeps lighting the object (Xiao et al. 2020, Noise or signal, arXiv 2006.09994). Hue, saturation and
+value are the hexcone model of Smith (Color gamut transform pairs, SIGGRAPH 1978), in display-referred values.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
 """What a control is: a named family of scene parameters that may vary, and their map from the unit box.
 
-A control declares its parameters as data (unit, range, default, whether periodic, its estimators)
-that the command line, the documentation, the gradient plan and the shared tests read. Bound to a scene it becomes a
-`BoundControl`: a slice of u, its budgets, and the map from that slice to scene inputs, written in torch so that
-autograd runs through it.
-
-Most controls are a handful of numbers: those subclass `advsearch.controls.numbers.NumberControl` and are one small
-file. `docs/controls/writing.md` has a worked example.
+A control declares its parameters as data. Bound to a scene it becomes a `BoundControl`: a slice of u and the map from
+it to scene inputs, in torch. Most controls subclass `numbers.NumberControl` (docs/controls/writing.md).
 """
 
 from __future__ import annotations

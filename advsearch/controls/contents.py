@@ -1,17 +1,12 @@
 """The `contents` control: what a vessel is filled with, and how high: water, coffee and milk in any proportions.
 
-Rain that falls on the mesh from above and cannot run off (a height map with its basins filled: Barnes, Lehman and
-Mulla 2014, arXiv 1511.04463, section 2) marks the inside and its brim; rays from the axis of that basin then find the
-wall all around at a few heights. A lamp shade catches rain as seen from above, but its wall has a gap below: the rays
-tell. The surface of the liquid is a level disc that follows the wall. Its colour is worked out in linear light from
-the proportions: absorption and scattering of coffee and milk add up by their amounts (Kubelka and Munk 1931), and
-water lets the vessel show through:
+Rain that cannot run off the mesh (a height map with its basins filled: Barnes, Lehman and Mulla 2014, arXiv 1511.04463,
+section 2) marks the inside; rays from its axis find the wall. Colours are in linear light (Kubelka and Munk 1931):
 
     K / S = sum(p_i K_i) / sum(p_i S_i),   milky coffee = 1 + K/S - sqrt((K/S)^2 + 2 K/S)
     color = opacity * milky coffee + (1 - opacity) * vessel * tint of water,   opacity = 1 - exp(-DENSITY (1 - water))
 
-Proportions add up to one in every configuration. The two that are free are cut off a stick of length one in turn, each
-from what the ones before leave; a range for an ingredient narrows where the stick may be cut.
+Proportions add up to one: the two that are free are cut off a stick of length one in turn, each from what is left.
 """
 
 from __future__ import annotations

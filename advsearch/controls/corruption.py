@@ -3,11 +3,8 @@
     severity 0: the picture as it is;  0 to 1: mixed with that of severity 1;  1 to 5: the published severities, and
     between two of them their parameters interpolated
 
-The corruptions and the numbers that a severity stands for are those of ImageNet-C (Hendrycks & Dietterich 2019,
-Benchmarking neural network robustness to common corruptions and perturbations, arXiv 1903.12261, section 4 and
-appendix A). They were made for a fixed list of pictures on disk; here they are functions of the picture in torch, so
-that a search can follow them back into the scene. Those of brightness, contrast, colour and file formats are here,
-the others in `corruption_filters`.
+They are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261, section 4 and appendix A) as functions of
+the picture in torch; those by noise, blur, shifted pixels and weather are in `corruption_filters`.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """Corruptions by noise, blur, shifted pixels and weather, and what all share: tables by severity, blurs, warps.
 
-Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A; but their frost is photographs, and here it is grown from
-noise, with the published weights. Pictures are (H, W, 3) float32 display-referred sRGB in
-[0, 1]. Lengths in the tables are pixels of a picture whose smaller side has `REFERENCE` pixels, the size for which the
-corruptions were published; `scale` converts them.
-
-The noise is one fixed draw, chosen by the seed: the same at every severity, so that the picture changes smoothly
-with the severity, and the same in every render. Blurs and shifts are linear in the picture.
+Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A; their frost is photographs, and here it is grown from noise.
+Pictures are (H, W, 3) float32 display-referred sRGB in [0, 1]. Lengths in the tables are pixels of a picture whose
+smaller side has `REFERENCE` pixels. Noise is one fixed draw, chosen by the seed: the same at every severity.
 """
 
 from __future__ import annotations

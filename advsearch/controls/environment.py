@@ -1,13 +1,11 @@
 """The `environment` control: which map lights the scene, how it is turned, how bright it is, and its colour.
 
-Mitsuba's own derivative of an environment's rotation has the wrong sign: the sampling of the light is detached from it
-(docs/gradients.md). Here the map itself is resampled along its columns by torch, and the adjoint differentiates its
-texels, which is right:
+Mitsuba's own derivative of a rotation has the wrong sign (docs/gradients.md). So the map is resampled by torch:
 
     map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1],    rotation / 360 * columns = k + f
 
-`harmonics` adds light of low order: real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan 2001,
-section 3), 9 coefficients for each colour channel as multiples of the map's mean radiance, inside an L2 ball.
+`harmonics` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan 2001, section 3), 9 coefficients
+for each colour channel as multiples of the map's mean radiance, inside an L2 ball.
 """
 
 from __future__ import annotations

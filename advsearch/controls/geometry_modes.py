@@ -1,13 +1,9 @@
 """Smooth displacements of a mesh: low-frequency modes over space, and how far they may go before the mesh breaks.
 
-A mode is a vector field that varies slowly over SPACE, not along the surface: two walls that are close together move
-together, so that a cup keeps its thickness. The scalar modes are diffusion maps (Coifman and Lafon 2006, "Diffusion
-maps", sections 2 and 3, with their normalisation alpha = 1 that forgets the sampling density) of points spread over the
-surface, extended to the vertices by the Nystrom formula. Rigid motions are projected out: those are the pose control's.
-
-`Preconditioner` is the alternative with one push per vertex: (I + lambda L)^-2, by which Nicolet et al. (2021, "Large
-Steps in Inverse Rendering of Geometry", section 3.2) precondition a step, with edges weighted by their length and links
-through thin walls added to L.
+A mode varies slowly over SPACE, so that close walls move together. Modes are diffusion maps (Coifman and Lafon 2006,
+"Diffusion maps", sections 2 and 3, alpha = 1) of points spread over the surface, extended to the vertices by the
+Nystrom formula, without rigid motions. `Preconditioner` is (I + lambda L)^-2 (Nicolet et al. 2021, "Large Steps in
+Inverse Rendering of Geometry", section 3.2), with edges weighted by length and links through thin walls.
 """
 
 from __future__ import annotations

@@ -3,12 +3,8 @@
     opacity_k(p) = opacity_k * exp(-(|p - centre_k|^2 / radius_k^2) ^ falloff)
     light(p)    <- (1 - opacity_k(p)) light(p) + opacity_k(p) color_k,     for each dot k in turn
 
-The model of a dot, a colour that is mixed in with an opacity that falls off exponentially with the squared distance,
-is that of Li, Schmidt and Kolter (Adversarial camera stickers, ICML 2019, arXiv 1904.00759, section 3): a dot on the
-glass is so far out of focus that all that is left of its outline is a smooth blob. They mix display values. Here the
-mixing is of linear light, because what a lens adds up on the sensor is light; the colours are given as sRGB.
-
-Dots are part of the camera, not of the scene: they are put on the finished picture, and nothing is rendered anew.
+The dots are those of Li, Schmidt and Kolter (Adversarial camera stickers, ICML 2019, arXiv 1904.00759, section 3), who
+mix display values; here linear light is mixed. They are put on the finished picture, and nothing is rendered anew.
 """
 
 from __future__ import annotations

@@ -1,14 +1,12 @@
 """The `light` control: one lamp with a place, a colour, a power and, if it is a ball, a size.
 
 Power is in multiples of the irradiance `E` with which a white surface (reflectance 0.8) gets the display value
-`LIT_WHITE`; the exposure is metered for the environment alone. A lamp of power p and linear colour c puts `p c E / d^2`
-on a surface that faces it at distance d (object sizes):
+`LIT_WHITE`. A lamp of power p and linear colour c puts `p c E / d^2` on a surface that faces it at distance d:
 
     point:  intensity I = p c E                      ball of radius r:  radiance L = p c E / (pi r^2)
 
-The second is the irradiance of a uniform ball, `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity and Realistic Image
-Synthesis, section 2.4), solved for L, so that size changes how soft the shadows are and not how bright the lamp is. One
-lamp is one instance; a second one needs a name of its own.
+The irradiance of a uniform ball is `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity and Realistic Image Synthesis,
+section 2.4), so that size changes how soft the shadows are and not how bright the lamp is.
 """
 
 from __future__ import annotations

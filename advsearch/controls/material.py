@@ -1,12 +1,9 @@
 """The `material` control: how the object's surface reflects, its tint, and which named material it is made of.
 
-The numbers are those of the principled BSDF (Burley, *Physically based shading at Disney*, SIGGRAPH 2012 course notes).
-A tint multiplies reflectance:
-
     base_color = linear(tint) * (the object's texture, or the named material's pattern)
 
-A named material is a seamless pattern of `patterns` with numbers of its own: the shape of one thing and
-the surface of another, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
+The numbers are those of the principled BSDF (Burley, *Physically based shading at Disney*, SIGGRAPH 2012 course notes).
+A named material has a seamless pattern and numbers of its own, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
 """
 
 from __future__ import annotations

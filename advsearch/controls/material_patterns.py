@@ -1,11 +1,8 @@
 """Named materials made by procedure: seamless patterns with a surface of their own, and how they cover an object.
 
-Each pattern is a square tile that repeats in both directions without a visible seam: it is built from noise, cells and
-waves on a torus. They are what "texture against shape" needs (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4:
-an object keeps its shape and wears another's surface).
-
-Ingredients, all periodic: gradient noise (Perlin 1985), cells (Worley 1996), and iterated band-pass filtering, which
-makes the stripes and spots of animals (Turing 1952; as a filter: Young 1984).
+Each is a square tile that repeats without a visible seam (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4), made
+of periodic gradient noise (Perlin 1985), cells (Worley 1996), and iterated band-pass filtering (Turing 1952; Young
+1984).
 """
 
 from __future__ import annotations

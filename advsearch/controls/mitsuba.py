@@ -1,10 +1,7 @@
-"""The `mitsuba` control: any number or colour of a scene by Mitsuba's own name.
+"""The `mitsuba` control: any number or colour of a scene by Mitsuba's own name, a key of `mitsuba.traverse`.
 
-The names are the keys of `mitsuba.traverse` for the scene inside Mitsuba, where the object under test is called
-`object` whatever it was called in a file. Of a colour, each channel is a number of its own in the same range, and
-`KEY.red` is one of them. Whether
-Mitsuba's derivative of a number is right nobody knows beforehand: `advsearch check` compares it with differences, and a
-plan that is measured takes what is nearer to them.
+The object under test is called `object` there. Of a colour, each channel is a number in the same range; `KEY.red` is
+one. Whether Mitsuba's derivative is right nobody knows beforehand: `advsearch check` compares it with differences.
 """
 
 from __future__ import annotations

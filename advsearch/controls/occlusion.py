@@ -1,13 +1,11 @@
 """The `occlusion` control: a second object between the camera and the object, hiding a wanted share of it.
 
-The occluder is a card, a sphere, a bundled object or a mesh from a file. It comes in from one side of the picture and
-stops where it hides as much as was asked for. It moves on a sphere around the camera and keeps its side towards it, so
-its distance and its size in the picture stay the same:
+The occluder comes in from one side of the picture, on a sphere around the camera, and stops where it hides as much as
+was asked for (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4):
 
     place = camera + distance * turned(line of sight, direction, angle),    hidden(angle) = coverage
 
-`angle` is found by bisection on rasterised silhouettes (`scene.silhouettes`). How much a classifier loses to an
-occluder at a known share is a standard question of robustness (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4).
+`angle` is found by bisection on rasterised silhouettes (`scene.silhouettes`).
 """
 
 from __future__ import annotations

@@ -2,11 +2,9 @@
 
     base colour = (1 - m) base colour + m linear(pixels at (a, b)),     m = soft square in (a, b), front of the surface
 
-A place is where a ray from outside towards the middle of the object meets the surface. Every texel of the object's
-base-colour map around it has a 3-D position and a normal (`advsearch.scene.surface_map`); its coordinates (a, b) are
-those in the tangent plane, unrolled along the direction in which the surface bends (exact for cylinders and spheres;
-Schmidt et al. 2006, "Interactive Decal Compositing with Discrete Exponential Maps", do it for any surface). Only the
-connected part of the surface that faces the same way is painted, so that nothing bleeds through a wall.
+A place is where a ray from outside towards the middle of the object meets the surface; (a, b) are those in the tangent
+plane, unrolled along the direction in which the surface bends (exact for cylinders and spheres; Schmidt et al. 2006,
+"Interactive Decal Compositing with Discrete Exponential Maps"). Only what is connected and faces that way is painted.
 """
 
 from __future__ import annotations

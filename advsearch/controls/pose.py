@@ -2,11 +2,8 @@
 
     world = scale * exp([rotation]) Rz(yaw) Ry(pitch) Rx(roll) (v - middle), then put on the ground and shifted
 
-A mesh around the object is put back on the height at which it stood, and shifted from where it stood.
-
-The three angles are those of the scene's settings. `rotation` is a rotation vector on top of them (axis times angle):
-angles alone lock at a pitch of 90 degrees, where yaw and roll turn about one axis, while the vector is well conditioned
-up to half a turn (its differential has condition number 1.6 at 180 degrees, that of the angles 115 at a pitch of 89).
+A mesh around the object is put back on the height at which it stood, and shifted from there. `rotation` is a rotation
+vector (axis times angle) on top of the angles, which lock at a pitch of 90 degrees.
 """
 
 from __future__ import annotations

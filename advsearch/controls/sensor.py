@@ -1,4 +1,4 @@
-"""The `sensor` control: what a camera's sensor and its processing do to a picture.
+"""The `sensor` control: what a camera's sensor and its processing do to the finished picture.
 
     vignetting light / (1 + a r^2)^2,    r from the middle of the picture, 1 in its corners: cos^4 of the angle there
     light      the red and blue picture are a little larger or smaller than the green one (lateral aberration)
@@ -7,15 +7,10 @@
     balance    red and blue times 2^red, 2^blue
     file       the tone curve, then JPEG
 
-The noise is the usual model of a raw image, Gaussian with a variance that is affine in the light (Foi, Trimeche,
-Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise modeling and fitting for single-image raw-data,
-section II). The pattern is Bayer's (1976, US patent 3971065); interpolation is bilinear. Chromatic aberration as a
-difference of magnification: Kang 2007, Automatic removal of chromatic aberration from a single image, section 2.
-Vignetting is that of light from off the axis: Kang and Weiss 2000, Can we calibrate a camera using an image of a flat,
-textureless Lambertian surface, section 2, with as much of it as is asked for.
-
-It happens to the finished picture, and nothing is rendered anew. Searched by default is what cameras do at their worst:
-noise of a tenth of white, a white balance half a stop off, a file of quality 40.
+Noise: Foi, Trimeche, Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise modeling and fitting for
+single-image raw-data, section II. Pattern: Bayer 1976, US patent 3971065. Aberration: Kang 2007, Automatic removal of
+chromatic aberration from a single image, section 2. Vignetting: Kang and Weiss 2000, Can we calibrate a camera using an
+image of a flat, textureless Lambertian surface, section 2.
 """
 
 from __future__ import annotations

@@ -1,21 +1,13 @@
 """The `sky` control: a clear sky with a sun instead of the environment; where the sun stands and how hazy the air is.
 
-The map is a differentiable function in torch. The sky dome is Hosek and Wilkie's (2012, An Analytic Model for Full
-Spectral Sky-Dome Radiance, equation 8), the sun theirs of 2013 (Adding a Solar Radiance Function to the Hosek Skylight
-Model), with the RGB coefficients that Mitsuba ships for its `sunsky` plugin. The plugin itself is not used: Mitsuba's
-samples of an emitter do not carry derivatives, so a moving sun has a wrong one, while a map under `environment.data`
-has a right one and does all that other environments do. What differs from the plugin: the sun is wider (`SUN_RADIUS`)
-with the same irradiance, so that a map can hold it; negative radiance is cut off; and below the horizon there is an
-infinite diffuse ground, not blackness.
-
-The same sun is hundreds of times darker at the horizon than at noon, so exposure matters. By default every
-configuration is metered, as an automatic camera would: the sky is scaled so that a surface facing the sun receives the
-same irradiance `M` always,
+The map is a differentiable function in torch: the dome of Hosek and Wilkie (2012, An Analytic Model for Full Spectral
+Sky-Dome Radiance, equation 8), their sun of 2013 (Adding a Solar Radiance Function to the Hosek Skylight Model), with
+the coefficients of Mitsuba's `sunsky` plugin. Unlike there, the sun is wider (`SUN_RADIUS`), so that a map can hold it,
+negative radiance is cut off, below is a diffuse ground, and a moving sun has a derivative. By default each is metered,
 
     radiance = map(azimuth, elevation, turbidity) M / m(azimuth, elevation, turbidity),
 
-with m the map's irradiance towards the sun. With `exposure: fixed` the divisor is that of the start, and a low sun is a
-dark picture.
+with m the map's irradiance towards the sun. With `exposure: fixed` the divisor is that of the start.
 """
 
 from __future__ import annotations

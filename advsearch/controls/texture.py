@@ -4,18 +4,10 @@
     palette    u = k colours in a ball around those of the original;   texel = original + sum_i w_i(texel) (u_i - c_i)
     waves      u = (a + 1) / 2 per wave and channel;   texel = original + r tanh(sum_mn s_mn a_mn cos_m(x) cos_n(y))
 
-and reflectance = linear(texel). Values are display-referred because that is what a person sees and a printer prints: a
-step of 0.1 is as visible in a dark texel as in a bright one. The threat model of a bounded change of texture is
-REVAMP's and Athalye et al.'s (2018, arXiv 1707.07397, section 3); here the ball is around the texture, not around the
-picture.
-
-The L2 radius is the plain Euclidean norm over all texel values. A search over many texels moves each by little: a
-radius of `r * sqrt(3 h w)` lets the root-mean-square change reach r.
-
-The palette follows Chang et al. (2015, "Palette-based Photo Recoloring", sections 3.2 and 3.4): k-means colours, and
-weights that fall off with the distance of a texel's colour from each, so that shades inside a surface survive. Ours are
-in sRGB instead of CIELAB, and normalised, so that no texel moves further than the palette does. The waves are the
-low-frequency search of Guo et al. (2019, arXiv 1809.08758, section 3) carried over from pictures to textures.
+and reflectance = linear(texel). A bounded change of texture is REVAMP's and Athalye et al.'s (2018, arXiv 1707.07397,
+section 3). L2 is the plain Euclidean norm over all texel values: `r * sqrt(3 h w)` lets their root-mean-square reach r.
+The palette follows Chang et al. (2015, "Palette-based Photo Recoloring", sections 3.2 and 3.4), in sRGB and normalised;
+the waves are the low-frequency search of Guo et al. (2019, arXiv 1809.08758, section 3).
 """
 
 from __future__ import annotations

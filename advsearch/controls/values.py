@@ -1,14 +1,10 @@
-"""What a parameter was set to: fixed, a range to search, or a list of values to choose from.
+"""What a parameter was set to: fixed, a range to search, or a list of values to choose from (docs/controls/README.md).
 
     pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
 
-The same form in Python, YAML and on the command line (docs/controls/README.md). Two numbers in a list are a range;
-three or more, or names, are a choice.
-
-The clean scene is the one that the object, the environment and the settings describe, and nothing else. A control's
-fixed value is another way of describing it. Where a control leaves out a value that was asked for, fixed, in a range or
-in a list, the two contradict each other, and that is refused. Where it leaves out only a default, the clean scene has
-the nearest value that the control does allow, and that is said: a `Moved`.
+Two numbers in a list are a range; three or more, or names, are a choice. Where a control leaves out a value of the
+clean scene that was asked for, the two contradict each other, and that is refused. Where it leaves out only a default,
+the clean scene has the nearest value that the control allows, and that is said: a `Moved`.
 """
 
 from __future__ import annotations

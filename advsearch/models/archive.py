@@ -1,12 +1,7 @@
-"""The zip archive of a model file, checked before anything that could run or swell is made of it.
+"""Archives of model files, checked before torch, which trusts them, makes anything of them that could run or swell.
 
-torch's own readers trust an archive. So it is opened here first: its members have distinct, plain names in one folder,
-are not encrypted, and unpack to no more than a limit; a member is unpacked to no more than its stated size.
-
-TorchScript is checked and rewritten before torch reads it. torch compiles the source code in the archive and runs a
-part of it (`__setstate__`) while it loads. The code cannot import or reach Python, but it can call any operator of
-torch, and a few of these touch files. The pickles beside it are read by torch's own reader, which makes no Python
-objects, but trusts the sizes that they state and follows any nesting.
+Members have distinct, plain names in one folder, are not encrypted, and unpack to no more than a limit. TorchScript is
+rewritten: torch runs a part of its code (`__setstate__`) while it loads, which can call operators that touch files.
 """
 
 from __future__ import annotations

@@ -1,13 +1,9 @@
 """`torch.export` archives (.pt2), rewritten before torch reads them.
 
-torch's reader evaluates the expressions of sizes and the guards as Python, writes names of the graph into code that it
-runs, looks operators up by any dotted name, imports modules for containers, and unpickles. So it never sees the file:
-from its description of the network (`models/model.json`) and its weights a new archive is made in memory. What cannot
-be checked is left out (example inputs, guards, notes on where an operator came from), and all else has to have the form
-that `torch.export.save` gives it.
-
-Expressions of sizes are arithmetic with whole numbers and symbols. torch hands these texts to sympy, which evaluates
-them as Python. Only what sympy itself writes passes: names, numbers, operators, and calls of the functions listed here.
+torch's reader evaluates expressions and guards as Python, writes names of the graph into code that it runs, imports
+modules for containers, and unpickles. So it never sees the file: a new archive is made in memory of its description of
+the network and its weights. What cannot be checked is left out, and all else has to have the form that
+`torch.export.save` gives it; expressions of sizes are arithmetic with whole numbers, symbols and listed functions.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """What code of others must not do to us: never end, or leave torch's global switches turned.
 
-Neither a signal nor an exception ends torch's own loops, so a call goes on in a thread of its own, which is left behind
-when the time is up; what would also hold Python up is tried in a process of its own first. All our own code runs with
-torch's switches as torch comes. A network is called with the type and device for new tensors that its own code has
-chosen. Gradients are ours to switch.
+A call goes on in a thread of its own, left behind when the time is up, for nothing ends torch's loops; what would hold
+Python up too is tried in a process of its own. A network has the type and device for new tensors that its code chose.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,28 +24,8 @@ TINT, LETTERS = 0.45, 28
 Box = tuple[float, float, float, float]
 
 
-class Shape(Protocol):
-    """What is drawn: a box, or the pixels of a mask; see `advsearch.tasks.Mark`."""
-
-    @property
-    def text(self) -> str:
-        """What stands beside it."""
-
-    @property
-    def true(self) -> bool:
-        """Whether it is true of the scene, and not what the model says."""
-
-    @property
-    def box(self) -> Box | None:
-        """x0, y0, x1, y1 in pixels of the picture."""
-
-    @property
-    def mask(self) -> Any:
-        """(h, w) bool over the whole picture, of any size; None for a box."""
-
-    @property
-    def map(self) -> Any:
-        """(h, w) numbers over the whole picture; None where there are none."""
+Shape = Any
+"""What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`."""
 
 
 def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 from advsearch.described import NOT_A_NUMBER
 
@@ -58,16 +58,8 @@ WHOLE = ("background", "itself", "something else")
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
 
-class Said(Protocol):
-    """An answer of a model: `advsearch.tasks.Answer`, or what a result holds of one."""
-
-    @property
-    def label(self) -> str:
-        """In words."""
-
-    @property
-    def probability(self) -> float | None:
-        """In [0, 1], of what the task says; None where there is none."""
+Said = Any
+"""An answer of a model: `advsearch.tasks.Answer`, or what a result holds of one."""
 
 
 def percent(share: float | None, most: int = MOST_DECIMALS) -> str:

@@ -73,14 +73,12 @@ class FreeAnswer(Task):
         return replace(self, target=None if target is None else _words("target", target), minimise=minimise)
 
     def read(self, answer: Any, count: int) -> list[Utterance]:
-        """See `Task.read`: what `Utterance` describes, for each picture."""
         keys = Utterance.__required_keys__
         if isinstance(answer, (list, tuple)) and all(isinstance(one, Mapping) and keys <= one.keys() for one in answer):
             return list(answer)
         raise ValueError("expected a mapping with text, logits and begins for each picture, as answers in words have")
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`: something has to be right."""
         self.truth(facts)
 
     def truth(self, facts: Facts) -> Words:
@@ -98,11 +96,9 @@ class FreeAnswer(Task):
         return right
 
     def truth_names(self, truth: Words) -> Words:
-        """Return the right words."""
         return truth
 
     def margin(self, output: Sequence[Utterance], truth: Words) -> Tensor:
-        """See `FreeAnswer`, (N,): over 0 exactly where the text has none of the words."""
         return torch.stack([_margin(one, truth) for one in output])
 
     def answers(self, output: Sequence[Utterance], count: int = 1) -> list[tuple[Answer, ...]]:

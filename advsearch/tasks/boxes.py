@@ -1,12 +1,8 @@
-"""Boxes round what a detector sees: how far two overlap, which of many are one thing, and how their numbers are read.
+"""Boxes round what a detector sees, x0, y0, x1, y1 from the top left: how far two overlap, and how they are read.
 
-A box is x0, y0, x1, y1 from the top left, (..., 4).
-
-Answers in one tensor, as YOLO's networks give them, have a box for each place of a grid, and a score of every class.
-Such an answer is (A, B) for each picture. Either its columns are places and its rows are numbers ("channels first", v8
-to v12 and YOLO11), or the other way round ("channels last", v5 to v7, YOLOX, RT-DETR). The numbers of a place are a box
-(by its middle, width and height), in the older ones objectness, with which scores are multiplied, and a score of each
-class; those of segmentation have mask coefficients after these, as many as the prototypes have channels.
+Answers in one tensor, as YOLO's networks give them, are (A, B) for each picture: "channels first" (places are columns,
+v8 to v12 and YOLO11) or "channels last" (v5 to v7, YOLOX, RT-DETR). The numbers of a place are a box (middle, width,
+height), in older ones objectness, with which scores are multiplied, a score of each class, and mask coefficients.
 """
 
 from __future__ import annotations

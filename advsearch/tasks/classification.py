@@ -149,7 +149,6 @@ class Classification(ClassTask):
         return output.index_fill(1, torch.tensor(sorted(nothing), device=output.device), -math.inf)
 
     def margin(self, output: Tensor, truth: Labels) -> Tensor:
-        """See `wrong_lead`."""
         return wrong_lead(self.answerable(output, truth), truth)
 
     def score(self, output: Tensor, truth: Labels) -> Tensor:
@@ -185,7 +184,6 @@ class Classification(ClassTask):
         return [Judgement.of(score, margin, first) for score, margin, (first,) in rows]
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
-        """Return the names of classes."""
         return self.names(truth)
 
 

@@ -190,12 +190,10 @@ class Depth(Task):
         return super().on(model, target=target, minimise=minimise)
 
     def seeking(self, objective: str) -> Depth:
-        """See `Task.seeking`: the objectives of depth say what counts as success."""
         return replace(self, seek=objective) if objective in GOALS else self
 
     @property
     def looks(self) -> bool:
-        """See `Task.looks`: at what the network says of its numbers, and at what is beside the object."""
         return True
 
     def seeing(self, output: Sequence[Map], truth: Distances | None) -> Depth:
@@ -227,7 +225,6 @@ class Depth(Task):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """See `Task.remarks`: how answers are read."""
         if not self.seen_kind:
             return ()
         text = f"The model's numbers are read as {self.seen_kind}: {KINDS[self.seen_kind]}"
@@ -258,7 +255,6 @@ class Depth(Task):
         return Distances(facts.mask, facts.z_depth)
 
     def truth_names(self, truth: Distances) -> tuple[str, ...]:
-        """Return what is right, in words."""
         return (AS_FAR,)
 
     # ---- scores -----------------------------------------------------------------------------------------------------

@@ -1,10 +1,8 @@
 """Object detection: whether a model finds the object, by a box where it is and the right name.
 
-A model that gives a score of every class for each box has not suppressed those that overlap, which is done class by
-class (greedily) before anybody sees a box. What counts here holds before and after that: the object is found by a right
-box that is left, and has vanished where there was none before either; a box that is a success is one that is left. So a
-right box beside a better one of its class that is not where the object is makes an answer neither right nor a success.
-Boxes that come with their labels count as they are. Scores p are compared as log-odds, log(p / (1 - p)).
+Boxes with a score of every class are suppressed class by class (greedily) before anybody sees one. The object is found
+by a right box that is left, and has vanished where there was none before either; a box that is a success is one that is
+left. Boxes that come with their labels count as they are. Scores p are compared as log-odds, log(p / (1 - p)).
 """
 
 from __future__ import annotations

@@ -37,7 +37,6 @@ class OwnTask(Task):
         return replace(asked, labels=tuple(model.labels) if model.named else ())
 
     def truth(self, facts: Facts) -> Facts:
-        """Return the facts themselves."""
         return facts
 
     def margin(self, output: Any, truth: Facts) -> Tensor:
@@ -69,7 +68,6 @@ class OwnTask(Task):
         return Answer(f"{' x '.join(map(str, one.shape))} numbers, mean {float(one.double().mean()):.3g}")
 
     def truth_names(self, truth: Facts) -> tuple[str, ...]:
-        """Return the label where there is one, else the object."""
         return (truth.label or truth.own_label or truth.object,)
 
 

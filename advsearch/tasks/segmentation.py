@@ -84,19 +84,15 @@ class Segmentation(ClassTask):
         return answer.float()
 
     def classes_in(self, output: Tensor) -> int:
-        """Return the number of classes."""
         return output.shape[1]
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`: the model must have such a class."""
         self.right_classes(facts)
 
     def truth(self, facts: Facts) -> Region:
-        """Return what is to be segmented."""
         return Region(self.right_classes(facts), facts.mask)
 
     def truth_names(self, truth: Region) -> tuple[str, ...]:
-        """Return the right names."""
         return self.names(truth.labels)
 
     def margin(self, output: Tensor, truth: Region) -> Tensor:

@@ -1,9 +1,6 @@
-"""A gallery: pictures in folders, one folder for each name, as a network sees them.
+"""Similarity: which reference pictures a network finds nearest, by the cosine of its features.
 
-Similarity: which reference pictures a network finds nearest, by the cosine of its features.
-
-Networks without classes are used like that: re-identification, search by picture, recognition of faces and products.
-With one folder of reference pictures for each name it is a classification among these names. Without, an answer is
+With a gallery, one folder of pictures for each name, it is a classification among these names. Without, an answer is
 right where the picture is still the same thing as the clean one to the network.
 """
 
@@ -299,7 +296,6 @@ class Similarity(Classification):
         return replace(found, gallery=embedded(self.references, model, linear=self.method == "linear"))
 
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
-        """Those of the folders."""
         return tuple(name for name, _ in folders_of(self.references)) if self.references else (ITSELF, ELSE), True
 
     def right_classes(self, facts: Facts) -> Labels:
@@ -315,7 +311,6 @@ class Similarity(Classification):
         return not self.references and self.clean is None
 
     def seeing(self, output: Tensor, truth: Labels | None) -> Similarity:
-        """See `Task.seeing`: the first picture is the clean one."""
         return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.looks else self
 
     def read(self, answer: Any, count: int) -> Tensor:
@@ -343,7 +338,6 @@ class Similarity(Classification):
         return scores / TEMPERATURE
 
     def answerable(self, output: Tensor, truth: Labels) -> Tensor:
-        """See `Task.answerable`: the logits."""
         return super().answerable(self.logits(output), truth)
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:

@@ -90,12 +90,10 @@ class Together(Task):
 
     @property
     def title(self) -> str:
-        """See `Task.title`: of different tasks, their names."""
         names = [one.title for one in self.parts]
         return JOINED.join(names) if len(set(names)) > 1 else self.name
 
     def read(self, answer: Any, count: int) -> list[Outputs]:
-        """See `advsearch.tasks.together.by_picture`."""
         return by_picture(answer, count)
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Together:
@@ -117,7 +115,6 @@ class Together(Task):
         return replace(self, models=models, tasks=tasks, target=wanted, minimise=minimise)
 
     def seeking(self, objective: str) -> Together:
-        """See `Task.seeking`: of every task."""
         return replace(self, parts=tuple(one.seeking(objective) for one in self.parts))
 
     def told(self, one: Task, facts: Facts) -> Facts:
@@ -128,7 +125,6 @@ class Together(Task):
         return one.labelled or not any(part.labelled for part in self.parts)
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`: of every model."""
         for one in self.tasks:
             one.check(self.told(one, facts))
 
@@ -150,11 +146,9 @@ class Together(Task):
         return tuple(dict.fromkeys(remark for one in self.tasks for remark in one.remarks))
 
     def truth(self, facts: Facts) -> Truths:
-        """Return what is true for each model."""
         return tuple(one.truth(facts) for one in self.tasks)
 
     def truth_names(self, truth: Truths) -> tuple[str, ...]:
-        """Return the names of all models, each once."""
         pairs = zip(self.tasks, truth, strict=True)
         return tuple(dict.fromkeys(name for one, own in pairs for name in one.truth_names(own)))
 
@@ -163,20 +157,16 @@ class Together(Task):
         return tuple(dict.fromkeys(name for one in self.tasks for name in one.target_names))
 
     def margin(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        """Return the largest margin of the models, (N,)."""
         return torch.stack([one.margin(*own) for one, *own in self._each(output, truth)]).amax(dim=0)
 
     def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        """Return the least score of the models, (N,)."""
         return torch.stack([one.score(*own) for one, *own in self._each(output, truth)]).amin(dim=0)
 
     def answers(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Answer, ...]]:
-        """Return one answer for each picture: what each model says, in their order."""
         said = [one.answers(own) for one, own in zip(self.tasks, of_each(output), strict=True)]
         return [(_joined([first for first, *_ in each]),) for each in zip(*said, strict=True)]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
-        """See `Task.judge`; the payload is that of each model."""
         judged = [one.judge(*own) for one, *own in self._each(output, truth)]
         return [self._together(each) for each in zip(*judged, strict=True)]
 

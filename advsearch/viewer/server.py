@@ -1,15 +1,9 @@
 """`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
 
-What it answers: GET and HEAD of the list, of a run's page, of its rows and pictures, POST of a photograph, and nothing
-else. No part of an address becomes a path: runs are looked up by name among those that it was given, pictures by
-number. A request whose `Host` is not this server's is refused, so that a page elsewhere whose name is made to lead here
-(DNS rebinding) reads nothing; so is one that another origin's page sends. Beyond this machine every request needs the
-token, and goes over HTTPS. A photograph has to come from this server's own page, which alone knows the key for it.
-
-A browser opens a camera on another machine for nothing less than HTTPS. The certificate is made by the `openssl`
-program, which about every machine has, rather than by a package that would be installed for this alone. It is good for
-as long as the server runs: its key lies in a folder that only this user can read, until it is loaded, and is deleted
-then. A browser can't know it, and asks; what it should show is printed.
+It answers GET and HEAD of the list, of a run's page, rows and pictures, POST of a photograph, and nothing else. No part
+of an address becomes a path. A request whose `Host` is not this server's is refused (DNS rebinding); so is one that
+another origin's page sends. Beyond this machine every request needs the token, and goes over HTTPS, with a certificate
+that `openssl` makes and that is good for as long as the server runs. A photograph needs the key of this server's page.
 """
 
 from __future__ import annotations
