@@ -27,8 +27,7 @@ from torch.nn.parameter import is_lazy
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError, resembling
 from advsearch.files import open_regular
 from advsearch.models.archive import LARGEST
-from advsearch.models.model import CPU, GIVEN_BY, Model, ModelWarning
-from advsearch.models.preprocessing import Triple
+from advsearch.models.model import CPU, GIVEN_BY, Model, ModelWarning, Triple
 from advsearch.models.probe import first_line
 from advsearch.registry import check_import, current_directory_importable
 

@@ -182,7 +182,7 @@ def test_a_phone_gets_a_chart_that_fits_with_letters_that_can_be_read(tmp_path: 
     assert "min-width" not in re.findall(r"svg\.chart \{[^}]*\}", asset("document.css"))[0]
     css = asset("document.css")
     phone = css.index("@media (max-width: 34rem)")
-    assert CSS.index("svg.narrow { display: none; }") < phone < CSS.index("svg.narrow { display: block; }")
+    assert css.index("svg.narrow { display: none; }") < phone < css.index("svg.narrow { display: block; }")
 
 
 def test_numbers_have_the_digits_that_mean_something(tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ Pixels = Callable[[Tensor], Tensor]
 
 
 def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measured]:
-    """Return what makes ``pixel_values`` of a picture (3, H, W), and what `advsearch.models.preprocessing` does before.
+    """Return what makes ``pixel_values`` of a picture (3, H, W), and what `Preprocessing` does before.
 
     An affine map is measured and left to that. What cuts a picture into patches or tiles is called itself, which is
     differentiable where the processor works with torchvision.

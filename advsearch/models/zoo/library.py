@@ -22,8 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.errors import ModelError
-from advsearch.models.model import ModelWarning
-from advsearch.models.preprocessing import Triple
+from advsearch.models.model import ModelWarning, Triple
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
 

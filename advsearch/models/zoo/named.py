@@ -12,7 +12,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from advsearch.errors import ModelError, UnknownNameError
-from advsearch.models.preprocessing import PRESETS, Triple
+from advsearch.models.model import PRESETS, Triple
 from advsearch.models.source import Purpose, Source, load_weights, near_names, source_of, split_weights
 from advsearch.models.zoo import outputs
 from advsearch.models.zoo.library import Loaded, library, reading

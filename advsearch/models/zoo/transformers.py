@@ -60,7 +60,7 @@ def load(spec: str) -> Source:
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
-            kind or larger than the memory, or its processor does what `advsearch.models.preprocessing` can't.
+            kind or larger than the memory, or its processor does what `Preprocessing` can't.
 
     Warns:
         ModelWarning: it has no image processor.

@@ -67,8 +67,7 @@ from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.attack.several import matrix_from_config
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
-from advsearch.tasks import AnyTask, Task, make_task
-from advsearch.tasks.own import OwnTask, function_of
+from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Generator, Tensor
 
 from advsearch.models import Model
-from advsearch.models.trainable import Trainable
+from advsearch.models.reference import Trainable
 from advsearch.questions.harden.lessons import (
     Lesson,
     RenderedLesson,

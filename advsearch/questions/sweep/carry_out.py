@@ -53,8 +53,7 @@ from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.parameters import Parameter
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
-from advsearch.tasks import AnyTask, Task, make_task
-from advsearch.tasks.own import OwnTask, function_of
+from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
