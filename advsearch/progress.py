@@ -186,7 +186,10 @@ class BarProgress:
         self._hinted: set[str] = set()
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        self._end_stage()
+        if self._task is not None:
+            done = next(task.completed for task in self._bars.tasks if task.id == self._task)
+            self._bars.update(self._task, total=max(done, 1), completed=max(done, 1), at_most=False)
+            self._bars.stop_task(self._task)
         if hint and hint not in self._hinted:
             self._hinted.add(hint)
             self._bars.console.print(
@@ -204,13 +207,6 @@ class BarProgress:
 
     def message(self, text: str) -> None:
         self._bars.console.print(_escaped(self._written(text)), markup=False, highlight=False)
-
-    def _end_stage(self) -> None:
-        """Fill the bar of a stage whose length was unknown, or that ended early, and stop its clock."""
-        if self._task is not None:
-            done = next(task.completed for task in self._bars.tasks if task.id == self._task)
-            self._bars.update(self._task, total=max(done, 1), completed=max(done, 1), at_most=False)
-            self._bars.stop_task(self._task)
 
 
 class NotebookProgress:

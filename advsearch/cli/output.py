@@ -261,7 +261,11 @@ def shown_text(result: Result) -> str:
         parts.append("\n".join(filter(None, [one.title, "\n\n".join(filter(None, inside))])))
     facts = [[name.lower(), text] for name, text in facts_of(result, given).items()]
     parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))
-    return "\n\n".join(filter(None, parts)) + as_notes(remarks_of(result, given))
+    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+
+    return "\n\n".join(filter(None, parts)) + "".join(
+        f"\n\nNote: {with_flags(text)}" for text in remarks_of(result, given)
+    )
 
 
 def aligned(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:
@@ -289,13 +293,6 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
             ctypes.CDLL(None).fflush(None)
         os.dup2(kept, source)
         os.close(kept)
-
-
-def as_notes(texts: Sequence[str]) -> str:
-    """Return notes below an answer, each a paragraph, with the flags of the settings that they name."""
-    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
-
-    return "".join(f"\n\nNote: {with_flags(text)}" for text in texts)
 
 
 LOADING_STAGES = 2

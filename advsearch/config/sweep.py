@@ -164,15 +164,10 @@ def _grid_values(given: Any) -> Any:
         if ":" in text and "," not in text:
             return text
         given = [part.strip() for part in text.split(",") if part.strip()]
-    values = _plain_values(given)
+    given = given.tolist() if hasattr(given, "tolist") else given
+    sequence = isinstance(given, (range, tuple, list))
+    values = [one.item() if hasattr(one, "item") else one for one in given] if sequence else given
     values = values if isinstance(values, list) else [values]
     if not values or any(one is None or isinstance(one, (bool, list, Mapping)) for one in values):
         raise ValueError("not values")
     return [number_or_text(one) for one in values]
-
-
-def _plain_values(given: Any) -> Any:
-    """A sequence, a range or an array as a list of Python numbers and names; one value stays one."""
-    given = given.tolist() if hasattr(given, "tolist") else given
-    sequence = isinstance(given, (range, tuple, list))
-    return [one.item() if hasattr(one, "item") else one for one in given] if sequence else given

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -43,9 +42,9 @@ def _coefficient(name: str) -> Parameter:
 class CameraControl(NumberControl):
     """An orbit around the object, the lens, and the exposure."""
 
-    kind: ClassVar[str] = "camera"
-    summary: ClassVar[str] = "An orbit around the object, the lens, and the exposure."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "camera"
+    summary = "An orbit around the object, the lens, and the exposure."
+    parameters = (
         *CAMERA[:-1],
         moving(ORBIT, "focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
         moving(ORBIT, "shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),

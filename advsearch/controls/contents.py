@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -227,10 +226,10 @@ class ContentsControl(NumberControl):
         InputError: proportions that cannot add up to one.
     """
 
-    kind: ClassVar[str] = "contents"
-    amount: ClassVar[str | None] = "level"
-    summary: ClassVar[str] = "What a vessel is filled with, and how high: water, coffee and milk."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "contents"
+    amount = "level"
+    summary = "What a vessel is filled with, and how high: water, coffee and milk."
+    parameters = (
         moving(
             ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is empty, 1 is full to the brim.", (0.0, 0.95)
         ),

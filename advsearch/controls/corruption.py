@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -41,7 +40,6 @@ from advsearch.controls.corruption_filters import (
     zoom_blur,
 )
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, OneOf
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import levels_of
 
@@ -149,10 +147,10 @@ NAMES = (*SMOOTH, *FROM_NOTHING, *STEPPED)
 class CorruptionControl(NumberControl):
     """One of the common image corruptions, by name and severity."""
 
-    kind: ClassVar[str] = "corruption"
-    amount: ClassVar[str | None] = "severity"
-    summary: ClassVar[str] = "A common image corruption (noise, blur, weather, digital) by name and severity."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "corruption"
+    amount = "severity"
+    summary = "A common image corruption (noise, blur, weather, digital) by name and severity."
+    parameters = (
         Parameter(
             "which", (), "name", 0, len(NAMES) - 1, NAMES[0], "Which corruption.", search=(0, len(NAMES) - 1),
             options=NAMES, estimators=(),
@@ -163,7 +161,7 @@ class CorruptionControl(NumberControl):
             estimators=("image",),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0.", whole=(0, 2**32 - 1)
         ),
@@ -175,16 +173,8 @@ class CorruptionControl(NumberControl):
         self.asked = False
 
     def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
-        if parameter.name == "severity" and self.possible() <= set(STEPPED):
-            return ()
-        return super().estimators(scene, parameter)
-
-    def possible(self) -> set[str]:
-        """Return the corruptions that a search may come to."""
-        spec = self.specs.get("which")
-        if isinstance(spec, Fixed):
-            return {str(spec.value)}
-        return {str(value) for value in spec.values} if isinstance(spec, OneOf) else set(NAMES)
+        stepped = {*self.allowed("which", *NAMES)} <= {*STEPPED}
+        return () if parameter.name == "severity" and stepped else super().estimators(scene, parameter)
 
     def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
         seed = int(self.chosen["seed"])  # type: ignore[call-overload]

@@ -10,7 +10,6 @@ mix display values; here linear light is mixed. They are put on the finished pic
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -46,10 +45,10 @@ def _per_dot(name: str, unit: str, default: float, description: str, **more: obj
 class LensControl(NumberControl):
     """Translucent dots on the camera's lens."""
 
-    kind: ClassVar[str] = "lens"
-    amount: ClassVar[str | None] = "opacity"
-    summary: ClassVar[str] = "Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "lens"
+    amount = "opacity"
+    summary = "Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."
+    parameters = (
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
         _per_dot(
@@ -66,9 +65,7 @@ class LensControl(NumberControl):
             estimators=("image",),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),
-    )
+    choices = (Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),)
 
     @property
     def dots(self) -> int:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -48,10 +47,10 @@ def _place(name: str, low: float, high: float, default: float, description: str)
 class LightControl(NumberControl):
     """One lamp beside the environment."""
 
-    kind: ClassVar[str] = "light"
-    amount: ClassVar[str | None] = "power"
-    summary: ClassVar[str] = "A lamp: where it stands, its colour, its power, and the size of an area light."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "light"
+    amount = "power"
+    summary = "A lamp: where it stands, its colour, its power, and the size of an area light."
+    parameters = (
         _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
         _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
         _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
@@ -66,7 +65,7 @@ class LightControl(NumberControl):
             (0.05, 0.6), log=True,
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "type", "area", "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
             options=("area", "point"),
@@ -81,7 +80,7 @@ class LightControl(NumberControl):
             )
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        if parameter.name == "power" and self.asked and isinstance(self.specs.get("power", Fixed(0.0)), Fixed):
+        if parameter.name == "power" and self.asked and not self.searches("power"):
             return LIT_POWER
         return parameter.default
 

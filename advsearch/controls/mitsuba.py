@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -26,9 +25,9 @@ from advsearch.scene.settings import CHANNELS
 class MitsubaControl(NumberControl):
     """Anything else in the scene: numbers and colours by Mitsuba's own names."""
 
-    kind: ClassVar[str] = "mitsuba"
-    summary: ClassVar[str] = "Anything else in the scene: numbers and colours by Mitsuba's own names."
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    kind = "mitsuba"
+    summary = "Anything else in the scene: numbers and colours by Mitsuba's own names."
+    parameters = ()
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)

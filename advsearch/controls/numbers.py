@@ -90,6 +90,15 @@ class NumberControl(Control, ABC):
     def settings(self) -> dict[str, object]:
         return {"kind": self.kind, **self._given} if self.name != self.kind else dict(self._given)
 
+    def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
+        """Return the values, one by one, that a parameter was set to; others where nothing was said of it."""
+        spec = self.specs.get(parameter)
+        return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else otherwise
+
+    def searches(self, parameter: str) -> bool:
+        """Return whether a parameter with a range of its own is among what is searched."""
+        return not isinstance(self.specs[parameter], Fixed) if parameter in self.specs else not self.asked
+
     # ---- what a subclass says ---------------------------------------------------------------------------------------
 
     def check_choices(self) -> None:

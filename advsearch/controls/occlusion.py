@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +23,6 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, OneOf
 from advsearch.errors import InputError
 from advsearch.files import reading
 from advsearch.scene import library
@@ -140,10 +138,10 @@ class Placement:
 class OcclusionControl(NumberControl):
     """A second object between the camera and the object."""
 
-    kind: ClassVar[str] = "occlusion"
-    amount: ClassVar[str | None] = "coverage"
-    summary: ClassVar[str] = "A second object between the camera and the object, hiding a wanted share of it."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "occlusion"
+    amount = "coverage"
+    summary = "A second object between the camera and the object, hiding a wanted share of it."
+    parameters = (
         Parameter(
             "which", (), "name", 0.0, len(OPTIONS) - 1.0, "card",
             "What it is: a piece of cardboard, a grey sphere, or a bundled object.", moves_silhouettes=True,
@@ -168,7 +166,7 @@ class OcclusionControl(NumberControl):
             periodic=True,
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice("object", None, "Another occluder in place of `which`: any bundled object, or a path to a mesh file."),
     )
 
@@ -223,9 +221,7 @@ class OcclusionControl(NumberControl):
         """Every occluder that can be chosen; each is a part of the scene."""
         if self.chosen["object"] is not None:
             return (str(self.chosen["object"]),)
-        spec = self.specs.get("which")
-        names = spec.values if isinstance(spec, OneOf) else (spec.value if isinstance(spec, Fixed) else MADE[0],)
-        return tuple(dict.fromkeys(str(name) for name in names))
+        return tuple(map(str, self.allowed("which", MADE[0])))
 
     def _option(self, values: Values) -> str:
         return self._candidates()[0] if self.chosen["object"] is not None else OPTIONS[int(values["which"])]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -51,9 +50,9 @@ class PatchControl(Control):
         InputError: a value is out of range.
     """
 
-    kind: ClassVar[str] = "patch"
-    summary: ClassVar[str] = "A printed square stuck onto the object: its pixels, place, size and turn."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "patch"
+    summary = "A printed square stuck onto the object: its pixels, place, size and turn."
+    parameters = (
         Parameter(
             "pixels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture underneath",
             "Display-referred colours of the patch; a narrower range is a printer's gamut.", search=(0.0, 1.0),
@@ -78,7 +77,7 @@ class PatchControl(Control):
             estimators=("adjoint", "differences"),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice("resolution", 32, "Side of the patch in pixels.", whole=(2, 512)),
         Choice(
             "norm", "box",
@@ -189,9 +188,9 @@ class PatchControl(Control):
 class _Placement(NumberControl):
     """The numbers of a patch; those not given are fixed."""
 
-    kind: ClassVar[str] = PatchControl.kind
-    summary: ClassVar[str] = "Where a patch is, how large and how turned."
-    parameters: ClassVar[tuple[Parameter, ...]] = PatchControl.parameters[1:]
+    kind = PatchControl.kind
+    summary = "Where a patch is, how large and how turned."
+    parameters = PatchControl.parameters[1:]
 
     @property
     def given(self) -> dict[str, object]:

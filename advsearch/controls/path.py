@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -85,12 +85,12 @@ Way = str | Waypoints
 class PathControl(NumberControl):
     """The camera, the object or both travel along a path."""
 
-    kind: ClassVar[str] = "path"
-    summary: ClassVar[str] = "The camera, the object or both travel along a path; a frame is a time."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "path"
+    summary = "The camera, the object or both travel along a path; a frame is a time."
+    parameters = (
         moving(ORBIT, "time", "s", 0.0, LONGEST, "where the scene is as it is", "Time since the path began."),
     )
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "path",
             APPROACH,

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,10 +27,10 @@ from advsearch.scene.settings import GEOMETRIC, POSE
 class PoseControl(NumberControl):
     """Where the object stands, how it is turned, and how large it is."""
 
-    kind: ClassVar[str] = "pose"
-    of_a_mesh: ClassVar[bool] = True
-    summary: ClassVar[str] = "Where the object stands, how it is turned, and how large it is."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "pose"
+    of_a_mesh = True
+    summary = "Where the object stands, how it is turned, and how large it is."
+    parameters = (
         *POSE[:3],
         Parameter(
             "rotation", (3,), "degrees", -180.0, 180.0, 0.0, "Rotation vector on top of the angles.",
@@ -39,7 +38,7 @@ class PoseControl(NumberControl):
         ),
         *POSE[3:],
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice("on_ground", "yes", "yes: the lowest point stays at height z however it turns; no: its middle stays."),
     )
 

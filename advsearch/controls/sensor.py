@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -51,9 +50,9 @@ def _number(name: str, unit: str, low: float, high: float, description: str, **m
 class SensorControl(NumberControl):
     """Noise, mosaic, white balance, chromatic aberration and compression of a camera."""
 
-    kind: ClassVar[str] = "sensor"
-    summary: ClassVar[str] = "What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "sensor"
+    summary = "What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."
+    parameters = (
         _number(
             "vignetting", "1", 0.0, 0.95, "Share of the light that is missing in the corners.", search=None,
         ),
@@ -76,9 +75,7 @@ class SensorControl(NumberControl):
             search=(0.0, 60.0), estimators=(),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),
-    )
+    choices = (Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),)
 
     def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
         return through_sensor(image, values, int(self.chosen["seed"]))  # type: ignore[call-overload]

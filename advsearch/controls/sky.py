@@ -16,7 +16,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache, lru_cache
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -176,9 +175,9 @@ METERED_IRRADIANCE = 0.9 * math.pi / 0.8
 class SkyControl(NumberControl):
     """A sun and a clear sky in place of the environment."""
 
-    kind: ClassVar[str] = "sky"
-    summary: ClassVar[str] = "A clear sky instead of the environment: where the sun stands, and how hazy the air is."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "sky"
+    summary = "A clear sky instead of the environment: where the sun stands, and how hazy the air is."
+    parameters = (
         Parameter(
             "azimuth", (), "degrees", -3600.0, 3600.0, 90.0, "Direction of the sun about the vertical; 0 is +x.",
             periodic=True, search=(0.0, 360.0), estimators=("differences",),
@@ -193,7 +192,7 @@ class SkyControl(NumberControl):
             estimators=("adjoint", "differences"),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "exposure", "metered", "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
             options=("metered", "fixed"),

@@ -214,20 +214,16 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
     with placed_by("bundle"):
         if len(results) == 1 and not sweeps:
-            return _alone(runs[0], folder)
+            run = runs[0]
+            for part in sorted((run / PARTS).glob(f"*/{REPORT}")):
+                if part.is_symlink() or part.parent.is_symlink() or not part.is_file():
+                    continue
+                write_bytes(folder / part.relative_to(run), part.read_bytes())
+            return write_bytes(folder / INDEX, renewed(run).read_bytes())
         if len(sweeps) < len(results):
             raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
         sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
         return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
-
-
-def _alone(run: Path, folder: Path) -> Path:
-    """Write the page of a run, and those of the attacks that it consists of, which it links to."""
-    for part in sorted((run / PARTS).glob(f"*/{REPORT}")):
-        if part.is_symlink() or part.parent.is_symlink() or not part.is_file():
-            continue
-        write_bytes(folder / part.relative_to(run), part.read_bytes())
-    return write_bytes(folder / INDEX, renewed(run).read_bytes())
 
 
 def _copied(run: Path, folder: Path, number: int) -> SweepSource:

@@ -315,13 +315,10 @@ def _axes(summary: SweepSummary) -> Html:
     for name in dict.fromkeys(row.axis for row in summary.axes):
         mine = [row for row in summary.axes if row.axis == name]
         if len(mine) <= MOST_LISTED:
-            tables.append(element("details", element("summary", f"Accuracy by {name}"), _table(mine)))
+            heads = ("value", "configurations", "right", "accuracy", "95 % interval")
+            table = study_table(heads, [_cells(row) for row in mine])
+            tables.append(element("details", element("summary", f"Accuracy by {name}"), table))
     return join_html(element("h2", "In numbers"), *tables) if tables else Html("")
-
-
-def _table(rows: Sequence[AxisRow]) -> Html:
-    heads = ("value", "configurations", "right", "accuracy", "95 % interval")
-    return study_table(heads, [_cells(row) for row in rows])
 
 
 def _cells(row: AxisRow) -> list[str]:
