@@ -77,10 +77,7 @@ def either(endings: Sequence[str]) -> str:
 
 def scaled(limit: int) -> int:
     """Return a limit on the size of input (bytes, pixels, faces, ...) times `ADVSEARCH_LIMITS`, which is 1 by default.
-
-    Raises:
-        InputError: `ADVSEARCH_LIMITS` is not a number greater than 0.
-    """
+    Raises InputError where `ADVSEARCH_LIMITS` is not a number greater than 0."""
     text = os.environ.get(FACTOR, "") or "1"
     try:
         factor = float(text)
@@ -160,12 +157,8 @@ def read_text(path: Path, expected: str, limit: int) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        ValueError: it is not JSON, is nested deeper than `DEPTH`, or has a number of thousands of digits; the message
-            is short.
-    """
+    """Return the value of a JSON text. Raises ValueError where it is not JSON, is nested deeper than `DEPTH`, or has a
+    number of thousands of digits; the message is short."""
     try:
         value = json.loads(text, parse_int=_whole_number)
     except RecursionError:

@@ -37,11 +37,8 @@ INTERRUPTS = Interrupts()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise what an interrupt that comes inside the block was made into as the interrupt that it is.
-
-    Raises:
-        KeyboardInterrupt: there was an error of any kind inside the block, and an interrupt before it.
-    """
+    """Raise what an interrupt that comes inside the block was made into as the interrupt that it is. Raises
+    KeyboardInterrupt where there was an error of any kind inside the block, and an interrupt before it."""
     before = INTERRUPTS.count
     try:
         yield

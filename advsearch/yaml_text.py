@@ -64,12 +64,8 @@ _Loader.add_implicit_resolver(
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the value of a YAML text.
-
-    Raises:
-        ValueError: it is not YAML, is too large or nested too deeply, or holds something else than settings are made
-            of; the message is short.
-    """
+    """Return the value of a YAML text. Raises ValueError where it is not YAML, is too large or nested too deeply, or
+    holds something else than settings are made of; the message is short."""
     if len(text) > scaled(LARGEST):
         raise ValueError(f"a text of {len(text):,} characters")
     try:

@@ -79,11 +79,8 @@ def _labels_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _labels(args: argparse.Namespace) -> int:
-    """Print index and name of the classes, best first.
-
-    Raises:
-        InputError: no class is like the word, or the model has no names for its classes.
-    """
+    """Print index and name of the classes, best first. Raises InputError where no class is like the word, or the model
+    has no names for its classes."""
     with at_work(as_json=True, quiet=False):
         # late, so that --help answers at once
         from advsearch.models import matching_labels
@@ -107,11 +104,8 @@ def _labels(args: argparse.Namespace) -> int:
 
 
 def class_names(model: str, labels: str | None) -> tuple[str, ...]:
-    """Return the names of a model's classes in index order: those of a file, or else the model's own.
-
-    Raises:
-        InputError: the model has none.
-    """
+    """Return the names of a model's classes in index order: those of a file, or else the model's own. Raises InputError
+    where the model has none."""
     # late, so that --help answers at once
     from advsearch.models import load_model, read_labels
 

@@ -339,11 +339,7 @@ class LoadingProgress:
         self._begun = 0
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`.
-
-        Raises:
-            KeyboardInterrupt: one came while something was loaded.
-        """
+        """See `Progress.stage`. Raises KeyboardInterrupt where one came while something was loaded."""
         if self._begun <= LOADING_STAGES:
             INTERRUPTS.check()
         self._begun += 1
@@ -356,10 +352,6 @@ class LoadingProgress:
         self._progress.message(text)
 
     def end(self) -> None:
-        """End the work.
-
-        Raises:
-            KeyboardInterrupt: nothing but imports was there, and one came meanwhile.
-        """
+        """End the work. Raises KeyboardInterrupt where nothing but imports was there, and one came meanwhile."""
         if self._begun < LOADING_STAGES:
             INTERRUPTS.check()

@@ -97,11 +97,7 @@ class QuestionCommand:
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Ask what the arguments say.
-
-        Raises:
-            InputError: what it is about is missing.
-        """
+        """Ask what the arguments say. Raises InputError where what it is about is missing."""
         # late, so that --help answers at once
         from advsearch.registry import only_named_code
 

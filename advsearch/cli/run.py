@@ -46,20 +46,12 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def changes_in(words: Sequence[str]) -> dict[str, object]:
-    """Return setting to value from ``NAME=VALUE``.
-
-    Raises:
-        InputError: a word is no such assignment.
-    """
+    """Return setting to value from ``NAME=VALUE``. Raises InputError where a word is no such assignment."""
     return dict(parse_assignment(text, f"change {text!r}") for text in words)
 
 
 def command_in(file: str | Path) -> str:
-    """Return the command that a file is for.
-
-    Raises:
-        FileFormatError: it is not a file with settings.
-    """
+    """Return the command that a file is for. Raises FileFormatError where it is not a file with settings."""
     return str(read_yaml(file).get("command", "attack"))
 
 

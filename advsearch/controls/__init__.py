@@ -113,11 +113,8 @@ def instance_of(kind: str, name: str) -> str:
 
 
 def check_instance(where: str, name: str, colon: str = ":") -> None:
-    """Refuse what can't stand behind the colon of `KIND:NAME`.
-
-    Raises:
-        InputError: it has other characters than letters, digits, dashes and underscores, or is empty.
-    """
+    """Refuse what can't stand behind the colon of `KIND:NAME`. Raises InputError where it has other characters than
+    letters, digits, dashes and underscores, or is empty."""
     if colon and not re.fullmatch(r"[\w-]+", name):
         raise InputError(f"{where}: expected a name of letters, digits, - and _ after the colon, got {name!r}")
 
@@ -136,11 +133,8 @@ def _default_range(control: type[Control], parameter: str) -> object:
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
-    """Return the settings of each control, with ranges of Mitsuba's names under one.
-
-    Raises:
-        InputError: one has something else than settings.
-    """
+    """Return the settings of each control, with ranges of Mitsuba's names under one. Raises InputError where one has
+    something else than settings."""
     found: dict[str, Mapping[str, object]] = {}
     for name, given in by_key(asked).items():
         if given is not None and not isinstance(given, Mapping):
@@ -171,11 +165,8 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them into something that can be searched.
-
-    Raises:
-        InputError: no control, two of one name, one that the scene cannot take, or nothing that varies.
-    """
+    """Let controls prepare a scene, bind them to it and compose them into something that can be searched. Raises
+    InputError for no control, two of one name, one that the scene cannot take, or nothing that varies."""
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
     space = compose(controls, scene)
@@ -219,11 +210,8 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def check_about(controls: Sequence[Control], scene: SceneDescription) -> None:
-    """Refuse the name of a mesh for a control that is not about one mesh or only about the object.
-
-    Raises:
-        InputError: one has it.
-    """
+    """Refuse the name of a mesh for a control that is not about one mesh or only about the object. Raises InputError
+    where one has it."""
     for control in controls:
         if control.name != control.kind and control.name in scene.around:
             able = ", ".join(kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh)

@@ -57,11 +57,8 @@ class Choice:
     most: float | None = None
 
     def check(self, control: str, given: object) -> None:
-        """Check what was chosen in an instance of a control; None is fine where it is the default.
-
-        Raises:
-            InputError: it cannot be chosen.
-        """
+        """Check what was chosen in an instance of a control; None is fine where it is the default. Raises InputError
+        where it cannot be chosen."""
         allowed, fits = "", True
         if self.options:
             allowed, fits = f"one of {', '.join(self.options)}", given in self.options
@@ -174,11 +171,7 @@ class Control(ABC):
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene.
-
-        Raises:
-            UnknownNameError: there is none of that name.
-        """
+        """Return that mesh in a scene. Raises UnknownNameError where there is none of that name."""
         mesh = self.mesh
         if mesh in scene.meshes:
             return scene.meshes[mesh]
@@ -226,16 +219,10 @@ class Control(ABC):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with whatever this control needs to be in it (a light, a medium); by default unchanged.
-
-        Raises:
-            InputError: the scene cannot take it.
-        """
+        Raises InputError where the scene cannot take it."""
         return scene
 
     @abstractmethod
     def bind(self, scene: SceneDescription) -> BoundControl:
-        """Fit the control to a scene that all controls of the space have prepared.
-
-        Raises:
-            InputError: a setting of the control is impossible in this scene.
-        """
+        """Fit the control to a scene that all controls of the space have prepared. Raises InputError where a setting of
+        the control is impossible in this scene."""

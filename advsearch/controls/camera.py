@@ -77,11 +77,7 @@ class CameraControl(NumberControl):
         return scene
 
     def _check_model(self, model: CameraModel, bent: list[str]) -> None:
-        """Refuse what the camera's model has not.
-
-        Raises:
-            InputError: it was asked for.
-        """
+        """Refuse what the camera's model has not. Raises InputError where it was asked for."""
         lacking = [name for name in bent if name not in OF_KIND[model.kind]]
         if lacking:
             has = ", ".join(OF_KIND[model.kind]) or "none"

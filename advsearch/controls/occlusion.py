@@ -62,11 +62,8 @@ SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "camera.lens", 
 
 @cache
 def loaded(spec: str) -> ObjectAsset:
-    """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin.
-
-    Raises:
-        InputError: there is no such object, or the file cannot be used.
-    """
+    """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin. Raises InputError
+    where there is no such object, or the file cannot be used."""
     is_file = "/" in spec or "\\" in spec or Path(spec).suffix != ""
     with reading(spec):
         return centred(import_object(Path(spec)) if is_file else library.load_object(spec))

@@ -204,11 +204,8 @@ def sentences(moved: Sequence[Moved]) -> list[str]:
 
 
 def check_prepared(control: str, before: SceneDescription, after: SceneDescription) -> Iterator[Moved]:
-    """Yield what a control has replaced in a scene by what it needs there, and nobody has described.
-
-    Raises:
-        InputError: it was asked for.
-    """
+    """Yield what a control has replaced in a scene by what it needs there, and nobody has described. Raises InputError
+    where it was asked for."""
     if after.environment is not None and after.environment is not before.environment:
         check_one_environment(after.parts, f"`controls` {control}")
         if ENVIRONMENT in before.given:

@@ -56,11 +56,8 @@ class Archive:
         return name in self.members
 
     def read(self, name: str, limit: int = LARGEST) -> bytes:
-        """Return the content of a member.
-
-        Raises:
-            FileFormatError: there is none of that name, it is larger than `limit`, or it is damaged.
-        """
+        """Return the content of a member. Raises FileFormatError where there is none of that name, it is larger than
+        `limit`, or it is damaged."""
         if name not in self.members:
             raise refused(self.path, f"has no {name!r}, so it is not complete")
         size = self.members[name].file_size
@@ -163,11 +160,8 @@ _ITEM_BYTES = {
 
 
 def rewritten_torchscript(archive: Archive) -> io.BytesIO:
-    """Return an archive for `torch.jit.load` that holds the code, the pickles and the tensors of this one.
-
-    Raises:
-        FileFormatError: its code calls what a network has no use for, or its pickles state what is not there.
-    """
+    """Return an archive for `torch.jit.load` that holds the code, the pickles and the tensors of this one. Raises
+    FileFormatError where its code calls what a network has no use for, or its pickles state what is not there."""
     code = {name: archive.read(name, LARGEST_CODE) for name in archive.members if _is_code(name)}
     _check_code(archive, code)
     for name in PICKLES:

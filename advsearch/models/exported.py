@@ -210,10 +210,7 @@ _IDENTIFIERS = frozenset(
 
 def rewritten(archive: Archive) -> io.BytesIO:
     """Return an archive for `torch.export.load` that holds what is harmless of this one: the network and its weights.
-
-    Raises:
-        FileFormatError: it has something in it that a plain network has not; the message says what.
-    """
+    Raises FileFormatError where it has something in it that a plain network has not; the message says what."""
     from torch.export.pt2_archive import PT2ArchiveWriter  # a second of compilers, which no other model needs
 
     names = {new: old if old in archive else new for new, old in OLD_NAMES.items()}

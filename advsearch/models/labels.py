@@ -245,11 +245,8 @@ def labels_origin(given: object) -> str:
 
 
 def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
-    """Return the texts that a model is given beside a picture, from a list or a text with | between them.
-
-    Raises:
-        InputError: one is no text, or empty.
-    """
+    """Return the texts that a model is given beside a picture, from a list or a text with | between them. Raises
+    InputError where one is no text, or empty."""
     if given is None:
         return None
     listed = [part.strip() for part in given.split("|")] if isinstance(given, str) else list(given)
@@ -260,11 +257,8 @@ def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
 
 
 def patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the texts that a name is put into, ``{}`` in its place; one of our own for None.
-
-    Raises:
-        InputError: one has no ``{}``.
-    """
+    """Return the texts that a name is put into, ``{}`` in its place; one of our own for None. Raises InputError where
+    one has no ``{}``."""
     for one in prompts or ():
         if "{}" not in one:
             raise InputError(f"prompt: expected a text with {{}} where the name goes, such as {PROMPT!r}, got {one!r}")

@@ -246,11 +246,8 @@ def checked_images(images: Tensor) -> Tensor:
 
 
 def read_by(read: Read, answer: Any, count: int, name: str) -> Any:
-    """Return the output that a reader finds in a network's answer.
-
-    Raises:
-        ModelError: it finds none, or another number than `count`.
-    """
+    """Return the output that a reader finds in a network's answer. Raises ModelError where it finds none, or another
+    number than `count`."""
     try:
         output = read(answer, count)
     except ValueError as error:

@@ -117,10 +117,7 @@ class Source:
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
     """Return a source with the module frozen, its type and device read off its parameters; `fields` go to `Source`.
-
-    Raises:
-        ModelError: it has lazy layers that have no weights yet.
-    """
+    Raises ModelError where it has lazy layers that have no weights yet."""
     lazy = [key for key, weights in (*module.named_parameters(), *module.named_buffers()) if is_lazy(weights)]
     if lazy:
         layer = lazy[0].rpartition(".")[0]

@@ -128,11 +128,8 @@ def write_sheets(
 
 
 def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[list[Placed]]:
-    """Yield what is on each page: rows of parts, the highest first, from the upper left.
-
-    Raises:
-        InputError: a pixel is larger than a page, or there would be more than `SHEETS_EVER` pages.
-    """
+    """Yield what is on each page: rows of parts, the highest first, from the upper left. Raises InputError where a
+    pixel is larger than a page, or there would be more than `SHEETS_EVER` pages."""
     width, height = paper[0] - 2 * MARGIN, paper[1] - 2 * MARGIN - FOOT
     parts = [part for piece in pieces for part in _parts(piece, width, height)]
     parts.sort(key=lambda part: -_extent(part)[1])

@@ -48,11 +48,7 @@ class OwnTask(Task):
         return facts
 
     def margin(self, output: Any, truth: Facts) -> Tensor:
-        """Return what the function says, (N,).
-
-        Raises:
-            InputError: it returns something else.
-        """
+        """Return what the function says, (N,). Raises InputError where it returns something else."""
         found, count = self.function(output, truth), len(output)
         if isinstance(found, Tensor) and found.is_floating_point() and found.numel() == count:
             return found.reshape(count)

@@ -145,11 +145,8 @@ class Facts:
 
     @cached_property
     def sight(self) -> Sight:
-        """What is seen of the configuration; the camera looks when this is asked for, and once.
-
-        Raises:
-            InputError: no configuration is meant.
-        """
+        """What is seen of the configuration; the camera looks when this is asked for, and once. Raises InputError for
+        no configuration is meant."""
         if self.look is None:
             raise InputError(
                 f"the task needs to see {self.object}, which depends on the configuration; set `varies = True` on it"
@@ -181,11 +178,8 @@ class Facts:
 
     @property
     def z_depth(self) -> Tensor:
-        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives.
-
-        Raises:
-            InputError: as for `sight`.
-        """
+        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives. Raises
+        InputError as for `sight`."""
         return self.sight.z_depth
 
     @cached_property
@@ -206,11 +200,8 @@ class Facts:
         return self.describe()
 
     def number(self, name: str) -> float:
-        """Return the number that a parameter has in this configuration.
-
-        Raises:
-            InputError: nothing in the scene is called that.
-        """
+        """Return the number that a parameter has in this configuration. Raises InputError where nothing in the scene is
+        called that."""
         if name not in self.numbers:
             known = ", ".join(sorted(self.numbers)) or "none"
             raise InputError(
@@ -249,11 +240,8 @@ class Task(ABC):
     target: Truth = field(default=None, metadata=FROM_RUN)
 
     def check_numbers(self, fits: Callable[[float], bool], expected: str, *names: str) -> None:
-        """Check options that are numbers.
-
-        Raises:
-            InputError: one is none, or does not fit; it says what was `expected`.
-        """
+        """Check options that are numbers. Raises InputError where one is none, or does not fit; it says what was
+        `expected`."""
         for name in names:
             value: object = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not fits(value):
@@ -263,11 +251,8 @@ class Task(ABC):
 
     @abstractmethod
     def truth(self, facts: Facts) -> Truth:
-        """Return what is true of the scene.
-
-        Raises:
-            InputError: the facts do not say it, or the model cannot answer it.
-        """
+        """Return what is true of the scene. Raises InputError where the facts do not say it, or the model cannot answer
+        it."""
 
     @abstractmethod
     def margin(self, output: Output, truth: Truth) -> Tensor:
@@ -343,11 +328,8 @@ class Task(ABC):
         return self
 
     def check(self, facts: Facts) -> None:
-        """Refuse a scene of which nothing could be judged, before anything is rendered.
-
-        Raises:
-            InputError: as for `truth`.
-        """
+        """Refuse a scene of which nothing could be judged, before anything is rendered. Raises InputError as for
+        `truth`."""
         if not self.varies:
             self.truth(facts)
 

@@ -50,11 +50,8 @@ class ClassTask(Task):
             raise InputError("minimise: makes the right answer easier to give; leave `target` out")
 
     def on(self: Own, model: Model, *, target: str | None = None, minimise: bool = False) -> Own:
-        """See `Task.on`: the target is one of the model's classes, or several.
-
-        Raises:
-            InputError: there is no such class, or the model's answers are not what the task reads.
-        """
+        """See `Task.on`: the target is one of the model's classes, or several. Raises InputError where there is no such
+        class, or the model's answers are not what the task reads."""
         if self.reads_logits != (model.read is None):
             raise InputError(f"model {model.name}: {self._other_reader}")
         labels, named = (model.labels, model.named) if self.reads_logits else self._names(model)
@@ -86,11 +83,8 @@ class ClassTask(Task):
         return None
 
     def right_classes(self, facts: Facts) -> Labels:
-        """Return the indices of the right classes: what was said, or else the object's own label.
-
-        Raises:
-            InputError: the model has no such class, the object has no label, or a target is right.
-        """
+        """Return the indices of the right classes: what was said, or else the object's own label. Raises InputError
+        where the model has no such class, the object has no label, or a target is right."""
         text = facts.own_label if facts.label is None else facts.label
         if text is None:
             raise InputError(f"label: expected the right answers for {facts.object}, got none")
@@ -192,20 +186,14 @@ class Classification(ClassTask):
 
 def wrong_lead(logits: Tensor, right: Labels) -> Tensor:
     """Return the largest wrong logit minus the largest right one, (N,): over 0 exactly where the answer is wrong.
-
-    Raises:
-        InputError: as for `members`.
-    """
+    Raises InputError as for `members`."""
     inside = members(logits, right)
     return logits.masked_fill(inside, -math.inf).amax(dim=1) - logits.masked_fill(~inside, -math.inf).amax(dim=1)
 
 
 def target_lead(logits: Tensor, targets: Labels) -> Tensor:
     """Return the largest logit of the targets minus the largest other one, (N,): over 0 exactly where one is answered.
-
-    Raises:
-        InputError: as for `members`.
-    """
+    Raises InputError as for `members`."""
     inside = members(logits, targets, "target")
     return logits.masked_fill(~inside, -math.inf).amax(dim=1) - logits.masked_fill(inside, -math.inf).amax(dim=1)
 

@@ -81,11 +81,8 @@ class Gallery:
 
 
 def folders_of(folder: str) -> list[tuple[str, Path]]:
-    """Return the names in a folder, and the folder of each, in alphabetical order; hidden ones are left out.
-
-    Raises:
-        InputError: it is not there, or does not have two names.
-    """
+    """Return the names in a folder, and the folder of each, in alphabetical order; hidden ones are left out. Raises
+    InputError where it is not there, or does not have two names."""
     root = Path(folder).expanduser()
     found = [(one.name, one) for one in _listed(root) if one.is_dir()]
     if len(found) < 2:

@@ -97,11 +97,8 @@ class Together(Task):
         return by_picture(answer, count)
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Together:
-        """See `Task.on`; a target is for the tasks that take a label, where some do and some do not.
-
-        Raises:
-            InputError: it is no model of `together`, or one of fewer or more than there are tasks.
-        """
+        """See `Task.on`; a target is for the tasks that take a label, where some do and some do not. Raises InputError
+        where it is no model of `together`, or one of fewer or more than there are tasks."""
         models = model.module.models if isinstance(model.module, Ensemble) else ()
         if len(models) != len(self.parts):
             raise InputError(f"model: expected {len(self.parts)}, one for each task, got {len(models) or 1}")

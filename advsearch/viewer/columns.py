@@ -146,10 +146,7 @@ class Columns:
 
 def read_columns(run: Path, after: int = 0, most: int | None = None) -> Columns:
     """Return the rows of the sweep in `run` that were written after the row with this id, `most` of them at most.
-
-    Raises:
-        FileFormatError: the results cannot be read.
-    """
+    Raises FileFormatError where the results cannot be read."""
     with Store(run / NAME, read_only=True) as store:
         found, edges = columns_of(islice(store.rows(KIND, after=after), most)), store.noted(EDGES)
     known = edges if isinstance(edges, dict) else {}

@@ -45,10 +45,7 @@ DAYS = 7
 
 def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
     """Return what speaks HTTPS under some names and addresses, and the SHA-256 fingerprint of its new certificate.
-
-    Raises:
-        InputError: there is no `openssl`, or it makes none.
-    """
+    Raises InputError where there is no `openssl`, or it makes none."""
     names = ",".join(f"IP:{host}" if is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
     with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
         key, certificate = Path(folder) / "key.pem", Path(folder) / "certificate.pem"

@@ -347,11 +347,8 @@ def _cost(path: Path, summary: SweepSummary) -> Html:
 
 
 def result_of(run: Path) -> SweepSummary | None:
-    """Return the result of the sweep in a folder; None where it has none yet.
-
-    Raises:
-        FileFormatError: it is damaged, or that of another command.
-    """
+    """Return the result of the sweep in a folder; None where it has none yet. Raises FileFormatError where it is
+    damaged, or that of another command."""
     if not (run / "summary.json").is_file():
         return None
     found = read_result(run)

@@ -87,11 +87,7 @@ def path_of(run: Path, number: int) -> Path:
 
 
 def keep(run: Path, number: int, data: bytes) -> None:
-    """Keep the thumbnail of a picture.
-
-    Raises:
-        StorageError: it cannot be written.
-    """
+    """Keep the thumbnail of a picture. Raises StorageError where it cannot be written."""
     write_bytes(path_of(run, number), data, durable=False)
 
 

@@ -54,11 +54,8 @@ def speaks(architecture: str, network: Any) -> bool:
 
 
 def source(loaded: Loaded) -> Source:
-    """Return the source of a network that is finished when names are there, or a free answer is asked for.
-
-    Raises:
-        ModelError: it has an encoder for texts of its own, or its processor can't be had.
-    """
+    """Return the source of a network that is finished when names are there, or a free answer is asked for. Raises
+    ModelError where it has an encoder for texts of its own, or its processor can't be had."""
     if getattr(loaded.network.config, "is_encoder_decoder", False):
         raise _another(loaded, "answers from an encoder of its own")
     try:
@@ -273,11 +270,8 @@ class _Reader(nn.Module):
         return self._prompts[side]
 
     def given(self, image: Tensor) -> dict[str, Tensor]:
-        """Return what the network is given for a picture (3, H, W).
-
-        Raises:
-            ValueError: it is for pictures of another size.
-        """
+        """Return what the network is given for a picture (3, H, W). Raises ValueError where it is for pictures of
+        another size."""
         height, width = image.shape[1:]
         prompt, pixels = self.prompt((height, width)), self._pixels(image)
         if pixels.shape != prompt["pixel_values"].shape:
@@ -289,10 +283,7 @@ class _Reader(nn.Module):
 
     def begin(self, image: Tensor) -> tuple[Tensor, Any]:
         """Return the logits (tokens,) float32 of what follows picture and prompt, and the keys and values so far.
-
-        Raises:
-            ValueError: the network keeps none.
-        """
+        Raises ValueError where the network keeps none."""
         answer = self.network(**self.given(image), use_cache=True)
         past = answer.get(self.cache)
         if past is None:

@@ -39,11 +39,8 @@ def load_timm(spec: str) -> Source:
 
 
 def timm_repository(spec: str, name: str, revision: str) -> Source:
-    """Return the network of a repository, or of a folder, that timm has made; `spec` is for messages.
-
-    Raises:
-        ModelError: timm is missing, or it cannot be had.
-    """
+    """Return the network of a repository, or of a folder, that timm has made; `spec` is for messages. Raises ModelError
+    where timm is missing, or it cannot be had."""
     timm = library("timm", spec, "timm")
     local = Path(name).is_dir()
     place = f"local-dir:{name}" if local else f"hf-hub:{name}{'@' if revision else ''}{revision}"

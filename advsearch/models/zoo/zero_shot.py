@@ -34,11 +34,8 @@ def compares(network: Any) -> bool:
 
 
 def source(loaded: Loaded) -> Source:
-    """Return the source of a network that becomes a classifier when names are there.
-
-    Raises:
-        ModelError: it takes patches in place of pictures.
-    """
+    """Return the source of a network that becomes a classifier when names are there. Raises ModelError where it takes
+    patches in place of pictures."""
     check_takes_pictures(loaded.network, loaded.spec)
     return loaded.when_named(_named)
 
