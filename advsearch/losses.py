@@ -20,19 +20,9 @@ from advsearch.engine import objective
 from advsearch.errors import InputError
 
 __all__ = [
-    "carlini_wagner",
-    "cross_entropy",
-    "dlr",
-    "log_odds",
-    "margin",
-    "non_printability",
-    "targeted_carlini_wagner",
-    "targeted_cross_entropy",
-    "targeted_dlr",
-    "targeted_log_odds",
-    "targeted_margin",
-    "total_variation",
-]
+    "carlini_wagner", "cross_entropy", "dlr", "log_odds", "margin", "non_printability", "targeted_carlini_wagner",
+    "targeted_cross_entropy", "targeted_dlr", "targeted_log_odds", "targeted_margin", "total_variation",
+]  # fmt: skip
 
 Labels = Tensor | Sequence[int]
 """(N,) int64, the right answer of each picture; or indices, each of which is right for all pictures."""

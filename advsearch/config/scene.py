@@ -84,6 +84,9 @@ DEFAULT_ENVIRONMENT = "studio"
 SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_out", "held_out_environment")
 """The settings that may be several names, where a command takes several."""
 
+TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
+"""The settings that are texts, whatever they are given as."""
+
 ControlsByName = dict[str, dict[str, object]]
 """Controls as they are asked for: their names, each with its settings."""
 
@@ -272,23 +275,7 @@ class SceneConfig(Config):
         """The models by name; those of several tasks are one together."""
         return (self.model,) if JOINED in self.task_name else split_names(self.model)
 
-    @field_validator(
-        "object",
-        "environment",
-        "model",
-        "labels",
-        "label",
-        "task",
-        "up",
-        "camera",
-        "run",
-        "objective",
-        "target",
-        "held_out",
-        "held_out_environment",
-        mode="before",
-        check_fields=False,
-    )
+    @field_validator(*TEXTS, mode="before", check_fields=False)
     @classmethod
     def _as_text(cls, value: Any, info: Any) -> Any:
         listed = info.field_name == "labels" and isinstance(value, (list, tuple))

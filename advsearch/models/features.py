@@ -84,11 +84,11 @@ def features_of(model: Model) -> Features:
                 return Features(model, read, size, f"the {where}, {size} numbers")
     why = f"the logits, {model.classes} numbers: no layer before them can be read in a {type(model.module).__name__}"
 
-    def read(x: Tensor) -> Tensor:
+    def centred(x: Tensor) -> Tensor:
         logits: Tensor = model.ask(x)
         return logits - logits.mean(dim=1, keepdim=True)
 
-    return Features(model, read, model.classes, why, penultimate=False)
+    return Features(model, centred, model.classes, why, penultimate=False)
 
 
 def _layer(model: Model, x: Tensor) -> tuple[Read, str] | None:

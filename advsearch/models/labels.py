@@ -101,7 +101,8 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet".
     """
     table = {name: indices for name, indices in _name_table(labels).items() if "," not in name}
-    same = [name for name in _synonyms(word) if name in table]
+    everyday = [[_key(name) for name in names] for names in json.loads((DATA / "synonyms.json").read_text("utf-8"))]
+    same = [name for names in everyday if _key(word) in names for name in names if name in table]
     like = resembling(word, table)
     if same and not any(_key(word) in name for name in like):  # nothing but other spellings
         like = []
@@ -110,14 +111,6 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
         for index in table[name]:
             parts.setdefault(index, name)
     return list(parts.items())
-
-
-def _synonyms(word: str) -> Iterator[str]:
-    """Yield what else an everyday thing is called, as a key of the table of names."""
-    for names in json.loads((DATA / "synonyms.json").read_text("utf-8")):
-        keys = [_key(name) for name in names]
-        if _key(word) in keys:
-            yield from keys
 
 
 def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> int:

@@ -21,22 +21,6 @@ from advsearch.settings.values import (
 )
 
 __all__ = [
-    "FILES",
-    "HEADER",
-    "Clash",
-    "Config",
-    "Setting",
-    "all_finite",
-    "as_python",
-    "as_text",
-    "check_once",
-    "is_shallow",
-    "number_or_text",
-    "parse_assignment",
-    "read_yaml",
-    "setting",
-    "setting_as_in",
-    "settings",
-    "shown",
-    "split_names",
-]
+    "FILES", "HEADER", "Clash", "Config", "Setting", "all_finite", "as_python", "as_text", "check_once", "is_shallow",
+    "number_or_text", "parse_assignment", "read_yaml", "setting", "setting_as_in", "settings", "shown", "split_names",
+]  # fmt: skip

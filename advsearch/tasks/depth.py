@@ -343,7 +343,7 @@ class Depth(Task):
         if not math.isfinite(mean):
             return Answer(NOT_A_NUMBER), None
         distance = float(truth.z[truth.mask].double().log().mean().exp())
-        payload: dict[str, float | str] = {
+        payload: dict[str, JsonValue] = {
             "distance": round(distance, 4),
             "judged": round(distance * math.exp(mean), 4),
             "factor": round(math.exp(float(factors.abs().mean())), 4),

@@ -332,13 +332,6 @@ class _Handler(BaseHTTPRequestHandler):
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such run")
         return found
 
-    def _list(self, _query: Mapping[str, list[str]]) -> tuple[str, bytes]:
-        return "text/html; charset=utf-8", list_page(self.server.runs()).encode()
-
-    def _cover(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        """A small picture of a run for the list; an empty one where it has none."""
-        return "image/jpeg", cover(self._run(name))
-
     def _page(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         run = self._run(name)
         if listing.listed_run(run, counts=False).command == "sweep":
@@ -349,9 +342,6 @@ class _Handler(BaseHTTPRequestHandler):
         if is_under_way(run):
             return _html(following_page(name, run).encode(), "../../")
         return _html(report.read_bytes(), "../../")
-
-    def _progress(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        return "application/json", progress_json(self._run(name), _after(query, START))
 
     def _part(self, _query: Mapping[str, list[str]], name: str, part: str) -> tuple[str, bytes]:
         """The page of one of the attacks that a study consists of, where the study's page links to it."""
@@ -394,12 +384,6 @@ class _Handler(BaseHTTPRequestHandler):
         )
         return _html(made, "../../../", ("../", name))
 
-    def _rendering(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
-        return _photographs("rendering_picture")(self._run(name), rendering)
-
-    def _photo(self, _query: Mapping[str, list[str]], name: str, photo: str) -> tuple[str, bytes]:
-        return _photographs("photo")(self._run(name), photo)
-
     def _take(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
         _photographs("check_sender")(self.headers, self.server.key)
         data = partial(_photographs("request_body"), self.headers, self.rfile)
@@ -416,17 +400,23 @@ Handler = Callable[..., tuple[str, bytes]]
 Routes = tuple[tuple[str, Handler], ...]
 
 _ROUTES: Routes = (
-    ("/", _Handler._list),
+    ("/", lambda self, _: ("text/html; charset=utf-8", list_page(self.server.runs()).encode())),
     ("/compare/", _Handler._compare),
     ("/runs/([^/]+)/", _Handler._page),
-    ("/runs/([^/]+)/cover", _Handler._cover),
+    ("/runs/([^/]+)/cover", lambda self, _, name: ("image/jpeg", cover(self._run(name)))),
     ("/runs/([^/]+)/rows", _Handler._rows),
-    ("/runs/([^/]+)/progress", _Handler._progress),
+    (
+        "/runs/([^/]+)/progress",
+        lambda self, query, name: ("application/json", progress_json(self._run(name), _after(query, START))),
+    ),
     (f"/runs/([^/]+)/{PARTS}/([^/]+)/{re.escape(REPORT)}", _Handler._part),
     (r"/runs/([^/]+)/pictures/[0-9]+/([0-9]{1,12})\.jpg", _Handler._picture),
     ("/runs/([^/]+)/align/", _Handler._align),
-    ("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._rendering),
-    ("/runs/([^/]+)/align/photos/([^/]+)", _Handler._photo),
+    (
+        "/runs/([^/]+)/align/renderings/([^/]+)",
+        lambda self, _, name, one: _photographs("rendering_picture")(self._run(name), one),
+    ),
+    ("/runs/([^/]+)/align/photos/([^/]+)", lambda self, _, name, one: _photographs("photo")(self._run(name), one)),
 )
 
 _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
