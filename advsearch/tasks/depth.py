@@ -20,6 +20,7 @@ from torch import Tensor
 
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
+from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Mark, Said, Task
