@@ -165,7 +165,8 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError(f"lists or objects nested deeper than {DEPTH}") from None
     level = [value]
     for _ in range(DEPTH):
-        level = [inner for outer in level if isinstance(outer, (list, dict)) for inner in _inside(outer)]
+        level = [list(one.values()) if isinstance(one, dict) else one for one in level if isinstance(one, (dict, list))]
+        level = [inner for outer in level for inner in outer]
         if not level:
             return value
     raise ValueError(f"lists or objects nested deeper than {DEPTH}")
@@ -175,10 +176,6 @@ def _whole_number(text: str) -> int:
     if len(text) > DIGITS:
         raise ValueError(f"a whole number of {len(text)} digits")
     return int(text)
-
-
-def _inside(value: list[JsonValue] | JsonObject) -> list[JsonValue]:
-    return value if isinstance(value, list) else list(value.values())
 
 
 def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> None:

@@ -34,7 +34,8 @@ LONGEST_WORD = 300
 def escaped(text: str, encoding: str = "utf-8") -> str:
     """Return `text` with everything but line ends and tabs that a terminal would not show written as an escape."""
     if not text.isascii() or not text.isprintable():
-        text = "".join(sign if sign in "\n\t" or _is_shown(sign) else _escape(sign) for sign in text)
+        plain = (one in "\n\t" or one.isprintable() or unicodedata.category(one) == "Zs" for one in text)
+        text = "".join(sign if shown else _escape(sign) for sign, shown in zip(text, plain, strict=True))
     return text.encode(encoding, "backslashreplace").decode(encoding)
 
 
@@ -44,10 +45,6 @@ def shortened(text: str) -> str:
         word if len(word) <= LONGEST_WORD else f"{word[:100]}...{word[-40:]} ({len(word):,} characters)"
         for word in text.split(" ")
     )
-
-
-def _is_shown(sign: str) -> bool:
-    return sign.isprintable() or (sign >= "\xa0" and unicodedata.category(sign) == "Zs")
 
 
 def _escape(sign: str) -> str:
@@ -167,12 +164,8 @@ def print_json(value: Any) -> None:
     from advsearch.runs.results.base import plain
 
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
-    print("".join(sign if sign.isprintable() or sign == "\n" else _json_escape(sign) for sign in text))
-
-
-def _json_escape(sign: str) -> str:
-    """What a terminal would not show, as JSON escapes it."""
-    return "\\u007f" if sign == "\x7f" else json.dumps(sign)[1:-1]
+    text = "".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text)
+    print(text.replace("\x7f", "\\u007f"))  # JSON escapes all others that a terminal would not show
 
 
 def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> int:

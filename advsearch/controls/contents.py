@@ -301,12 +301,8 @@ class ContentsControl(NumberControl):
         """An ingredient's coordinate is where the stick is cut, from 0 to 1 of what is possible there."""
         if parameter.name not in INGREDIENTS:
             return super()._spec(scene, parameter, value)
-        return Range(0.0, 1.0) if parameter.name in self._free() else Fixed(0.0)
-
-    def _free(self) -> tuple[str, ...]:
-        """The ingredients that have a coordinate."""
         wide = [name for name in INGREDIENTS if self.bounds[name][1] > self.bounds[name][0]]
-        return tuple(wide[:-1])
+        return Range(0.0, 1.0) if parameter.name in wide[:-1] else Fixed(0.0)
 
     def proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Cut the stick: coordinates in [0, 1] by ingredient to shares that add up to one; differentiable."""

@@ -65,12 +65,9 @@ def problem(text: object) -> str:
         tree = ast.parse(text.strip(), mode="eval")
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        return f"expected arithmetic with whole numbers and symbols, got {text[:60]!r} ({_reason(error)})"
+        reason = str(error.args[0]) if type(error) is ValueError else "it cannot be read"
+        return f"expected arithmetic with whole numbers and symbols, got {text[:60]!r} ({reason})"
     return ""
-
-
-def _reason(error: BaseException) -> str:
-    return str(error.args[0]) if type(error) is ValueError else "it cannot be read"
 
 
 def _check(node: ast.expr, depth: int, power: int) -> None:
@@ -78,7 +75,11 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
     if depth <= 0:
         raise ValueError("it is nested too deeply")
     if isinstance(node, ast.Constant):
-        _check_number(node.value)
+        number = node.value
+        if not isinstance(number, (int, float)):
+            raise ValueError("text")
+        if isinstance(number, int) and abs(number) >= NUMBER:
+            raise ValueError("a number that is too large")
     elif isinstance(node, ast.Name):
         if not (node.id in NAMES or (is_symbol(node.id) and node.id[-1].isdigit())):
             raise ValueError(f"the name {node.id[:40]!r}")
@@ -163,12 +164,6 @@ def _powered(base: ast.expr, exponent: ast.expr, power: int) -> tuple[list[ast.e
     return [base], power // max(value, 1)
 
 
-def _check_number(value: object) -> None:
-    if isinstance(value, (bool, float)) or (isinstance(value, int) and abs(value) < NUMBER):
-        return
-    raise ValueError("a number that is too large" if isinstance(value, int) else "text")
-
-
 PROGRAM = "models/model.json"
 
 OLD_NAMES = {
@@ -214,7 +209,11 @@ def rewritten(archive: Archive) -> io.BytesIO:
     from torch.export.pt2_archive import PT2ArchiveWriter  # a second of compilers, which no other model needs
 
     names = {new: old if old in archive else new for new, old in OLD_NAMES.items()}
-    program = _checked_program(archive, names[PROGRAM])
+    program = archive.read_json(names[PROGRAM])
+    if not isinstance(program, dict) or not isinstance(program.get("graph_module"), dict):
+        expected = f"expected a network in {names[PROGRAM]!r}, got other JSON"
+        raise refused(archive.path, f"cannot be read as torch.export ({expected})")
+    program = _checked_object(archive.path, program, "")
     for name in EXAMPLE:
         if name in archive:
             _check_pickle(archive, name)
@@ -270,14 +269,6 @@ def _check_tensor(archive: Archive, record: str, meta: Any) -> None:
 # ---- the description of the network ----------------------------------------------------------------------------------
 
 
-def _checked_program(archive: Archive, name: str) -> JsonObject:
-    """Return the description of the network as torch may see it."""
-    program = archive.read_json(name)
-    if not isinstance(program, dict) or not isinstance(program.get("graph_module"), dict):
-        raise refused(archive.path, f"cannot be read as torch.export (expected a network in {name!r}, got other JSON)")
-    return _checked_object(archive.path, program, "")
-
-
 def _checked(path: Path, value: JsonValue, key: str) -> JsonValue:
     """Return a value of the description, which stands under `key`, without what is left out."""
     if isinstance(value, dict):
@@ -325,11 +316,6 @@ def _identifier_problem(text: str) -> str:
     return "" if proper else f"expected a name of a value, got {text[:60]!r}"
 
 
-def _range_problem(text: str) -> str:
-    """A symbol or an expression whose range is stated."""
-    return "" if is_symbol(text) else problem(text)
-
-
 def _argument_problem(text: str) -> str:
     """Text that an operator is called with, such as 'same' or 'bilinear'."""
     return "" if len(text) <= 1000 and text.isprintable() else "has text that is too long or not printable"
@@ -372,7 +358,7 @@ _TEXTS: dict[str, Callable[[str], str]] = {
     "out_spec": _tree_problem,
     "as_string": _argument_problem,
     "as_strings": _argument_problem,
-    "range_constraints": _range_problem,
+    "range_constraints": lambda text: "" if is_symbol(text) else problem(text),
 }
 
 

@@ -397,8 +397,10 @@ class Config(BaseModel):
         """Return the settings that decide a run's numbers, as JSON values: all that are not `free`. Files have their
         names only, since they may have been moved."""
         given = {name: value for name, value in self.plain().items() if name not in self.free}
-        files = {name: _bare(value) for name in FILES if isinstance(value := given.get(name), str)}
-        return {**given, **files}
+        for name in FILES:
+            if isinstance(value := given.get(name), str):
+                given[name] = ",".join(Path(part).name for part in split_names(value))
+        return given
 
     def command_line(self) -> str:
         """Return the shell command that repeats this in a place of its own: all settings that are not the default.
@@ -435,11 +437,6 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
             got = f"{error['loc'][1]}={got}"
         problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
     return SettingsError(tuple(problems.items()))
-
-
-def _bare(value: str) -> str:
-    """Return names with no folders before them."""
-    return ",".join(Path(part).name for part in split_names(value))
 
 
 def _absolute(value: str | None) -> str | None:

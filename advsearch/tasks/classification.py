@@ -53,19 +53,16 @@ class ClassTask(Task):
         """See `Task.on`: the target is one of the model's classes, or several. Raises InputError where there is no such
         class, or the model's answers are not what the task reads."""
         if self.reads_logits != (model.read is None):
-            raise InputError(f"model {model.name}: {self._other_reader}")
+            other = f'it was loaded for its logits; load it with task="{self.name}"'
+            if self.reads_logits:
+                other = "expected logits, and it was loaded for another task; leave `read` out"
+            raise InputError(f"model {model.name}: {other}")
         labels, named = (model.labels, model.named) if self.reads_logits else self._names(model)
         try:
             wanted = None if target is None else find_label_set(target, labels, named=named).indices
         except InputError as error:
             raise InputError(f"target: {error}") from None
         return replace(self, labels=labels, named=named, target=wanted, minimise=minimise)
-
-    @property
-    def _other_reader(self) -> str:
-        if self.reads_logits:
-            return "expected logits, and it was loaded for another task; leave `read` out"
-        return f'it was loaded for its logits; load it with task="{self.name}"'
 
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
         """The names of the classes that a model answers with, and whether they are names."""

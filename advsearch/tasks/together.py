@@ -169,7 +169,10 @@ class Together(Task):
 
     def _together(self, each: Sequence[Judgement]) -> Judgement:
         payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
-        said = _joined([one.answer for one in each]), payloads if any(map(_there, payloads.values())) else None
+        said = (
+            _joined([one.answer for one in each]),
+            payloads if any(one is not None for one in payloads.values()) else None,
+        )
         margin = math.nan if any(one.not_a_number for one in each) else max(one.margin for one in each)
         return Judgement.of(min(one.score for one in each), margin, *said)
 
@@ -186,10 +189,6 @@ class Together(Task):
     def _each(self, output: Sequence[Outputs], truth: Truths) -> list[tuple[Any, Any, Any]]:
         """The task, the output and the truth of each model."""
         return list(zip(self.tasks, of_each(output), truth, strict=True))
-
-
-def _there(payload: object) -> bool:
-    return payload is not None
 
 
 def _joined(answers: Sequence[Answer]) -> Answer:

@@ -177,6 +177,7 @@ def columns_of(rows: Iterable[Row]) -> Columns:
         if isinstance(row.payload, dict) and "box" in row.payload:
             boxes.extend([NO_BOX] * (8 * number - len(boxes)))
             boxes.extend(_boxes(row.payload, row.label or ""))
+    boxes.extend([NO_BOX] * (8 * len(steps) - len(boxes) if boxes else 0))
     return Columns(
         step=np.array(steps, np.uint32),
         margin=np.array(margins, np.float32),
@@ -186,13 +187,8 @@ def columns_of(rows: Iterable[Row]) -> Columns:
         answers=tuple(answers.names),
         parameters=parameters.columns(len(steps)),
         last=last,
-        boxes=_filled(boxes, len(steps)) if boxes else None,
+        boxes=np.array(boxes, np.uint16).reshape(-1, 8) if boxes else None,
     )
-
-
-def _filled(boxes: array[int], count: int) -> AnyArray:
-    boxes.extend([NO_BOX] * (8 * count - len(boxes)))
-    return np.array(boxes, np.uint16).reshape(count, 8)
 
 
 def _boxes(payload: Mapping[str, Any], label: str) -> list[int]:

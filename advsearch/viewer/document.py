@@ -54,7 +54,8 @@ def document(
     """
     code = "\n".join(map(asset, scripts))
     images, connect = ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
-    runs = f"; script-src '{_digest(code)}'" if code else ""
+    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+    runs = f"; script-src 'sha256-{digest}'" if code else ""
     policy = f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'{runs}{connect}"
     head = element(
         "head",
@@ -92,10 +93,6 @@ def scrolled(inside: Html | None, css: str = "") -> Html:
 def asset(name: str) -> str:
     """Return a file of the viewer."""
     return (resources.files("advsearch.viewer") / "static" / name).read_text(encoding="utf-8")
-
-
-def _digest(script: str) -> str:
-    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 # ---- what pages have in common ---------------------------------------------------------------------------------------

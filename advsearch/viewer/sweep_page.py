@@ -216,7 +216,8 @@ def sweep_verdict(summary: SweepSummary) -> str:
 def _still(path: Path, summary: SweepSummary) -> Html:
     """What a page without a script shows in the explorer's place."""
     single = summary.cells is not None and max(map(max, summary.cells.configurations)) <= 1
-    figure = _figure(path / "images" / "sweep.png", f"{'Margin' if single else 'Accuracy'} over {_axes_text(summary)}.")
+    axes = " and ".join(list(dict.fromkeys(row.axis for row in summary.axes))[:2]) or "all configurations"
+    figure = _figure(path / "images" / "sweep.png", f"{'Margin' if single else 'Accuracy'} over {axes}.")
     worst = _figure(path / "images" / "worst.png", _worst_text(summary))
     return join_html(
         element("div", figure, class_="pictures", data_still="true") if figure else None,
@@ -283,11 +284,6 @@ def _parts(told: SurfaceTable) -> Html:
     who = f"{wording.short_name(told.object)}, {wording.short_name(told.model)}"
     what = f"{who}: the {told.part}s that are told most clearly"
     return element("details", element("summary", what), study_table(heads, cells))
-
-
-def _axes_text(summary: SweepSummary) -> str:
-    names = list(dict.fromkeys(row.axis for row in summary.axes))
-    return " and ".join(names[:2]) or "all configurations"
 
 
 def _worst_text(summary: SweepSummary) -> str:

@@ -148,12 +148,14 @@ def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measur
     An affine map is measured and left to that. What cuts a picture into patches or tiles is called itself, which is
     differentiable where the processor works with torchvision.
     """
-    described, side = Measured(), _side(loaded.network.config)
+    side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or SIDE
+    side = (int(side[0]), int(side[1])) if isinstance(side, (list, tuple)) else (int(side), int(side))
+    described = Measured()
     with suppress(ModelError):  # it is called then
         described = measured(lambda **given: processor(text=[text], **given), loaded.spec)
     if "mean" in described:
         described["input_size"] = described.get("input_size", side)
-        pixels: Pixels = _alone
+        pixels: Pixels = lambda image: image[None]  # noqa: E731
     elif importlib.util.find_spec("torchvision") is None:
         raise ModelError(
             f"model {loaded.spec}: its processor cuts pictures into patches or tiles, and lets gradients through with "
@@ -163,16 +165,6 @@ def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measur
         described, pixels = Measured(input_size=side), partial(_called, processor, text)
     _check_pixels(loaded, processor, text, pixels, described)
     return pixels, described
-
-
-def _side(config: Any) -> tuple[int, int]:
-    side = getattr(getattr(config, "vision_config", None), "image_size", None) or SIDE
-    height, width = side if isinstance(side, (list, tuple)) else (side, side)
-    return int(height), int(width)
-
-
-def _alone(image: Tensor) -> Tensor:
-    return image[None]
 
 
 def _called(processor: Any, text: str, image: Tensor) -> Tensor:
