@@ -89,13 +89,8 @@ def scaled(limit: int) -> int:
 
 
 def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
-    """Return the error for input over a limit; it names the setting that raises the limit.
-
-    Args:
-        path: the file.
-        expected: what was expected, with the limit: ``"a mesh of at most 100 faces"``.
-        size: what was got: ``"120"``.
-    """
+    """Return the error for input over a limit, which names the setting that raises it. Expected: ``"a mesh of at most
+    100 faces"``; size: ``"120"``."""
     return FileFormatError(
         f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the environment makes all limits "
         "ten times as large"
@@ -103,16 +98,10 @@ def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
 
 
 def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
-    """Return an ordinary file opened for reading; close it.
+    """Return an ordinary file, such as ``"a label file"``, opened for reading; close it. Links are followed.
 
-    Args:
-        path: the file; links are followed.
-        expected: what it should be, for messages: ``"a label file"``.
-        limit: the most bytes it may have, before `scaled`.
-
-    Raises:
-        FileFormatError: a directory, a pipe, a socket or a device, none of which is read; or too large.
-        OSError: as for `open`: it is not there, or there is no permission.
+    Raises FileFormatError: a directory, a pipe, a socket or a device, none of which is read; or more bytes than the
+    limit, which is `scaled`. Raises OSError as `open`: it is not there, or there is no permission.
     """
     if "\0" in str(path):
         raise FileFormatError(f"{path}: expected the name of a file, got one with a zero byte in it")

@@ -58,15 +58,8 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path, limit: int) -> Iterator[Image.Image]:
-    """Open a picture file for the block, which may decode it.
-
-    Args:
-        path: the file.
-        limit: the most bytes that it may have.
-
-    Raises:
-        FileFormatError: it is missing, no ordinary file, no picture, too large or damaged.
-    """
+    """Open a picture file of at most `limit` bytes for the block, which may decode it. Raises FileFormatError: it is
+    missing, no ordinary file, no picture, too large or damaged."""
     try:
         data = files.read_bytes(path, "a picture file such as PNG", limit)
         with warnings.catch_warnings(), without_pillows_limit():

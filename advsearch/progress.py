@@ -78,14 +78,7 @@ UPDATE = 0.2
 
 @contextmanager
 def watched(asked: Watched) -> Iterator[Progress]:
-    """Yield the progress that a call asked for.
-
-    Args:
-        asked: see `Watched`.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Yield the progress that a call asked for, see `Watched`. Raises InputError where it is something else."""
     if asked not in (None, True, False):
         if not callable(getattr(asked, "stage", None)):
             raise InputError(f"progress: expected True, False, None or a Progress, got {asked!r:.80}")

@@ -32,11 +32,8 @@ _chosen: int | None = None
 
 
 def cores(quota: Path = _CPU_MAX) -> int:
-    """The number of cores this process may use: those it is pinned to, and no more than a container's quota allows.
-
-    Args:
-        quota: the file with the quota and its period in microseconds (control groups, version 2).
-    """
+    """The number of cores this process may use: those it is pinned to, and no more than a container's quota allows. The
+    file has the quota and its period in microseconds (control groups, version 2)."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         limit, period = quota.read_text(encoding="ascii").split()

@@ -44,13 +44,8 @@ from advsearch.viewer.pages import write_page
 
 
 def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
-    """Return the result of a part; what is done of it is not done again.
-
-    Args:
-        path: of its folder.
-        config: what it does, where it has not begun.
-        progress: told how far it is.
-    """
+    """Return the result of the part in the folder `path`; what is done of it is not done again. The configuration is
+    what it does, where it has not begun."""
     if not is_run(path) or not (path / CONFIG).is_file():
         return carry_out(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
     if finished(path):
@@ -178,17 +173,8 @@ def attacks_of(settings: JsonObject) -> Call:
 
 
 def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress) -> None:
-    """Have the attacks that are not begun carried out by workers, where some were asked for.
-
-    Args:
-        config: of the study.
-        chains: its attacks.
-        run: its folder, which gets theirs.
-        progress: told how far it is.
-
-    Raises:
-        ClusterError: every worker died of an attack, or there are none.
-    """
+    """Have the attacks of a study that are not begun carried out by workers into its folder, where some were asked for.
+    Raises ClusterError: every worker died of an attack, or there are none."""
     left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / one.name) for one in chain)]
     plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     settings, threads = {"command": config.command, **plain}, config.used_threads or 1
@@ -230,15 +216,8 @@ def carry_out_study(
     progress: Progress | None,
     resumed: Path | None,
 ) -> Study:
-    """Carry out the attacks of a study in its run.
-
-    Args:
-        config: what is asked.
-        attacks: carries out the attacks and returns their rows.
-        result_of: puts these into a result, beside what all studies have in common.
-        progress: told how far it is.
-        resumed: folder of the run to go on with.
-    """
+    """Carry out the attacks of a study in its run: `attacks` does so and returns their rows, and `result_of` puts these
+    into a result, beside what all studies have in common."""
     begun, progress = time.perf_counter(), progress or NullProgress()
     with RunDirectory.of(config, resumed) as run:
         notes = _label_for_all(config)

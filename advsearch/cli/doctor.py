@@ -141,11 +141,8 @@ def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
 
 
 def other_packages(requirements: Sequence[str] | None = None) -> Component:
-    """The dependencies that need no trial: present or not.
-
-    Args:
-        requirements: as in the package's metadata, e.g. ``"rich>=13"``; None reads them there.
-    """
+    """The dependencies that need no trial: present or not. Requirements are as in the package's metadata, e.g.
+    ``"rich>=13"``; None reads them there."""
     wanted = (metadata.requires("advsearch") or []) if requirements is None else requirements
     names = {re.split(r"[^\w.-]", one, maxsplit=1)[0] for one in wanted if "extra ==" not in one}
     rest = sorted(names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES}, key=str.lower)

@@ -169,13 +169,8 @@ def print_json(value: Any) -> None:
 
 
 def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> int:
-    """Print the last word of a command, and return its exit status.
-
-    Args:
-        result: what came out.
-        answer: makes a text for a person of it.
-        as_json: print the result itself instead.
-    """
+    """Print the last word of a command, as JSON or as the text for a person that `answer` makes, and return its exit
+    status."""
     # late: it imports this module
     from advsearch.cli.main import INTERRUPTED, OK
 
@@ -194,11 +189,7 @@ def go_on_text(result: Result) -> str:
 
 
 def go_on_command(run: str | Path) -> str:
-    """Return the shell command that goes on with a run, with the Python code that its settings name.
-
-    Args:
-        run: its folder.
-    """
+    """Return the shell command that goes on with the run in a folder, with the Python code that its settings name."""
     # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG, typed_name
 

@@ -65,17 +65,10 @@ def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]
 def run_file(
     command: str, file: str | Path, changes: Mapping[str, object], args: argparse.Namespace, resumed: Path | None = None
 ) -> int:
-    """Do what a file describes.
+    """Do what a YAML file describes, with `changes` put over it. Raises UnknownNameError where there is no such
+    command.
 
-    Args:
-        command: what the file says it is.
-        file: YAML.
-        changes: put over it.
-        args: with `json`, `quiet` and `code`.
-        resumed: the folder of the run to go on with, if the file is a run's own.
-
-    Raises:
-        UnknownNameError: there is no such command.
+    If the file is a run's own, `resumed` is its folder; `args` has `json`, `quiet` and `code`.
     """
     config = config_of_file(command, file, changes)
     with only_named_code(file, args.code):

@@ -34,13 +34,8 @@ FOLDERS = ("references",)
 
 
 def read_named(value: Any, setting: str, otherwise: str) -> Any:
-    """Return a name, or a mapping with a `name` and options, from ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping.
-
-    Args:
-        value: as it is given.
-        setting: whose.
-        otherwise: the name of a mapping without one.
-    """
+    """Return a name, or a mapping with a `name` and options, from ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping,
+    which may leave out the name `otherwise`."""
     if isinstance(value, str) and "=" in value:
         name, options = parse_assignment(value, setting)
         value = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}

@@ -124,11 +124,7 @@ class SweepConfig(SceneConfig):
     @classmethod
     def of_answer(cls, theirs: AttackConfig, *, varies: bool) -> dict[str, Any]:
         """Return the settings that a sweep of an attack's answer takes from the attack, where it says nothing else.
-
-        Args:
-            theirs: the attack's settings.
-            varies: whether the sweep says itself what varies; otherwise it is what the attack was over.
-        """
+        Unless it says itself what `varies`, that is what the attack was over."""
         apart = ("controls", "texture_resolution", "spp", "seed", "threads", "deterministic")
         kept = {name: value for name, value in cls.shared(theirs).items() if name not in apart}
         return kept if varies else {**kept, "controls": theirs.over}

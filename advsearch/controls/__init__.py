@@ -100,12 +100,8 @@ def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | No
 
 
 def instance_of(kind: str, name: str) -> str:
-    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where the name is that of a mesh.
-
-    Args:
-        kind: word for the control.
-        name: what stands behind the colon; empty if there is none.
-    """
+    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where the name is that of a mesh; the
+    name is empty where there is no colon."""
     of_a_mesh = kind in CONTROLS and CONTROLS[kind].of_a_mesh
     if not name or (of_a_mesh and name == OBJECT):
         return kind
@@ -144,12 +140,9 @@ def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, obje
 
 
 def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
-    """Return settings by control for names as `make_control` takes them.
+    """Return settings by control for names as `make_control` takes them, or with ".parameter" behind.
 
     `camera.azimuth` and `camera.elevation` become one control that searches both.
-
-    Args:
-        asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or "kind:name.parameter".
     """
     found: dict[str, dict[str, object]] = {}
     for name, given in settings_by_name(asked).items():

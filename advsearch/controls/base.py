@@ -157,12 +157,8 @@ class Control(ABC):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings: those of the class, unless the scene or the
-        settings name them.
-
-        Args:
-            settings: names of what is given, perhaps with the values.
-        """
+        """Return the parameters of an instance that is given settings of these names: those of the class, unless the
+        scene or the settings name them."""
         return cls.parameters
 
     @property
@@ -192,16 +188,9 @@ class Control(ABC):
         return {**named, **{choice.name: getattr(self, choice.name) for choice in self.choices}}
 
     def chosen_form(self, forms: Sequence[str], form: str | None) -> str:
-        """Return which form of itself a control takes, where each of its parameters stands for one.
-
-        Args:
-            forms: the forms, in the order of the parameters; the first is the default.
-            form: the one that was asked for by name, or None.
-
-        Raises:
-            InputError: two forms are asked for, or a parameter was given a range of its own.
-            UnknownNameError: there is no such form.
-        """
+        """Return which form of itself a control takes, where each of its parameters stands for one: the one that was
+        asked for by name, or else the first. Raises InputError where two are asked for or a parameter was given a range
+        of its own, UnknownNameError where there is no such form."""
         named = []
         for one, stands_for in zip(self.parameters, forms, strict=True):
             given = getattr(self, one.name)

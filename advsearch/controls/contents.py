@@ -389,12 +389,8 @@ def _said(low: float, high: float) -> str:
 
 
 def liquid(shares: Tensor, vessel: Tensor) -> Tensor:
-    """Return the linear reflectance (3,) of a cup of water, milk and coffee.
-
-    Args:
-        shares: (3,) proportions in the order of `INGREDIENTS`.
-        vessel: (3,) linear reflectance of the vessel's inside.
-    """
+    """Return the linear reflectance (3,) of a cup of water, milk and coffee: of their proportions (3,) in the order of
+    `INGREDIENTS`, and the linear reflectance (3,) of the vessel's inside."""
     amounts = dict(zip(INGREDIENTS, shares, strict=True))
     absorbed, scattered = shares.new_zeros(3), shares.new_tensor(1e-6)
     for name, reflectance in REFLECTANCE.items():

@@ -44,15 +44,8 @@ def generator(seed: int, name: str) -> torch.Generator:
 
 
 def at_level(table: Sequence[Sequence[float]], level: Tensor) -> tuple[Tensor, ...]:
-    """Interpolate the rows of a table, one for each severity, linearly.
-
-    Args:
-        table: five rows of n numbers.
-        level: () severity in [1, 5].
-
-    Returns:
-        n tensors of shape (), the row at the severity; differentiable.
-    """
+    """Interpolate the five rows of n numbers of a table linearly at a severity () in [1, 5]; returns n differentiable
+    tensors ()."""
     rows = torch.tensor(table, dtype=torch.float32, device=level.device)
     return between(level, lambda whole: rows[whole - 1]).unbind()
 
@@ -90,14 +83,10 @@ def blurred(image: Tensor, sigma: Tensor) -> Tensor:
 
 
 def streaked(image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: float) -> Tensor:
-    """Blur an (H, W, C) picture along a line: a one-sided Gaussian, cut off at twice the radius.
+    """Blur an (H, W, C) picture along a line at an `angle` in radians: a one-sided Gaussian, cut off at twice the
+    `radius`.
 
-    Args:
-        image: the picture.
-        radius: () half the length of the streak, in reference pixels.
-        sigma: () standard deviation, in reference pixels.
-        angle: of the line, in radians.
-        step: pixels of this picture for a reference pixel.
+    Radius () and standard deviation `sigma` () are in reference pixels, of which one is `step` pixels of this picture.
     """
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
     along = torch.arange(count, device=image.device) / step
@@ -114,12 +103,8 @@ def streaked(image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: f
 
 
 def warped(image: Tensor, shift: Tensor) -> Tensor:
-    """Look every pixel up at another place.
-
-    Args:
-        image: (H, W, C).
-        shift: (H, W, 2) how far to the right and down to look, in pixels; places outside are mirrored inwards.
-    """
+    """Look every pixel of an image (H, W, C) up at another place: `shift` (H, W, 2) pixels to the right and down;
+    places outside are mirrored inwards."""
     height, width = image.shape[:2]
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(image.device)
@@ -184,12 +169,8 @@ def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def poisson(mean: Tensor, share: Tensor) -> Tensor:
-    """Return the Poisson numbers of given means at given shares of the distribution; no derivative.
-
-    Args:
-        mean: any shape, 0 to about 80.
-        share: the same shape, in [0, 1).
-    """
+    """Return the Poisson numbers of means, 0 to about 80, at given shares of the distribution in [0, 1), of the same
+    shape; no derivative."""
     chance = torch.exp(-mean.double())
     total, count = chance.clone(), torch.zeros_like(chance)
     for number in range(1, 400):

@@ -117,14 +117,9 @@ def body(mesh: Mesh) -> Body:
 
 @lru_cache(maxsize=8)
 def shape_modes(mesh: Mesh, count: int) -> Doubles:
-    """Return the smoothest displacement fields of a mesh that are no rigid motion; kept in memory.
+    """Return the `count` smoothest displacement fields of a mesh that are no rigid motion; kept in memory.
 
-    Args:
-        mesh: the mesh.
-        count: number of modes.
-
-    Returns:
-        (P, 3, count) displacement of each place of `body(mesh)`, smoothest first; its largest length is 1 in each.
+    They are (P, 3, count), for each place of `body(mesh)`, smoothest first; the largest length is 1 in each.
     """
     welded_mesh = body(mesh)
     points, cell = _landmarks(welded_mesh)
@@ -189,18 +184,8 @@ def _landmarks(solid: Body) -> tuple[Doubles, float]:
 
 
 def _without_rotation(points: Doubles, functions: Doubles, mass: Doubles, energy: Doubles, count: int) -> Doubles:
-    """Combine scalar modes to vector fields that hold no rotation, smoothest first.
-
-    Args:
-        points: (N, 3).
-        functions: (N, S) scalar modes, orthonormal under `mass`.
-        mass: (N,) weights.
-        energy: (S,) how fast each varies.
-        count: number of fields wanted.
-
-    Returns:
-        (S, 3, count): weight of each scalar mode along each axis.
-    """
+    """Combine scalar modes (N, S), orthonormal under `mass` (N,), to vector fields that hold no rotation, smoothest
+    first: (S, 3, count), the weight of each mode along each axis. `energy` (S,) is how fast each varies."""
     scalars = functions.shape[1]
     middle = (points * mass[:, None]).sum(axis=0) / mass.sum()
     turns = [np.cross(axis, points - middle) for axis in np.eye(3)]

@@ -111,13 +111,11 @@ def _cells(at: Grid, points: Doubles, count: int = 2) -> tuple[Doubles, npt.NDAr
 
 
 def _turing(wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12) -> Doubles:
-    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and again.
+    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and again; after about ten rounds the
+    pattern has settled.
 
-    Args:
-        wavelength: in tiles, along x and along y; unequal ones make stripes across the shorter.
-        bias: added before saturation: stripes break up into spots away from 0.
-        seed: of the noise.
-        rounds: how often; after about ten the pattern has settled.
+    Wavelengths are in tiles, along x and along y; unequal ones make stripes across the shorter. The bias is added
+    before saturation: stripes break up into spots away from 0.
     """
     frequency = np.fft.fftfreq(SIDE, 1.0 / SIDE)
     radius = np.hypot(frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1])

@@ -231,13 +231,8 @@ class OcclusionControl(NumberControl):
         return made(option) if option in MADE else loaded(option)
 
     def placement(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
-        """Work out where the occluder goes; without derivatives.
-
-        Args:
-            scene: the scene.
-            values: the configuration.
-            so_far: where other controls put the camera and the object.
-        """
+        """Work out where the occluder goes, with camera and object where other controls put them; without
+        derivatives."""
         asked = {name: float(value.detach()) for name, value in values.items()}
         seen = _Seen.of(scene, so_far)
         mesh = self._asset(self._option(values)).mesh
@@ -297,13 +292,8 @@ class _Seen:
 
 
 def _through(model: CameraModel, points: Doubles, faces: npt.NDArray[np.uint32]) -> Doubles | None:
-    """Unit directions (N, 3) in which a mesh is seen through a lens, each for the same area of the picture, or None.
-
-    Args:
-        model: the lens.
-        points: (V, 3) vertices in camera coordinates.
-        faces: (F, 3) vertex indices.
-    """
+    """Unit directions (N, 3) in which a mesh, with vertices (V, 3) in camera coordinates, is seen through a lens, each
+    for the same area of the picture, or None."""
     axes = middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
     cover = silhouette(points @ axes.T, faces)
     if cover is None:
@@ -358,16 +348,11 @@ def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: fl
 
 
 def _fitting(points: Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
-    """Return a size and a distance close to those asked for with which the occluder is between camera and object.
+    """Return a size and a distance close to those asked for with which an occluder with points (V, 3), one object size
+    large around the origin, is between the camera and the object, whose nearest vertex is at `near`.
 
     It keeps `CLEARANCE` from the camera, and no vertex is farther from the camera than the object's nearest one. Where
     its size leaves no such place, it is made smaller.
-
-    Args:
-        points: (V, 3) of the occluder, one object size large around the origin.
-        size: asked for.
-        distance: asked for.
-        near: distance of the object's nearest vertex.
     """
     front, back = float(points[:, 0].max()), float(-points[:, 0].min())
     aside = float(np.hypot(points[:, 1], points[:, 2]).max())

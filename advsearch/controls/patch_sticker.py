@@ -100,13 +100,9 @@ class Sticker:
         self._spot = lru_cache(maxsize=4)(self._find_spot)
 
     def paint(self, base: Tensor | None, pixels: Tensor, numbers: Mapping[str, Tensor]) -> Tensor:
-        """Return the base colour (h, w, 3), linear, with the patch on it; differentiable except in the place.
-
-        Args:
-            base: (any, any, 3) what other controls made of it; None takes the object's own.
-            pixels: (n, n, 3) sRGB.
-            numbers: azimuth, height, size and rotation.
-        """
+        """Return the base colour (h, w, 3), linear, with the patch of pixels (n, n, 3) sRGB on it; differentiable
+        except in the place (azimuth, height, size and rotation). The base is what other controls made of it; None takes
+        the object's own."""
         device = pixels.device
         base = self._own.to(device) if base is None else _fitted(base, len(self._own))
         size = numbers["size"]
@@ -182,13 +178,8 @@ class Sticker:
 
 
 def _fine_enough(mesh: Mesh, own: int, pixel: float) -> Charts:
-    """Rasterise the charts at the side of a base-colour map whose texels are smaller than the square's pixels.
-
-    Args:
-        mesh: of the object.
-        own: side of the object's own base-colour map.
-        pixel: side of a pixel in object sizes.
-    """
+    """Rasterise the charts at the side of a base-colour map whose texels are smaller than the square's pixels, whose
+    side is `pixel` object sizes; `own` is the side of the object's own map."""
     smallest, largest = BASE_SIDES
     side = max(smallest, own)
     charts = rasterised(mesh, side)
@@ -215,11 +206,7 @@ def unrolled(offsets: Doubles, normals: Doubles, frame: Doubles) -> tuple[Double
 
     In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its arc is `R phi`, phi being the
     angle that the normal has turned. So the component along the direction of turning is stretched by `phi / sin(phi)`.
-
-    Args:
-        offsets: (N, 3) points minus the middle.
-        normals: (N, 3) unit normals there.
-        frame: (3, 3) rows right, up, normal at the middle.
+    Offsets are (N, 3) from the middle; the rows of `frame` are right, up and normal there.
     """
     plane, tilt = offsets @ frame[:2].T, normals @ frame[:2].T
     cosine = normals @ frame[2]

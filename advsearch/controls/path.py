@@ -247,18 +247,11 @@ def _is_path(name: str) -> bool:
 
 
 def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, Waypoints]:
-    """Read a file of waypoints.
+    """Return the way of all that travels, from a .csv file with the columns time, x, y, z, and look_x, look_y, look_z
+    or heading. It is about the `mover`; unless `alone`, one about the camera may say what the object does at the same
+    times.
 
-    Args:
-        path: a .csv file with the columns time, x, y, z, and look_x, look_y, look_z or heading.
-        mover: what they are about, "camera" or "object".
-        alone: whether a file about the camera may say what the object does at the same times.
-
-    Returns:
-        The way of all that travels.
-
-    Raises:
-        FileFormatError: it is no table of numbers with the columns that a path needs, or its times do not ascend.
+    Raises FileFormatError: it is no table of numbers with the columns that a path needs, or its times do not ascend.
     """
     further = (HEADING,) if mover == THING else (*LOOKING, *SHIFT, TURNING) if alone else LOOKING
     try:

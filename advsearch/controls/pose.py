@@ -66,11 +66,7 @@ class PoseControl(NumberControl):
 @lru_cache(maxsize=16)
 def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, float]:
     """Where a mesh stands before it is posed: from its own coordinates (4, 4), its vertices (V, 3) there, their floor.
-
-    Args:
-        mesh: as the settings have it.
-        placed: as it came, of a mesh around the object; the object's own coordinates are those of the scene.
-    """
+    `placed` is a mesh around the object as it came; the object's own coordinates are those of the scene."""
     if placed is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
     places = standing(placed)

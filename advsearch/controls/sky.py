@@ -107,13 +107,8 @@ class Sky:
         self.solid_angles = torch.cos(torch.deg2rad(rows))[..., None] * texel
 
     def dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
-        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon without the sun's disk.
-
-        Args:
-            sun: (3,) unit vector towards it.
-            elevation: () of the sun, degrees, over 0.
-            turbidity: () in `TURBIDITIES`.
-        """
+        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon without the sun's disk. The sun is a
+        unit vector (3,) towards it, its elevation () in degrees, over 0, and the turbidity () in `TURBIDITIES`."""
         a, b, c, d, e, f, g, i, h = self._interpolated(tables(sun.device)[0], elevation, turbidity).unbind(-1)
         level = self._interpolated(tables(sun.device)[1], elevation, turbidity)
         cosine = (self.directions @ sun)[..., None]
@@ -142,16 +137,8 @@ class Sky:
         return bump / (bump * self.solid_angles).sum().clamp_min(NEARLY_NOTHING)
 
     def __call__(self, azimuth: Tensor, elevation: Tensor, turbidity: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the map (ROWS, COLUMNS, 3) of linear radiance and its metered irradiance ().
-
-        Args:
-            azimuth: () of the sun, degrees.
-            elevation: () of the sun, degrees, over 0 and at most 90.
-            turbidity: () in `TURBIDITIES`.
-
-        Returns:
-            The map, and the mean channel of the irradiance on a surface that faces the sun.
-        """
+        """Return the map (ROWS, COLUMNS, 3) of linear radiance, and the mean channel () of the irradiance on a surface
+        that faces the sun, which stands at an azimuth () and an elevation (), over 0 and at most 90 degrees."""
         sun = direction(azimuth, elevation)
         upper = self.dome(sun, elevation, turbidity) + self.disk(sun) * sun_irradiance(elevation, turbidity)
         arriving = upper * self.solid_angles

@@ -221,13 +221,8 @@ def repainted(original: Tensor, budget: Budget) -> Painter:
 
 
 def recoloured(original: Tensor, centres: Tensor, budget: Budget) -> Painter:
-    """Return a few colours, from which each texel takes its change by how much it resembles them.
-
-    Args:
-        original: (n, 3) sRGB.
-        centres: (k, 3) sRGB, the palette of the original.
-        budget: ball around the palette.
-    """
+    """Return a few colours, from which each texel of the original (n, 3) sRGB takes its change by how much it resembles
+    them: within a ball around the original's palette, the centres (k, 3)."""
     squared = (original[..., None, :] - centres).square().sum(dim=-1)
     weights = torch.softmax(-squared / (2.0 * _spread(centres) ** 2), dim=-1)
 

@@ -230,19 +230,8 @@ def check_prepared(control: str, before: SceneDescription, after: SceneDescripti
 def check_start(
     control: str, parameter: str, allowed: str, setting: str, scene: SceneDescription, wanted: Number
 ) -> None:
-    """Check that a value which the clean scene cannot have was not asked for.
-
-    Args:
-        control: the instance's name.
-        parameter: its parameter.
-        allowed: what the parameter is set to, in words.
-        setting: the setting of the scene that says the same.
-        scene: as it was described.
-        wanted: the parameter's value in it.
-
-    Raises:
-        InputError: it was.
-    """
+    """Raise InputError where a value `wanted` of a control's parameter, which is outside what is `allowed` (in words)
+    and so cannot be that of the clean scene, was asked for in the scene's `setting` that says the same."""
     if setting not in scene.given:
         return
     asked = f"`environment={scene.environment_spec}`"

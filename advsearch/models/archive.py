@@ -77,16 +77,8 @@ class Archive:
 
 
 def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
-    """Return the archive in an open file of `size` bytes.
-
-    Args:
-        path: for messages.
-        file: the archive; it stays open as long as the answer is used.
-        size: bytes of the file.
-
-    Raises:
-        FileFormatError: it is damaged, unpacks to too much, or has members that torch's archives never have.
-    """
+    """Return the archive in an open file of `size` bytes, which stays open as long as that is used. Raises
+    FileFormatError: it is damaged, unpacks to too much, or has members that torch's archives never have."""
     try:
         archive = zipfile.ZipFile(file)
         entries = archive.infolist()

@@ -42,14 +42,10 @@ class TookTooLong(Exception):
 
 
 def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -> Result:
-    """Return what `call` returns, or raise what it raises.
+    """Return what `call`, which may never end, returns, or raise what it raises; `stop` asks it to end when the time is
+    up.
 
-    Args:
-        call: what may never end.
-        stop: asks it to end when the time is up; None where nothing can.
-
-    Raises:
-        TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
+    Raises TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
     """
     results: list[Result] = []
     errors: list[BaseException] = []

@@ -196,14 +196,9 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
 
 
 def names_in(said: Any) -> tuple[str, ...] | None:
-    """Return the names that a network says its classes have: as YOLO's do in `names`, and their files in metadata.
-
-    Args:
-        said: a mapping from 0, 1, ... to names, a list of names, or the text of one of these; from a stranger.
-
-    Returns:
-        The names in order; None of anything else.
-    """
+    """Return the names that a network says its classes have, in order: as YOLO's do in `names`, and their files in
+    metadata. A stranger says them: a mapping from 0, 1, ... to names, a list of names, or the text of one; None of
+    anything else."""
     if isinstance(said, str):
         if len(said) > LONGEST_NAMES or not _FLAT.fullmatch(said):
             return None
@@ -271,14 +266,8 @@ def _label_sets() -> dict[str, tuple[str, ...]]:
 
 
 def fitting_labels(classes: int, labels: tuple[str, ...] | None, source: str, model: str) -> tuple[str, ...]:
-    """Return the labels, or placeholders for None; InputError (FileFormatError, for a file) if their number is wrong.
-
-    Args:
-        classes: how many the model has.
-        labels: the names.
-        source: where they came from, e.g. ``"label file x.json"``.
-        model: the model's name.
-    """
+    """Return the labels, or placeholders for None; InputError (FileFormatError, for a file) if their number is not that
+    of a model's classes. The source, such as ``"label file x.json"``, is for the message."""
     if labels is None:
         return tuple(f"class {index}" for index in range(classes))
     if len(labels) == classes:

@@ -52,28 +52,15 @@ class Purpose:
     tokens: int = 16
 
     def check(self, model: str, what: str, *tasks: str) -> None:
-        """Raise a ModelError where a network cannot do the task.
-
-        Args:
-            model: for messages.
-            what: it does, such as "compares a picture with texts".
-            tasks: that it does. Tasks of a user's own may read its answer in any way.
-        """
+        """Raise a ModelError where a network cannot do the task: `what` it does, such as "compares a picture with
+        texts", is good for `tasks`, and for a user's own, which may read its answer in any way."""
         if self.task in (*GIVEN_BY, "answer") and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
             raise ModelError(f"model {model} {what} and cannot do task {self.task}; use {instead}")
 
     def named(self, model: str, what: str, task: str) -> tuple[str, ...]:
-        """Return the names, for a network that has no classes of its own.
-
-        Args:
-            model, what: as in `check`.
-            task: that it does.
-
-        Raises:
-            ModelError: see `check`.
-            InputError: there are no names.
-        """
+        """Return the names, for a network that does a task and has no classes of its own. Raises ModelError as `check`,
+        and InputError where there are no names."""
         self.check(model, what, task)
         if self.names is None:
             raise InputError(

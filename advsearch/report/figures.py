@@ -66,14 +66,8 @@ def drawn(
     kinds: Sequence[str] = ("png", "svg"),
     style: dict[Any, Any] | None = None,
 ) -> Figures:
-    """Return a figure as files.
-
-    Args:
-        draw: draws on it.
-        size: width and height in inches.
-        kinds: suffixes of the files.
-        style: settings of matplotlib that differ from `STYLE`.
-    """
+    """Return a figure of a size in inches (width, height) as files of some kinds; the style is what differs from
+    `STYLE`."""
     # late: matplotlib takes long to import
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -292,11 +286,8 @@ class SurfacePanel:
 
 
 def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
-    """Draw a row for each panel: the map, and the object in its colours from some sides.
-
-    Args:
-        panels: the first `MOST_PANELS` are drawn, at one scale.
-    """
+    """Draw a row for each of the first `MOST_PANELS` panels, at one scale: the map, and the object in its colours from
+    some sides."""
     panels = panels[:MOST_PANELS]
     largest = max((float(np.nanmax(np.abs(one.difference), initial=0.0)) for one in panels), default=0.0)
     end = max(ceil(10.0 * largest - 1e-9) / 10.0, 0.1)

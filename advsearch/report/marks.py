@@ -133,15 +133,8 @@ NARROWEST = 160
 
 
 def contact_sheet(pictures: Sequence[Floats], captions: Sequence[Sequence[str]]) -> Floats:
-    """Return pictures side by side on white.
-
-    Args:
-        pictures: (H, W, 3) display-referred sRGB in [0, 1], all of one size.
-        captions: the lines of text under each; what is too long for the tile is cut.
-
-    Returns:
-        (h, w, 3) float32, display-referred sRGB in [0, 1].
-    """
+    """Return pictures (H, W, 3), display-referred sRGB in [0, 1] and all of one size, side by side on white, each over
+    lines of text; what is too long for the tile is cut. As the pictures, float32."""
     columns = columns_for(len(pictures))
     rows = math.ceil(len(pictures) / columns)
     factor = math.ceil(NARROWEST / pictures[0].shape[1])

@@ -36,13 +36,8 @@ class Html(str):
 
 
 def element(tag: str, *children: str | None, **attributes: str | float) -> Html:
-    """Return one element. Children that are not `Html` are escaped; None is left out.
-
-    Args:
-        tag: the element's name.
-        children: what stands in it.
-        attributes: by name; ``class_`` is ``class``, and other underscores become hyphens.
-    """
+    """Return one element. Children that are not `Html` are escaped; None is left out. Of attributes ``class_`` is
+    ``class``, and other underscores become hyphens."""
     names = {"class_": "class", "viewBox": "viewBox"}
     given = "".join(
         f' {names.get(name, name.replace("_", "-"))}="{escape(str(value), quote=True)}"'
@@ -98,12 +93,7 @@ def _shown(result: object) -> ShownAnswer:
 
 
 def answer_html(given: ShownAnswer, pictures: Mapping[str, ArrayLike] | None = None) -> str:
-    """Return an answer as a cell of a notebook.
-
-    Args:
-        given: what is shown of it.
-        pictures: name to (H, W, 3) sRGB in [0, 1].
-    """
+    """Return an answer as a cell of a notebook, with pictures (H, W, 3), sRGB in [0, 1]."""
     figures = [
         element(
             "figure", _picture(png_bytes(image), SHOWN, name), element("figcaption", name), style="display:inline-block"
@@ -210,14 +200,9 @@ class Curve:
 
 
 def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "", width: int = WIDE) -> Html:
-    """Return the best objective so far (lines) and each single one (dots) over the number of evaluations.
-
-    Args:
-        curves: each with a finite value.
-        objective: label of the vertical axis.
-        zero_means: what stands at the zero line; no line when it is empty.
-        width: in CSS pixels.
-    """
+    """Return the best objective so far (lines) and each single one (dots) over the number of evaluations; each curve
+    has a finite value. `zero_means` stands at the zero line, which is not there when it is empty; the width is in CSS
+    pixels."""
     values = [np.array(curve.values, dtype=float) for curve in curves]
     best = [np.fmax.accumulate(one) for one in values]
     ends = [(one[np.isfinite(one)][0], one[-1]) for one in best]
@@ -244,14 +229,8 @@ def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "
 
 
 def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, height: int = HEIGHT) -> Html:
-    """Return what `report.studies` draws on axes, without its title and with the page's legend.
-
-    Args:
-        draw: draws on the axes.
-        words: what it shows, to who does not see it.
-        width: in CSS pixels.
-        height: likewise.
-    """
+    """Return what `draw` draws on axes, without its title and with the page's legend. The words say what it shows to
+    who does not see it; width and height are in CSS pixels."""
 
     def on_figure(figure: Figure) -> None:
         axes = figure.subplots()

@@ -85,13 +85,7 @@ class AnswerPart:
 
     @classmethod
     def table(cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any) -> AnswerPart:
-        """Return a table, a row for each of some values.
-
-        Args:
-            rows: the values.
-            columns: head to how its cell is made.
-            more: other attributes.
-        """
+        """Return a table, a row for each of some values, with columns by their heads, and `more` of its attributes."""
         made = [[made(row) if callable(made) else made.format(row) for made in columns.values()] for row in rows]
         return cls(heads=tuple(columns), rows=made, **more)
 

@@ -128,14 +128,8 @@ def distance_of(summary: SweepSummary) -> SeenFrom | None:
 
 
 def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
-    """Return the distance at which an object is first seen.
-
-    Args:
-        rows: of one axis, each with pictures: a distance, or both ends of a range of it, and the counts there.
-
-    Raises:
-        InputError: there are fewer than two distances.
-    """
+    """Return the distance at which an object is first seen, from the rows of one axis: a distance, or both ends of a
+    range of it, and the counts there. Raises InputError where there are fewer than two distances."""
     rows = sorted(rows, key=_middle)
     counted = [(_middle(row), row.correct, row.configurations) for row in rows]
     if len(counted) < 2:

@@ -258,12 +258,8 @@ def print_cost_text(summary: AttackSummary) -> str:
 
 
 def formation_text(formation: Formation, gains: Mapping[str, float] | None = None) -> str:
-    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops, gain 1.35``.
-
-    Args:
-        formation: of the pictures.
-        gains: of several scenes, by their names.
-    """
+    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops, gain 1.35``; gains
+    of several scenes by their names."""
     height, width = formation.resolution
     denoised = "not denoised" if formation.denoiser == "none" else f"denoised ({formation.denoiser})"
     exposure = f"exposure {number_text(formation.exposure)} stops"

@@ -349,12 +349,8 @@ class Config(BaseModel):
 
     @classmethod
     def of(cls, other: Config, **changes: object) -> Self:
-        """Return what another command's configuration describes as one of this, in a place of its own.
-
-        Args:
-            other: gives the settings that are `shared`.
-            **changes: settings that are different.
-        """
+        """Return what another command's configuration describes as one of this, in a place of its own: the settings
+        that are `shared`, but for the changes."""
         return cls(**{**cls.shared(other), **changes}).with_only_here(other.only_here)
 
     @property

@@ -74,12 +74,7 @@ def number_or_text(value: Any) -> Any:
 def parse_assignment(text: str, where: str) -> tuple[str, Any]:
     """Return the name and the value of ``NAME=VALUE``; the value is read as YAML, and as plain text where it is none.
 
-    Args:
-        text: the assignment.
-        where: what the error names: ``"--set"``, say.
-
-    Raises:
-        InputError: there is no ``=``, or the name is empty.
+    Raises InputError, which names `where` ("--set", say): there is no ``=``, or the name is empty.
     """
     name, separator, value = text.partition("=")
     if not (separator and name.strip()):

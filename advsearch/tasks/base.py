@@ -285,12 +285,8 @@ class Task(ABC):
         return False
 
     def seeing(self: Own, output: Output, truth: Truth | None) -> Own:
-        """Return the task with what its model's answer to a clean picture of the scene shows of how answers are read.
-
-        Args:
-            output: of one picture.
-            truth: of the scene; None where nobody knows it.
-        """
+        """Return the task with what its model's answer to one clean picture of the scene shows of how answers are read;
+        the truth is None where nobody knows it."""
         return self
 
     @property

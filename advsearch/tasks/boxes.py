@@ -68,17 +68,9 @@ def corners(boxes: Tensor, form: str) -> Tensor:
 
 
 def strongest(boxes: Tensor, scores: Tensor, count: int, iou: float) -> list[int]:
-    """Return which boxes are left when of those that overlap only the best one is kept (greedy suppression).
-
-    Args:
-        boxes: (D, 4) of one class.
-        scores: (D,).
-        count: the most that are kept.
-        iou: intersection over union from which two are the same thing.
-
-    Returns:
-        Their places, the best first.
-    """
+    """Return which of boxes (D, 4) of one class, with scores (D,), are left when of those that overlap (by an
+    intersection over union of `iou`) only the best one is kept (greedy suppression): their places, the best first,
+    `count` at most."""
     left = scores.argsort(descending=True)
     kept: list[int] = []
     while len(left) and len(kept) < count:
@@ -286,13 +278,8 @@ class Reading:
         return as_option(", ".join(f"{name}: {new}" for name, old, new in said if old != new))
 
     def better(self, boxes: Tensor, true: Tensor, least: float) -> str:
-        """Return what says the reading in which one of boxes (D, 4) overlaps the true box `NEARER` than in this one.
-
-        Args:
-            boxes: that have the right name.
-            true: (4,) corners in shares of width and height.
-            least: intersection over union.
-        """
+        """Return what says the reading in which one of boxes (D, 4), those with the right name, overlaps the true box
+        (4,), in shares of width and height, `NEARER` than in this one, and at `least` so."""
         every = [self, *(Reading(form, unit, self.size) for unit in UNITS for form in FORMS)]
         found = {one: float(overlap(one.fractions(boxes), true).max()) for one in every} if len(boxes) else {}
         best = max(found, key=lambda one: found[one], default=self)
@@ -336,19 +323,9 @@ def names_head(order: str) -> bool:
 
 
 def head_in(answer: Tensor, beside: Collection[int], classes: int, order: str = "") -> tuple[str, ...]:
-    """Return the orders that an answer (A, B) to one picture may have, such as "boxes scores channels first".
-
-    Sides tell, and scores, which lie in [0, 1].
-
-    Args:
-        answer: numbers of places.
-        beside: how many channels the maps have that came with it.
-        classes: that there are.
-        order: what is said of it already; "" for nothing.
-
-    Raises:
-        ValueError: it has none of them; the text says what it seems to be.
-    """
+    """Return the orders that an answer (A, B) to one picture may have, such as "boxes scores channels first"; what is
+    said of it already narrows them. Sides tell (`beside`: the channels of maps that came with it), and scores, which
+    lie in [0, 1]. Raises ValueError where it has none of them; the text says what it seems to be."""
     found, outside = list[str](), ""
     for layout, length in zip(LAYOUTS, answer.shape, strict=True):
         for head, start in HEADS.items():
@@ -403,14 +380,8 @@ def _unfitting(answer: Tensor, classes: int) -> str:
 
 
 def split(answer: Tensor, classes: int, order: str, *, multiplied: bool = True) -> tuple[Tensor, Tensor]:
-    """Return the boxes (D, 4) and scores (D, classes) of an answer to one picture; differentiable.
-
-    Args:
-        answer: (A, B).
-        classes: that there are.
-        order: with its layout.
-        multiplied: whether objectness is multiplied with the scores; otherwise it is the first of (D, 1 + classes).
-    """
+    """Return the boxes (D, 4) and scores (D, classes) of an answer (A, B) to one picture; differentiable. Its order has
+    a layout. Unless objectness is `multiplied` with the scores, it is the first of (D, 1 + classes)."""
     places = answer.T if order.endswith(LAYOUTS[0]) else answer
     scores = places[:, 4 : 4 + classes]
     if order.startswith("boxes objectness"):

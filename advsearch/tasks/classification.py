@@ -196,16 +196,9 @@ def target_lead(logits: Tensor, targets: Labels) -> Tensor:
 
 
 def members(logits: Tensor, labels: Labels | Tensor, setting: str = "label") -> Tensor:
-    """Return (C,) bool, true for the classes of a label set; checks the logits and the labels.
-
-    Args:
-        logits: (N, C).
-        labels: class indices, which are right for all N.
-        setting: what an error names.
-
-    Raises:
-        InputError: logits of another shape, no index, one out of range, or all classes.
-    """
+    """Return (C,) bool, true for the classes of a label set; checks the logits (N, C) and the labels, which are right
+    for all N. Raises InputError, which names the setting: logits of another shape, no index, one out of range, or all
+    classes."""
     if logits.ndim != 2:
         raise InputError(f"model output: expected logits of shape (N, classes), got {tuple(logits.shape)}")
     classes = logits.shape[1]

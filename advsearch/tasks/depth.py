@@ -373,13 +373,10 @@ class Depth(Task):
 
 
 def _fitted(values: Tensor, wanted: Tensor, at: Tensor) -> Tensor:
-    """Return a scale times the values plus a shift, the nearest to what is wanted where `at` says, by least squares.
+    """Return a scale times the values (H, W) plus a shift, the nearest to what is wanted where `at` (H, W) says, by
+    least squares; there is a pixel there, and what is wanted is finite.
 
     A scale is not negative: what the model holds for near stays near.
-
-    Args:
-        values, wanted: (H, W).
-        at: (H, W) bool, at least one pixel; `wanted` is finite there.
     """
     x, y = values[at], wanted[at]
     x, y, middle, level = x - x.mean(), y - y.mean(), x.mean(), y.mean()

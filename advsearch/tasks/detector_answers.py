@@ -88,16 +88,9 @@ def checked_order(text: str) -> tuple[str, ...]:
 
 
 def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
-    """Return what a detector answered to each of `count` pictures.
-
-    Args:
-        answer: as `EXPECTED` says. The parts of a mapping or an object may have other names.
-        count: pictures.
-        order: of parts that have no names, see `checked_order`; "" for what types and shapes say.
-
-    Raises:
-        ValueError: it is something else, or scores are not in [0, 1].
-    """
+    """Return what a detector answered, as `EXPECTED` says, to each of `count` pictures. The order is of parts that have
+    no names, see `checked_order`; "" for what types and shapes say. Raises ValueError: it is something else, or scores
+    are not in [0, 1]."""
     parts = checked_order(order) if order else ()
     if isinstance(answer, (list, tuple)) and answer and all(isinstance(one, Tensor) and one.ndim > 3 for one in answer):
         raise ValueError("expected boxes, and not the maps of a head from which they are made: export it in .eval()")
@@ -307,16 +300,9 @@ def _kept(one: dict[str, Tensor], filling: Tensor, numbers: Tensor) -> Detection
 
 
 def settled(one: Detections, order: str = "", classes: int | None = None) -> Detections:
-    """Return the detections of a picture with boxes, scores and labels told apart.
-
-    Args:
-        one: of `detections_in`.
-        order: one of `ORDERS` or `QUERIES`, or of `boxes.HEADS` with a layout; "" for what its rows show.
-        classes: that there are; None where nobody says.
-
-    Raises:
-        ValueError: they do not show it, or something else than the order says.
-    """
+    """Return the detections of a picture with boxes, scores and labels told apart, by an order (`ORDERS`, `QUERIES`, or
+    `boxes.HEADS` with a layout; "" for what its rows show) and the number of classes, None where nobody says. Raises
+    ValueError: they do not show it, or something else than the order says."""
     if "raw" in one:
         if classes is None:
             raise ValueError(EXPECTED)

@@ -37,12 +37,8 @@ class Ensemble:
 
 
 def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Model:
-    """Return several models as one, whose output is a list with a tuple of the models' outputs for each picture.
-
-    Args:
-        models: at least one.
-        size: (height, width) in pixels of the pictures; None for the largest that a model takes.
-    """
+    """Return several models as one, whose output is a list with a tuple of the models' outputs for each picture. The
+    size of the pictures is (height, width) in pixels; None for the largest that a model takes."""
     high, wide = (max(model.input_size[side] for model in models) for side in (0, 1))
     return Model(
         module=Ensemble(models),

@@ -94,15 +94,8 @@ def following_page(name: str, run: Path) -> str:
 
 
 def progress_json(run: Path, after: int) -> bytes:
-    """Return what is new in a run as JSON.
-
-    Args:
-        run: its folder.
-        after: what `next` was in the answer before, or `START`.
-
-    Raises:
-        FileFormatError: what it keeps is damaged.
-    """
+    """Return what is new in a run as JSON, after what `next` was in the answer before, or `START`. Raises
+    FileFormatError where what it keeps is damaged."""
     last = after
     running, ended = (
         files.is_held(run),

@@ -138,14 +138,8 @@ def study_table(
     links: Sequence[str] = (),
     shares: Mapping[tuple[int, int], float] | None = None,
 ) -> Html:
-    """Return a table whose rows begin with their name.
-
-    Args:
-        heads: of the columns.
-        rows: texts.
-        links: of the rows' names; empty ones and those that are missing lead nowhere.
-        shares: in [0, 1], by row and column: the larger, the stronger the colour of the cell.
-    """
+    """Return a table whose rows begin with their name. Links, of the names, lead nowhere where they are empty or
+    missing. Shares in [0, 1], by row and column: the larger, the stronger the colour of the cell."""
     lines = []
     for number, (first, *cells) in enumerate(rows):
         link = links[number] if number < len(links) else ""

@@ -86,16 +86,8 @@ KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 
 
 def write_page(run: Path, result: Result) -> Path:
-    """Write `report.html` into the folder of a run and return its path.
-
-    Args:
-        run: the folder.
-        result: that the run has.
-
-    Raises:
-        FileFormatError: other results of the run are damaged.
-        StorageError: the page cannot be written.
-    """
+    """Write `report.html` into the folder of a run and return its path. Raises FileFormatError where other results of
+    the run are damaged, StorageError where the page cannot be written."""
     if isinstance(result, SweepSummary):
         return write_sweep_page(run, result)
     own = rooms.in_room(result.command, "page", "page")

@@ -94,12 +94,8 @@ def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
 
 
 def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:
-    """Return the page as HTML.
-
-    Args:
-        runs: folder and result of each sweep; None where it has none yet.
-        sources: what the explorer of each reads.
-    """
+    """Return the page of sweeps as HTML, of each its folder, its result (None where it has none yet) and what its
+    explorer reads."""
     connects = any(isinstance(one.rows, str) for one in sources)
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)

@@ -28,16 +28,8 @@ from advsearch.models.source import Purpose, Source, source_of
 
 
 def library(name: str, spec: str, extra: str) -> Any:
-    """Return an optional library.
-
-    Args:
-        name: as it is imported.
-        spec: the model that needs it, for the message.
-        extra: the extra of advsearch that installs it.
-
-    Raises:
-        ModelError: it is not installed, or cannot be imported.
-    """
+    """Return an optional library, that an extra of advsearch installs and a model needs. Raises ModelError where it is
+    not installed, or cannot be imported."""
     try:
         return importlib.import_module(name)
     except Exception as error:  # a build for another torch raises RuntimeError, among others
@@ -65,12 +57,8 @@ def without_unpickling() -> Iterator[None]:
 
 @contextlib.contextmanager
 def reading(spec: str, advice: str) -> Iterator[None]:
-    """Turn what a library raises while it fetches and reads weights into a ModelError; it never unpickles.
-
-    Args:
-        spec: the model.
-        advice: what else its user may give.
-    """
+    """Turn what a library raises while it fetches and reads a model's weights into a ModelError, which advises what
+    else its user may give; it never unpickles."""
     disabled = logging.root.manager.disable
     logging.disable(logging.WARNING)  # of single tries to connect: an error is raised in the end
     try:
@@ -130,18 +118,13 @@ def processor_of(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
 
 
 def measured(processor: Any, spec: str) -> Measured:
-    """Return size, mean, standard deviation and order of channels such that ours is what a processor does.
+    """Return size, mean, standard deviation and order of channels such that ours is what a processor of transformers
+    does.
 
     Pictures of one colour tell gain and offset of each channel, whatever is resized or cropped: with x in [0, 1],
     ``gain x + offset = (x - mean) / std``. The size is that of a square picture's answer. A processor that does
-    something else to the values of pixels is returned, to be called, if a gradient goes through it.
-
-    Args:
-        processor: of transformers.
-        spec: the model, for messages.
-
-    Raises:
-        ModelError: it does something else and lets no gradient through, pads pictures or cuts them into patches.
+    something else to the values of pixels is returned, to be called, if a gradient goes through it. Raises ModelError:
+    no gradient does, or it pads pictures or cuts them into patches.
     """
 
     def shown(colour: tuple[int, int, int], side: int = SIDES[0]) -> Array:
@@ -268,11 +251,8 @@ class Loaded:
         return source_of(module, self.name, **{**self.described, **fields})
 
     def when_named(self, named: Callable[[Any, Any, str, Measured, Purpose], Source]) -> Source:
-        """Return the source of a network that reads texts, which is built when the user's names are there.
-
-        Args:
-            named: makes it of the network, its tokenizer, its name, what is done to pictures, and the purpose.
-        """
+        """Return the source of a network that reads texts, which is built when the user's names are there: of the
+        network, its tokenizer, its name, what is done to pictures, and the purpose."""
         tokenizer, described = self.part("AutoTokenizer"), self.described
         side = getattr(getattr(self.network.config, "vision_config", None), "image_size", None)
         if "input_size" not in described and isinstance(side, int):

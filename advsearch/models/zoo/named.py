@@ -58,12 +58,8 @@ def of_timm(network: nn.Module) -> Source | None:
 
 
 def wrapped_timm(loaded: Loaded, labels: tuple[str, ...]) -> Source:
-    """Return the source of a network of timm inside one of transformers, whose ``config`` may tell more than timm.
-
-    Args:
-        loaded: of a `TimmWrapperForImageClassification`.
-        labels: that transformers knows; none where it only numbers them.
-    """
+    """Return the source of a network of timm inside a `TimmWrapperForImageClassification` of transformers, whose
+    ``config`` may tell more than timm. There are no labels where transformers only numbers them."""
     timm = library("timm", loaded.spec, "timm")
     network: Any = loaded.network
     told = getattr(network.config, "pretrained_cfg", None)
@@ -73,15 +69,8 @@ def wrapped_timm(loaded: Loaded, labels: tuple[str, ...]) -> Source:
 def _source(
     timm: Any, module: Any, name: str, told: Mapping[str, Any] | None = None, labels: tuple[str, ...] = ()
 ) -> Source:
-    """Return the source of a network, which is asked for its classes or for its features.
-
-    Args:
-        timm: the library.
-        module: the network.
-        name: what to call it.
-        told: what stands for its ``pretrained_cfg``.
-        labels: names of its classes that go before timm's.
-    """
+    """Return the source of a network of timm, which is asked for its classes or for its features. `told` stands for its
+    ``pretrained_cfg``; labels go before timm's."""
     return Source(module, name, finish=partial(_finished, timm, module, name, told, labels))
 
 

@@ -36,12 +36,8 @@ TOKENS = ("cls_token", "class_embedding", "class_token")
 
 
 def answers_with_features(architecture: str, network: Any) -> bool:
-    """Whether a network of transformers, or the class of one, has features of a picture and no head.
-
-    Args:
-        architecture: by name, such as Dinov2Model or CLIPVisionModelWithProjection.
-        network: of it, or its class; None where transformers has none.
-    """
+    """Whether a network of transformers, or the class of one, has features of a picture and no head; its architecture
+    is a name such as Dinov2Model or CLIPVisionModelWithProjection. None stands for one that transformers has not."""
     if network is None or not architecture.endswith(ENDINGS) or zero_shot.compares(network):
         return False
     finds = "encoder_outputs" in inspect.signature(network.forward).parameters or "Detr" in architecture
@@ -63,12 +59,8 @@ def also(plain: Callable[[Loaded], Source], *, reads_text: bool = False) -> Call
 
 
 def no_classes(name: str, what: str) -> ModelError:
-    """Return the error for a network that is asked for classes and has features only.
-
-    Args:
-        name: of the model.
-        what: it is, such as "is a Dinov2Model".
-    """
+    """Return the error for a model that is asked for classes and has features only; `what` it is: "is a
+    Dinov2Model"."""
     return ModelError(
         f"model {name}: {what}, which answers with features and has no classes: use `task={TASK}`, which compares "
         "them with those of other pictures, or give a network with a head"
@@ -99,13 +91,9 @@ def _finished(loaded: Loaded, plain: Callable[[Loaded], Source] | None, purpose:
 
 
 def pooled(answer: Any, *, token: bool) -> Tensor | None:
-    """Return the features (N, D) in an answer of a network; None where there are none.
-
-    Args:
-        answer: a tensor (N, D), or what has one of `PARTS`. Maps (N, D, H, W) among these are averaged over their
-            positions.
-        token: whether the first of several tokens (N, T, D) stands for the picture; otherwise their mean does.
-    """
+    """Return the features (N, D) in an answer of a network, a tensor (N, D) or what has one of `PARTS`; None where
+    there are none. Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D), the first stands
+    for the picture if `token`, otherwise their mean."""
     for part in PARTS:
         value = answer.get(part) if isinstance(answer, Mapping) else getattr(answer, part, None)
         if isinstance(value, Tensor):
@@ -187,15 +175,8 @@ def is_ours(architecture: str, network: Any) -> bool:
 
 
 def mask_source(loaded: Loaded, labels: tuple[str, ...] | None) -> Source:
-    """Return the source of a network that answers with masks and their classes.
-
-    Args:
-        loaded: the network.
-        labels: names of its classes.
-
-    Warns:
-        ModelWarning: what its scores are.
-    """
+    """Return the source of a network that answers with masks and their classes. Warns what its scores are
+    (ModelWarning)."""
     warnings.warn(
         f"model {loaded.name} gives a pixel a score of each class, summed over its masks, which is no logit: its "
         "logarithm is used, so that margins are logarithms of a ratio of scores",

@@ -122,13 +122,8 @@ def _part(transformers: Any, spec: str, name: str, where: Mapping[str, Any], loa
 
 
 def _kind(architecture: str, network: Any, spec: str) -> Family:
-    """Return which of `NETWORKS` an architecture is of; a ModelError says what it is otherwise.
-
-    Args:
-        architecture: by name.
-        network: of it, or its class.
-        spec: the model, for messages.
-    """
+    """Return which of `NETWORKS` an architecture is of, by its name and a network or its class; a ModelError says what
+    it is otherwise."""
     for kind in NETWORKS:
         if kind.ours(architecture, network):
             return kind
