@@ -8,12 +8,8 @@ from types import FrameType
 
 
 class Interrupts:
-    """A handler of Ctrl-C as Python's own, which counts.
-
-    Attributes:
-        count: signals that have come.
-        ended: whether further ones are only counted, since nothing is left to interrupt.
-    """
+    """A handler of Ctrl-C as Python's own, which counts signals. Once it has `ended` they are only counted, since
+    nothing is left to interrupt."""
 
     def __init__(self) -> None:
         self.count = 0

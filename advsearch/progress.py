@@ -114,14 +114,8 @@ def in_notebook() -> bool:
 
 
 class LineProgress:
-    """Plain lines: what a stage is once it has lasted `PATIENCE` seconds, then how far it is every `LINE_INTERVAL`
-    seconds or more; messages at once.
-
-    Args:
-        stream: where they go.
-        clock: seconds, growing.
-        written: writes the settings that a text names as whoever reads it does.
-    """
+    """Plain lines on a stream: what a stage is once it has lasted `PATIENCE` seconds, then how far it is every
+    `LINE_INTERVAL` seconds or more; messages at once. `written` is as for `BarProgress`."""
 
     def __init__(
         self, stream: IO[str], clock: Callable[[], float] = time.monotonic, written: Callable[[str], str] = str
@@ -165,12 +159,8 @@ class LineProgress:
 
 
 class BarProgress:
-    """One bar for each stage, with the time that it took and what is left; the last `MOST_BARS` are shown.
-
-    Args:
-        bars: of rich, started.
-        written: writes the settings that a text names as whoever reads it does.
-    """
+    """One bar for each stage, in bars of rich that are started, with the time that it took and what is left; the last
+    `MOST_BARS` are shown. `written` writes the settings that a text names as whoever reads it does."""
 
     def __init__(self, bars: Bars, written: Callable[[str], str] = str) -> None:
         self._bars, self._written = bars, written

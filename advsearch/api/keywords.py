@@ -158,11 +158,8 @@ LOADED = (Scene, Model, nn.Module)
 
 
 class _Signature(inspect.Signature):
-    """A signature with all settings, for editors, which `help` writes without them: it lists them below.
-
-    Attributes:
-        short: the same with `**settings` in their place.
-    """
+    """A signature with all settings, for editors; `help` writes the `short` one, with `**settings` in their place: it
+    lists them below."""
 
     __slots__ = ("short",)
     short: Any

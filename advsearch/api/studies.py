@@ -73,14 +73,8 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class StudyAttack:
-    """One attack of a study.
-
-    Attributes:
-        config: what the attack is carried out with.
-        name: of its folder.
-        of: what tells it from the others: an object, a control of it, or a model.
-        epsilon: that of a curve; None where there is one for all.
-    """
+    """One attack of a study: what it is carried out with, the name of its folder, and what tells it from the others: an
+    object, a control of it, or a model. The epsilon is that of a curve, or None."""
 
     config: AttackConfig
     name: str
@@ -261,13 +255,8 @@ def _label_for_all(config: AttackConfig) -> list[str]:
 class StudyRun:
     """Carries out attacks, each in a folder of its own, unless they are done already; first on workers, if asked to.
 
-    Attributes:
-        chains: all that there are.
-        run: of the study.
-        progress: told how far it is.
-        names: of the parts so far.
-        warnings: what they said, each sentence once.
-        interrupted: whether one was; nothing more is carried out then.
+    `chains` are all that there are, `names` are of those so far, and `warnings` what they said, each sentence once.
+    After an interrupt nothing more is carried out.
     """
 
     def __init__(self, config: AttackConfig, run: RunDirectory, progress: Progress) -> None:

@@ -51,15 +51,8 @@ _NO_FIX_NEEDED = ""
 
 @dataclass(frozen=True)
 class Component:
-    """One part of the installation.
-
-    Attributes:
-        name: what it is.
-        version: its version; empty where there is none to tell.
-        status: ok, warning, missing or broken.
-        detail: what was tried or found.
-        fix: what to type or do; empty when nothing has to be done.
-    """
+    """One part of the installation: its version ("" where there is none to tell), a status (ok, warning, missing or
+    broken), what was tried or found, and what to type or do ("" when nothing has to be done)."""
 
     name: str
     version: str

@@ -53,12 +53,8 @@ def _escape(sign: str) -> str:
 
 
 class Screen:
-    """A text stream that prints text `escaped`. All but writing is the stream's own.
-
-    Args:
-        stream: where it goes.
-        needed: whether a failure to write is an error; what goes to standard error is dropped then.
-    """
+    """A text stream that prints text `escaped`. All but writing is the stream's own. Unless it is `needed`, what cannot
+    be written is dropped."""
 
     def __init__(self, stream: TextIO, *, needed: bool) -> None:
         self.stream = stream
@@ -312,10 +308,7 @@ class LoadingProgress:
     """A watcher that raises an interrupt which came while something was loaded, when that stage ends.
 
     Modules that are being imported and native code make other errors of an interrupt, or none. After `LOADING_STAGES`
-    all that catches one is ours and answers it.
-
-    Args:
-        progress: is told everything.
+    all that catches one is ours and answers it. Everything is told to `progress`.
     """
 
     def __init__(self, progress: Progress) -> None:

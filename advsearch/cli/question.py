@@ -40,14 +40,8 @@ class Command:
 
 @dataclass(frozen=True)
 class Positional:
-    """How a setting is given without its flag.
-
-    Attributes:
-        metavar: what the help calls it.
-        expected: what is missing where neither is given.
-        more: what the help says of it.
-        several: whether there may be more than one.
-    """
+    """How a setting is given without its flag: what the help calls it and says of it, what is missing where neither is
+    given, and whether there may be several."""
 
     metavar: str
     expected: str

@@ -352,12 +352,8 @@ class ContentsControl(NumberControl):
 
 
 class BoundContents(BoundNumbers):
-    """A filled vessel: coordinates are cuts of a stick, values are proportions.
-
-    Args:
-        control: the control.
-        bound: the same, bound as plain numbers.
-    """
+    """A filled vessel: coordinates are cuts of a stick, values are proportions. `bound` is the control, bound as plain
+    numbers."""
 
     control: ContentsControl
 

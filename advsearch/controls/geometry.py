@@ -201,11 +201,8 @@ def _without_rotation(points: Doubles, functions: Doubles, mass: Doubles, energy
 
 
 class Preconditioner:
-    """Spreads pushes over the neighbourhood and takes rigid motions out: `d = R (I + lambda L)^-2 p`.
-
-    Args:
-        solid: the welded mesh.
-    """
+    """Spreads pushes over the neighbourhood of a welded mesh and takes rigid motions out: `d = R (I + lambda L)^-2
+    p`."""
 
     def __init__(self, solid: Body) -> None:
         count = len(solid.places)

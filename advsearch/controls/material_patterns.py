@@ -29,14 +29,8 @@ BLEND = 20.0
 
 @dataclass(frozen=True)
 class Pattern:
-    """A named material.
-
-    Attributes:
-        name: the word for it.
-        size: side of one tile in object sizes.
-        material: the surface beside its colour.
-        paint: draws the tile: (SIDE, SIDE, 3) display-referred sRGB, any overshoot clipped later.
-    """
+    """A named material: the side of a tile in object sizes, the surface beside its colour, and what draws the tile:
+    (SIDE, SIDE, 3) display-referred sRGB, any overshoot clipped later."""
 
     name: str
     size: float

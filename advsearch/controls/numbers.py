@@ -247,11 +247,8 @@ class Slot:
 
 
 class BoundNumbers(BoundControl):
-    """A `NumberControl` in a scene.
-
-    Attributes:
-        slots: each parameter with what it is set to, in the order of its coordinates.
-    """
+    """A `NumberControl` in a scene. `slots` has each parameter with what it is set to, in the order of its
+    coordinates."""
 
     def __init__(self, control: NumberControl, scene: SceneDescription, slots: tuple[Slot, ...]) -> None:
         self.control = control

@@ -71,13 +71,7 @@ class Spot:
 
 
 class Sticker:
-    """Paints a patch into the object's base-colour map.
-
-    Args:
-        scene: the scene.
-        resting: the numbers at the start.
-        side: of the patch in pixels.
-    """
+    """Paints a patch of `side` pixels into the object's base-colour map; the resting numbers are those at the start."""
 
     def __init__(self, scene: SceneDescription, resting: Mapping[str, float], side: int) -> None:
         mesh = scene.object.mesh

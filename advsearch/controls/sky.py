@@ -89,11 +89,7 @@ def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
 
 
 class Sky:
-    """Sky maps over one ground.
-
-    Args:
-        ground: (3,) linear reflectance of the ground, in [0, 1]; its device is the maps'.
-    """
+    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1]; its device is the maps'."""
 
     def __init__(self, ground: Tensor) -> None:
         self.ground = ground

@@ -257,16 +257,9 @@ def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter
 
 
 class BoundTexture(BoundControl):
-    """The base-colour map of one mesh.
-
-    Args:
-        name: the instance's name.
-        on: name of the mesh.
-        original: (h, w, 3) float32 display-referred sRGB in [0, 1].
-        painter: maps u to the texels that are painted.
-        where: (h, w) bool, which these are; None for all.
-        materials: whose they are, in words.
-    """
+    """The base-colour map of one mesh: the original (h, w, 3) float32 display-referred sRGB in [0, 1], of which a
+    painter paints the texels where `where` (h, w) says, or all. `on` is the mesh, and `materials` says whose they
+    are."""
 
     def __init__(
         self, name: str, on: str, original: Tensor, painter: Painter, where: Mask | None = None, materials: str = ""

@@ -177,15 +177,9 @@ CLOSE = 1e-6
 
 @dataclass(frozen=True)
 class Moved:
-    """A value of the clean scene that a control leaves out, although nobody asked for it.
-
-    Attributes:
-        control: the instance's name.
-        parameter: how it is addressed: ``pose.yaw``, ``ground.size``, ``environment``.
-        unit: of the values; "name" for names.
-        scene: the value of the scene as it was described.
-        used: the value that the clean scene has instead.
-    """
+    """A value of the clean scene that a control leaves out, although nobody asked for it: that of a parameter
+    (``pose.yaw``, ``ground.size``, ``environment``), in a unit ("name" of names), as the scene described it, and the
+    one that is used instead."""
 
     control: str
     parameter: str

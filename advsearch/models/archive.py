@@ -40,13 +40,8 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 @dataclass(frozen=True, eq=False)
 class Archive:
-    """An open archive that has passed the checks. Made by `open_archive`.
-
-    Args:
-        path: of the file, for messages.
-        zip: the open zip file.
-        members: each member by its name without the root folder.
-    """
+    """An open archive that has passed the checks, with its members by name without the root folder. Made by
+    `open_archive`."""
 
     path: Path
     zip: zipfile.ZipFile

@@ -184,11 +184,7 @@ OLDEST = (1, 24)
 
 class OnnxNetwork(nn.Module):
     """A session of onnxruntime as a function from a batch of images to its outputs; no gradient goes through it.
-
-    Args:
-        session: the session.
-        new_options: makes options of a run, by which it can be ended.
-    """
+    `new_options` makes options of a run, by which it can be ended."""
 
     def __init__(self, session: Any, new_options: Callable[[], Any]) -> None:
         super().__init__()

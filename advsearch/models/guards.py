@@ -93,14 +93,8 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Switches:
-    """The state of torch's switches.
-
-    Attributes:
-        dtype, device: of new tensors.
-        gradients: whether operations are recorded, in this thread.
-        deterministic: 0, 1 where operations that are not deterministic warn, 2 where they raise.
-        anomalies: whether NaN in a derivative raises.
-    """
+    """The state of torch's switches: dtype and device of new tensors, whether this thread records gradients, whether
+    operations that are not deterministic warn (1) or raise (2), and whether NaN in a derivative does."""
 
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU

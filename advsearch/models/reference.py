@@ -166,12 +166,8 @@ def network(folder: Path | None = None, weights: Path | None = None) -> tuple[Re
 
 @dataclass(frozen=True, eq=False)
 class Trainable:
-    """A network that is trained, and what asks it.
-
-    Attributes:
-        net: a copy of the model's network; the parameters that are trained collect gradients.
-        model: asks the same weights, in evaluation mode, without their gradients.
-    """
+    """A copy of a model's network, whose trained parameters collect gradients, and a model that asks the same weights,
+    in evaluation mode, without their gradients."""
 
     net: nn.Module
     model: Model

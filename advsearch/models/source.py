@@ -37,14 +37,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a network is to be asked.
-
-    Args:
-        task: by name.
-        names: of the classes, as the user gave them; None if they did not.
-        prompts: the texts that the user gave; None if they gave none.
-        tokens: the most that a free answer has.
-    """
+    """What a network is to be asked: the task's name, what its user gave as names of classes and as texts (None if they
+    did not), and the most tokens of a free answer."""
 
     task: str = "classification"
     names: tuple[str, ...] | None = None

@@ -250,13 +250,8 @@ ROWS = 2
 
 @dataclass(frozen=True, eq=False)
 class MapView:
-    """What a camera sees of an object.
-
-    Attributes:
-        title: where the camera stands.
-        cells: (H, W) number of the cell in each pixel, row by row of the map; -1 beside the object.
-        normal: (H, W, 3) unit normals, world space.
-    """
+    """What a camera sees of an object: the number of the cell in each pixel (H, W), row by row of the map, -1 beside
+    the object, and unit normals (H, W, 3) in world space. The title says where it stands."""
 
     title: str
     cells: npt.NDArray[np.int64]

@@ -186,13 +186,8 @@ STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Curve:
-    """The objective of one policy, evaluation by evaluation.
-
-    Attributes:
-        name: what the legend calls it.
-        kind: `search` or `baseline`; also the variable of the style sheet that has its colour.
-        values: objective of each evaluation in order; None where it was not a number.
-    """
+    """The objective of one policy, evaluation by evaluation; None where it was not a number. The name is for the
+    legend; `search` or `baseline` is also the variable of the style sheet that has its colour."""
 
     name: str
     kind: str

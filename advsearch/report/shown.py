@@ -97,15 +97,9 @@ class AnswerPart:
 
 @dataclass(frozen=True)
 class ShownAnswer:
-    """An answer.
-
-    Attributes:
-        said: what a reader should know first, in a sentence or two.
-        sections: what else there is.
-        facts: what it was done with, by name; beside what all questions have: environment, renders, time and seed.
-        cautions: what has to be known beside the warnings.
-        about: what it is of, in a few names; empty: the object, the controls and the model.
-    """
+    """An answer: what a reader should know first, in a sentence or two, the other sections, and by name what it was
+    done with, beside what all questions have (environment, renders, time and seed). Cautions have to be known beside
+    the warnings; `about` is what it is of, in a few names, and empty: the object, the controls and the model."""
 
     said: str
     sections: Sequence[AnswerPart] = ()

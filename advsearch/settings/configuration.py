@@ -86,13 +86,8 @@ def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
 
 
 class Clash(NamedTuple):
-    """A setting that says nothing, or the opposite of another one, beside others.
-
-    Attributes:
-        setting: its field. It counts as given where it differs from its default.
-        with_others: whether the others of a configuration are such.
-        why: what is wrong, and what to do; completes "setting: ...".
-    """
+    """A setting, by its field, that says nothing, or the opposite of another one, `with_others` that are such. It
+    counts as given where it differs from its default; `why` completes "setting: ..." and says what to do."""
 
     setting: str
     with_others: Callable[[Any], object]
@@ -234,11 +229,8 @@ FILES = (
 
 
 class SettingsError(InputError):
-    """One or more settings have values that are not allowed.
-
-    Attributes:
-        problems: pairs of a setting's name and what is wrong with it.
-    """
+    """One or more settings have values that are not allowed: `problems` are pairs of a setting's name and what is wrong
+    with it."""
 
     def __init__(self, problems: tuple[tuple[str, str], ...], file: str | Path = "") -> None:
         where = f"{file}: " if file else ""

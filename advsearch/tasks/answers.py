@@ -26,13 +26,8 @@ MOST = 256
 
 
 class Utterance(TypedDict):
-    """What a model says of one picture.
-
-    Attributes:
-        text: in words.
-        logits: (T, tokens) float32, of all that it could have said at each step; it took the largest.
-        begins: from a word to the numbers of the tokens that may begin it; empty where none does.
-    """
+    """What a model says of one picture: the text, logits (T, tokens) float32 of all that it could have said at each
+    step, of which it took the largest, and from a word to the tokens that may begin it, where any does."""
 
     text: str
     logits: Tensor

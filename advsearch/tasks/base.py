@@ -33,13 +33,8 @@ Own = TypeVar("Own", bound="Task")
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer of a model to a picture.
-
-    Attributes:
-        label: in words.
-        index: its number among the model's classes; None where there are no classes.
-        probability: in [0, 1]; None where the model gives none.
-    """
+    """One answer of a model to a picture: a label in words, its number among the model's classes, where there are any,
+    and a probability, where the model gives one."""
 
     label: str
     index: int | None = None
@@ -112,13 +107,8 @@ class Mark:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the camera sees first through the middle of each pixel of a picture, without noise.
-
-    Attributes:
-        mask: (H, W) bool, where it is the object.
-        depth: (H, W) float, how far it is, see `Facts.depth`.
-        z_depth: (H, W) float, see `Facts.z_depth`.
-    """
+    """What the camera sees first through the middle of each pixel of a picture, without noise: where it is the object,
+    (H, W) bool, and how far it is, (H, W) float, as in `Facts.depth` and in `Facts.z_depth`."""
 
     mask: Tensor
     depth: Tensor

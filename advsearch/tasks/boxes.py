@@ -101,13 +101,9 @@ def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Place:
-    """What is to be found in a picture: the truth of detection.
-
-    Attributes:
-        labels: indices of the right classes.
-        box: smallest box round what is seen of the object, x0, y0, x1, y1 in pixels; None where nothing is.
-        size: (height, width) of the picture in pixels.
-    """
+    """What is to be found in a picture, the truth of detection: indices of the right classes, and the smallest box
+    round what is seen of the object, x0, y0, x1, y1 in pixels, or None. Size: (height, width) of the picture in
+    pixels."""
 
     labels: Labels
     box: tuple[int, int, int, int] | None
@@ -228,13 +224,8 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Reading:
-    """How boxes are read.
-
-    Attributes:
-        form: one of `FORMS`.
-        unit: one of `UNITS`.
-        size: (height, width) of the model's input in pixels.
-    """
+    """How boxes are read: in one of `FORMS`, one of `UNITS`, and for a model's input of a size (height, width) in
+    pixels."""
 
     form: str
     unit: str

@@ -65,12 +65,8 @@ Map = Mapping[str, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """What is true of a picture: where the object is seen, and how far everything is.
-
-    Attributes:
-        mask: (H, W) bool, the pixels in which the object is seen.
-        z: (H, W) z-depth in object sizes; infinite where there is nothing.
-    """
+    """What is true of a picture: in which pixels the object is seen, (H, W) bool, and the z-depth of everything in
+    object sizes, (H, W); infinite where there is nothing."""
 
     mask: Tensor
     z: Tensor

@@ -22,12 +22,8 @@ Lead = Callable[[Tensor, Labels], Tensor]
 
 @dataclass(frozen=True)
 class Region:
-    """What is to be segmented in a picture: the truth of segmentation.
-
-    Attributes:
-        labels: indices of the right classes.
-        mask: (H, W) bool, the pixels of the picture in which the object is seen.
-    """
+    """What is to be segmented in a picture, the truth of segmentation: indices of the right classes, and (H, W) bool,
+    the pixels in which the object is seen."""
 
     labels: Labels
     mask: Tensor

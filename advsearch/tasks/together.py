@@ -22,11 +22,7 @@ Outputs = tuple[Any, ...]
 
 @final
 class Ensemble:
-    """Asks several models; what `Model.module` is of `together`.
-
-    Args:
-        models: at least one; each resizes and normalises for itself.
-    """
+    """Asks several models, each of which resizes and normalises for itself; what `Model.module` is of `together`."""
 
     def __init__(self, models: Sequence[Model]) -> None:
         self.models = tuple(models)

@@ -93,14 +93,8 @@ def keep(run: Path, number: int, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class Kept:
-    """The thumbnails that a run has.
-
-    Attributes:
-        run: its folder.
-        models: how many configurations in a row are of one picture.
-        some: whether only some of the pictures were kept.
-        suffix: of the files.
-    """
+    """The thumbnails that a run has, as files with a suffix, each of `models` configurations in a row; only of some of
+    the pictures, if it says so."""
 
     run: Path
     models: int

@@ -134,11 +134,8 @@ def depth_source(loaded: Loaded) -> Source:
 class _DepthMap(nn.Module):
     """A mapping with numbers (N, h, w) under what they are.
 
-    ZoeDepth is shown pictures with a mirrored border, which its processor adds and its post-processing removes.
-
-    Args:
-        network: of transformers.
-        padded: whether its processor adds a border.
+    ZoeDepth is shown pictures with a mirrored border, which its processor adds (`padded`) and its post-processing
+    removes.
     """
 
     def __init__(self, network: Any, padded: bool) -> None:
@@ -198,13 +195,10 @@ def _told(tokenizer: Any, length: int) -> Tensor:
 class _MaskQueries(nn.Module):
     """Logarithms of scores (N, classes, H, W) of each pixel of the input.
 
-    The score of a class is the sum over queries of the probability that it is a query's, times the probability that
-    the pixel is in that one's mask (Cheng et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Sizes are
-    changed where `post_process_semantic_segmentation` of each family changes them.
-
-    Args:
-        network: of transformers.
-        told: the task in tokens, (1, L); None of a network that has one task.
+    The score of a class is the sum over queries of the probability that it is a query's, times the probability that the
+    pixel is in that one's mask (Cheng et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Sizes are
+    changed where `post_process_semantic_segmentation` of each family changes them. A network of several tasks is told
+    its own in tokens (1, L).
     """
 
     told: Tensor | None

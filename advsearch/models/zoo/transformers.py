@@ -25,14 +25,9 @@ from advsearch.models.zoo.library import Loaded, in_pixels, library, processor_o
 
 @dataclass(frozen=True)
 class Family:
-    """Networks of transformers that are loaded and asked alike.
-
-    Args:
-        ours: whether a network is of it, by the name of its architecture (``DeiTForImageClassificationWithTeacher``)
-            and the network or its class.
-        loader: the class of transformers that builds it; "" for the architecture itself.
-        source: makes the model's source of it.
-    """
+    """Networks of transformers that are loaded and asked alike: `ours` tells them by the name of an architecture
+    (``DeiTForImageClassificationWithTeacher``) and the network or its class, a class of transformers builds them (""
+    for the architecture itself), and `source` makes the model's source."""
 
     ours: Callable[[str, Any], bool]
     loader: str

@@ -207,11 +207,7 @@ class _Owl(nn.Module):
     """Boxes (N, patches, 4) in pixels, x0 y0 x1 y1, and scores (N, patches, names) in [0, 1] of each name by itself.
 
     Minderer et al. 2022 (arXiv 2205.06230), section 3: each patch of the picture is one box, compared with the text of
-    each name. The half for texts is left out.
-
-    Args:
-        network: ``OwlViTForObjectDetection`` or ``Owlv2ForObjectDetection``.
-        rows: (names, features), the texts.
+    each name, whose features are the rows. The half of OWL for texts is left out.
     """
 
     rows: Tensor
@@ -245,13 +241,9 @@ def _owl(network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str,
 class _Grounded(nn.Module):
     """Boxes (N, queries, 4) in pixels, x0 y0 x1 y1, and scores (N, queries, names) in [0, 1] of each name by itself.
 
-    Liu et al. 2023 (arXiv 2303.05499), section 3: all names are one text, and a box has a score of each of its tokens.
-    A name's is the largest of its own.
-
-    Args:
-        network: ``GroundingDinoForObjectDetection`` or ``MMGroundingDinoForObjectDetection``.
-        text: (1, L) int64, its tokens.
-        places: (names, most) int64, where in it the tokens of each name are; a shorter one's first is there again.
+    Liu et al. 2023 (arXiv 2303.05499), section 3: all names are one text (1, L) of tokens, and a box has a score of
+    each of its tokens. A name's is the largest of its own, which are at `places` (names, most); a shorter one's first
+    is there again.
     """
 
     text: Tensor
