@@ -16,7 +16,6 @@ class Interrupts:
         self.ended = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Take a signal."""
         self.count += 1
         if not self.ended:
             raise KeyboardInterrupt

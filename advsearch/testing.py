@@ -192,7 +192,6 @@ def _asserted(
 
 
 def _told(result: SuiteResult, one: ClaimAnswer, again: str) -> str:
-    """What a failing test shows."""
     run = Path(result.run or "")
     lines = [f"{one.name}: {one.answer}: {one.reason}", f"  claimed: {one.statement}"]
     lines += [f"  picture: {(run / one.picture).resolve()}"] if one.picture else []

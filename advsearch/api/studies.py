@@ -103,7 +103,6 @@ def chains_of(config: AttackConfig) -> list[Chain]:
 
 
 def _controls_of(config: AttackConfig) -> Chain:
-    """Every object with every control."""
     run_settings.check(config)
     attacks = []
     for place, name in enumerate(different(config.objects, "object")):
@@ -115,7 +114,6 @@ def _controls_of(config: AttackConfig) -> Chain:
 
 
 def _models_of(config: AttackConfig) -> Chain:
-    """Every model, or all of them together."""
     names = different(config.models, "model")
     own = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
     return [

@@ -39,7 +39,6 @@ def _dashboard_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _dashboard(args: argparse.Namespace) -> int:
-    """Serve until Ctrl-C."""
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     runs = [find_run(name) for name in args.runs]
@@ -98,7 +97,6 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _view(args: argparse.Namespace) -> int:
-    """Write the page and say where it is."""
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:
         raise InputError("--bundle: pages of several runs go into a folder; name one, or give one run")

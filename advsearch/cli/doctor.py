@@ -62,7 +62,6 @@ class Component:
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    """Check, print, and return the checks' exit status."""
     print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
     return told(as_json=args.json)
 

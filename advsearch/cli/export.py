@@ -145,7 +145,6 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _export(args: argparse.Namespace) -> int:
-    """Write what was asked for."""
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     endings = {one.ending or format: format for format, one in WRITERS.items()}
@@ -168,7 +167,6 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
-    """Write the rows."""
     otherwise = by_name if by_name in FORMATS else "json" if args.json and out is None else "csv"
     format = args.format or otherwise
     if args.json and out is None and format != "json":

@@ -31,7 +31,6 @@ def _import_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _import(args: argparse.Namespace) -> int:
-    """Print what was understood."""
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
@@ -50,7 +49,6 @@ def _import(args: argparse.Namespace) -> int:
 
 
 def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
-    """Print what was understood of a mesh or glTF file."""
     whole = found.object
     facts = {
         "triangles": len(whole.mesh.faces),
@@ -172,7 +170,6 @@ def _threedb_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _import_threedb(args: argparse.Namespace) -> int:
-    """Write the run and say where it is."""
     from advsearch.engine.sweeps.imported import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)

@@ -168,7 +168,6 @@ def _run(given: list[str]) -> int:
 
 
 def _parse(given: list[str], command: str | None) -> argparse.Namespace:
-    """Return the arguments of a known command."""
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",

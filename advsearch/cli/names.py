@@ -37,7 +37,6 @@ def _list_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _list(args: argparse.Namespace) -> int:
-    """Print the names of one kind, or of all."""
     kinds = list(REGISTRIES) if args.kind == "all" else [args.kind]
     with at_work(as_json=True, quiet=False):
         found = {kind: list_names(kind) for kind in kinds}

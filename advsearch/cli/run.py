@@ -35,7 +35,6 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Read the file, put the changes over it and do what it says."""
     command = command_in(args.file)
     changes = changes_in(args.change)
     if args.run is not None:
@@ -129,7 +128,6 @@ def _runs_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _runs(args: argparse.Namespace) -> int:
-    """Print one line for each run."""
     folder = HOME if args.folder is None else Path(args.folder)
     if args.folder is not None and not os.path.isdir(folder):
         raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")

@@ -194,7 +194,6 @@ def _of_parameter(one: Parameter) -> dict[str, str]:
 
 
 def _of_choice(one: Choice) -> dict[str, str]:
-    """The same of a setting."""
     allowed = ", ".join(one.options)
     if one.whole:
         allowed = f"{one.whole[0]} to {one.whole[1]}"
@@ -204,7 +203,6 @@ def _of_choice(one: Choice) -> dict[str, str]:
 
 
 def _table(declared: Sequence[Mapping[str, str]]) -> str:
-    """Return what was declared as a table."""
     rows = [list(one.values()) for one in declared]
     return output.aligned([list(declared[0]), *rows])
 

@@ -86,7 +86,6 @@ class DerivativeConfig(SceneConfig):
 
 
 def _positive(value: Any) -> float:
-    """A number of an epsilon."""
     try:
         number = float("nan") if isinstance(value, bool) else float(value)
     except (TypeError, OverflowError):

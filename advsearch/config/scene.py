@@ -281,7 +281,6 @@ class SceneConfig(Config):
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
-        """Accept several in a list."""
         several = isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value)
         text = " | ".join(value) if several else value
         if isinstance(text, str) and not all(one.strip() for one in text.split("|")):

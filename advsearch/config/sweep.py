@@ -132,7 +132,6 @@ class SweepConfig(SceneConfig):
     @field_validator("answer_of", mode="before")
     @classmethod
     def _run_as_text(cls, value: Any) -> Any:
-        """Accept a path for a folder."""
         return str(value) if isinstance(value, Path) else value
 
     @field_validator("trials")

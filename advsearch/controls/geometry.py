@@ -156,7 +156,6 @@ def _largest(symmetric: Doubles, count: int) -> tuple[Doubles, Doubles]:
 
 
 def _signed(vectors: Doubles) -> Doubles:
-    """Vectors (N, K) with the sign that makes the largest entry of each positive."""
     largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])]
     return np.asarray(vectors * np.where(largest < 0.0, -1.0, 1.0))
 

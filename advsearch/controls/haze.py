@@ -76,7 +76,6 @@ class HazeControl(NumberControl):
 
 
 def _haze_of(scene: SceneDescription) -> HazePart | None:
-    """The haze that a scene has, if it has one."""
     return next((one for one in scene.parts if isinstance(one, HazePart)), None)
 
 

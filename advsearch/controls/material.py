@@ -98,7 +98,6 @@ class MaterialControl(NumberControl):
 
     @property
     def _names(self) -> tuple[Number, ...]:
-        """The materials that can be chosen."""
         return self.allowed("which", OWN)
 
     def _varies(self, name: str) -> bool:

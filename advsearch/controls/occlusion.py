@@ -397,5 +397,4 @@ def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
 
 
 def _put_away(camera: Tensor) -> Tensor:
-    """A pose (4, 4) behind the camera, very small."""
     return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])

@@ -110,7 +110,6 @@ def _is_list(given: object) -> bool:
 
 
 def _value(where: str, parameter: Parameter, given: object) -> Number:
-    """Check one value."""
     if parameter.options:
         if not isinstance(given, str):
             raise InputError(f"{where}: expected one of {', '.join(parameter.options)}, got {given!r}")

@@ -177,7 +177,6 @@ def _is_code(name: str) -> bool:
 
 
 def _version(archive: Archive) -> int:
-    """Return the version of the operators that the code means."""
     name = "version" if "version" in archive else ".data/version"
     text = archive.read(name, 100).decode("ascii", "replace").strip()
     if not re.fullmatch("[0-9]{1,3}", text):

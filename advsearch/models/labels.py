@@ -114,7 +114,6 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
 
 
 def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> int:
-    """Return the one class index that `term` stands for."""
     explicit = re.fullmatch(r"#\s*(-?\d+)", term)
     if explicit:
         return _checked_index(int(explicit[1]), labels)

@@ -160,7 +160,6 @@ def named_code(spec: str) -> str | None:
 
 
 def _find(spec: object) -> Source | Model:
-    """Return what `spec` names."""
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
@@ -195,7 +194,6 @@ def _by_library(text: str) -> str:
 
 
 def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
-    """Return the source's own preprocessing with the caller's options on top."""
     made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE, processor=found.processor)
     instead = [key for key in ("mean", "std", "value_range", "channels") if found.processor and key in given]
     if instead:

@@ -264,7 +264,6 @@ def _build(value: Any, spec: str) -> nn.Module | Model:
 
 
 def _where(error: BaseException) -> str:
-    """Return a foreign error with the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
     return f"{first_line(error)}{place}"

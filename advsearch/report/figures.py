@@ -132,7 +132,6 @@ def _only_axis(answer: SweepSummary) -> Sequence[AxisRow]:
 
 
 def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
-    """The map of a sweep."""
     first, second = cells.axes
     seen, correct, margin = cells.configurations, cells.correct, cells.margin
     extent = (-0.5, len(first.values) - 0.5, -0.5, len(second.values) - 0.5)
@@ -152,7 +151,6 @@ def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
 
 
 def _along(axes: Any, answer: SweepSummary, rows: Sequence[AxisRow]) -> None:
-    """The accuracy with its interval over one axis."""
     at, accuracy = range(len(rows)), [row.accuracy for row in rows]
     low, high = ([row.interval[end] for row in rows if row.interval] for end in (0, 1))
     axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
@@ -208,7 +206,6 @@ def _written(value: Any) -> str:
 
 
 def _who(answer: SweepSummary) -> str:
-    """Objects and models of a sweep, files without their folders."""
     return ", ".join(short_name(name) for name in (*split_names(answer.object), *split_names(answer.model)))
 
 

@@ -128,7 +128,6 @@ def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
 
 
 def _part(one: AnswerPart) -> Html:
-    """A part of an answer; a folded one has its title as the handle."""
     head = element("thead", element("tr", *(element("th", cell) for cell in one.heads))) if one.heads else None
     body = (element("tr", *(element("td", cell) for cell in row)) for row in one.rows)
     inside = [

@@ -186,13 +186,11 @@ def _rows(value: object) -> Sequence[Fields]:
 
 
 def _columns(rows: Sequence[Fields]) -> list[str]:
-    """The fields that are not empty in every row."""
     names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
     return [name for name in names if any(_text(getattr(row, name, None)) for row in rows)]
 
 
 def _text(value: object) -> str:
-    """A value in a cell."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -212,7 +210,6 @@ def _text(value: object) -> str:
 
 
 def _words(name: str) -> str:
-    """The name of a field as a heading."""
     words = name.replace("_", " ").replace("-", " ")
     return words[:1].upper() + words[1:]
 

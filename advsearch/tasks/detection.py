@@ -344,7 +344,6 @@ class Detection(ClassTask):
 
     @property
     def _least(self) -> float:
-        """The least score of a box that anybody looks at."""
         return min(LEAST, self.confidence)
 
     def _broken(self, one: Detections) -> bool:

@@ -179,7 +179,6 @@ class Together(Task):
         return found
 
     def _each(self, output: Sequence[Outputs], truth: Truths) -> list[tuple[Any, Any, Any]]:
-        """The task, the output and the truth of each model."""
         return list(zip(self.tasks, of_each(output), truth, strict=True))
 
 

@@ -199,8 +199,6 @@ def _boxes(payload: Mapping[str, Any], label: str) -> list[int]:
 
 
 class _Levels:
-    """Names, and where each row's stands among them."""
-
     def __init__(self) -> None:
         self.names: dict[str, int] = {}
         self.places = array("H")

@@ -173,7 +173,6 @@ def _figure(run: Path, name: str, alt: str) -> Html | None:
 
 
 def _links(run: Path, parts: list[str]) -> Html:
-    """The runs that a run consists of, folded."""
     linked = zip(parts, part_links(run, parts), strict=True)
     lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
     return element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines))

@@ -424,7 +424,6 @@ _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
 
 
 def _after(query: Mapping[str, list[str]], otherwise: int) -> int:
-    """Return the id of the row after which rows are asked for."""
     after = query.get("after", [str(otherwise)])[0]
     if not re.fullmatch(r"[0-9]{1,15}", after):
         raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")

@@ -71,7 +71,6 @@ def source(loaded: Loaded) -> Source:
 
 
 def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
-    """Return the classifier of these names, or what answers freely."""
     purpose.check(loaded.name, "goes on in words", "classification", "answer")
     free, names = purpose.task == "answer", purpose.names
     if free and names is not None:
@@ -355,7 +354,6 @@ class _Free(nn.Module):
 
 
 def _ends(network: Any) -> frozenset[int]:
-    """Return the tokens that end an answer."""
     said = network.generation_config.eos_token_id
     return frozenset(said if isinstance(said, (list, tuple)) else [said]) - {None}
 

@@ -163,7 +163,6 @@ def _out_of_reach(name: str) -> bool:
 
 
 def _cached() -> list[str]:
-    """Return the names of the repositories in the hub's cache."""
     cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
     return [one.name.partition("--")[2].replace("--", "/") for one in cache.glob("models--*")]
 

@@ -50,7 +50,6 @@ def check_takes_pictures(network: Any, spec: str) -> None:
 
 
 def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
-    """Return the classifier of these names."""
     names = purpose.named(name, "compares a picture with texts", "classification")
     prompts = patterns(purpose.prompts)
     if len(names) < 2:
@@ -188,7 +187,6 @@ def detector_source(loaded: Loaded) -> Source:
 
 
 def _detector(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
-    """Return the detector of these names."""
     names = purpose.named(name, "finds what it is told to", "detection")
     try:
         with torch.no_grad():
@@ -229,7 +227,6 @@ class _Owl(nn.Module):
 
 
 def _half(network: Any) -> Any:
-    """Return the CLIP in an OWL."""
     return getattr(network, network.base_model_prefix)
 
 
