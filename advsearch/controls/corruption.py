@@ -18,27 +18,8 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
+from advsearch.controls import corruption_filters as filters
 from advsearch.controls.base import Choice, Parameter, Value
-from advsearch.controls.corruption_filters import (
-    LEVELS,
-    REFERENCE,
-    at_level,
-    defocus_blur,
-    elastic,
-    fog,
-    frost,
-    gaussian_blur,
-    gaussian_noise,
-    glass_blur,
-    impulse_noise,
-    motion_blur,
-    picture,
-    planes,
-    shot_noise,
-    snow,
-    speckle_noise,
-    zoom_blur,
-)
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import levels_of
@@ -59,21 +40,21 @@ _GREY = 1.0 / 512.0
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Raise the value, keep hue and saturation."""
-    (more,) = at_level(BRIGHTNESS, level)
+    (more,) = filters.at_level(BRIGHTNESS, level)
     value = image.amax(dim=-1, keepdim=True)
     return image + ((value + more).clamp(max=1.0) - value) * (image + _GREY) / (value + _GREY)
 
 
 def contrast(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pull every value towards its channel's mean."""
-    (factor,) = at_level(CONTRAST, level)
+    (factor,) = filters.at_level(CONTRAST, level)
     mean = image.mean(dim=(0, 1))
     return mean + factor * (image - mean)
 
 
 def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Scale the saturation, keep hue and value; grey stays grey."""
-    factor, more = at_level(SATURATE, level)
+    factor, more = filters.at_level(SATURATE, level)
     value = image.amax(dim=-1, keepdim=True)
     saturation = (value - image.amin(dim=-1, keepdim=True)) / (value + _GREY)
     wanted = (factor * saturation + more).clamp(max=1.0)
@@ -86,10 +67,10 @@ def pixelate(image: Tensor, whole: int) -> Tensor:
     A cell has 1.7 to 4 pixels of a picture of the reference size, more in a larger one, and as many in a smaller one.
     """
     height, width = image.shape[:2]
-    share = PIXELATE[whole - 1] / max(1.0, min(height, width) / REFERENCE)
+    share = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
     cells = (max(1, int(height * share)), max(1, int(width * share)))
-    return picture(
-        F.interpolate(F.interpolate(planes(image), cells, mode="area"), (height, width), mode="nearest-exact")
+    return filters.picture(
+        F.interpolate(F.interpolate(filters.planes(image), cells, mode="area"), (height, width), mode="nearest-exact")
     )
 
 
@@ -119,25 +100,25 @@ def coded(image: Tensor, quality: int) -> Tensor:
 SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
     one.__name__: one
     for one in (
-        gaussian_noise,
-        shot_noise,
-        impulse_noise,
-        speckle_noise,
-        defocus_blur,
-        glass_blur,
-        motion_blur,
-        zoom_blur,
-        gaussian_blur,
-        snow,
-        frost,
-        fog,
+        filters.gaussian_noise,
+        filters.shot_noise,
+        filters.impulse_noise,
+        filters.speckle_noise,
+        filters.defocus_blur,
+        filters.glass_blur,
+        filters.motion_blur,
+        filters.zoom_blur,
+        filters.gaussian_blur,
+        filters.snow,
+        filters.frost,
+        filters.fog,
         brightness,
         contrast,
         saturate,
     )
 }
 """Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity and the seed."""
-FROM_NOTHING: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {"elastic": elastic}
+FROM_NOTHING: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {"elastic": filters.elastic}
 """Corruptions of every severity in [0, 5]: a mix of a warped and an unwarped picture would show the object twice."""
 STEPPED: Mapping[str, Callable[[Tensor, int], Tensor]] = {"pixelate": pixelate, "jpeg": jpeg}
 """Corruptions of whole severities only: of the picture and the severity."""
@@ -156,8 +137,8 @@ class CorruptionControl(NumberControl):
             options=NAMES, estimators=(),
         ),
         Parameter(
-            "severity", (), "1", 0.0, float(LEVELS), 0.0,
-            "How strong it is: 0 is none, 1 to 5 are the published severities.", search=(0.0, float(LEVELS)),
+            "severity", (), "1", 0.0, float(filters.LEVELS), 0.0,
+            "How strong it is: 0 is none, 1 to 5 are the published severities.", search=(0.0, float(filters.LEVELS)),
             estimators=("image",),
         ),
     )  # fmt: skip
@@ -223,6 +204,6 @@ def _stepped(image: Tensor, at: Callable[[Tensor, int], Tensor], severity: Tenso
     out = at(image, whole) if whole else image
     if not severity.requires_grad:
         return out
-    below = min(int(severity.detach()), LEVELS - 1)
+    below = min(int(severity.detach()), filters.LEVELS - 1)
     low, high = at(image, below).detach() if below else image.detach(), at(image, below + 1).detach()
     return out + (severity - severity.detach()) * (high - low)

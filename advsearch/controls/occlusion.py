@@ -25,7 +25,7 @@ from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import InputError
 from advsearch.files import reading
-from advsearch.scene import library
+from advsearch.scene import library, silhouettes
 from advsearch.scene.assets import Material, Mesh, ObjectAsset, normalised
 from advsearch.scene.cameras.model import CameraModel
 from advsearch.scene.description import SceneDescription
@@ -33,16 +33,6 @@ from advsearch.scene.geometry import affine, camera_to_world, object_to_world
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT, moving
-from advsearch.scene.silhouettes import (
-    GRID,
-    RASTER,
-    Frame,
-    Passage,
-    Silhouette,
-    angle_outside,
-    middle_axes,
-    silhouette,
-)
 
 Doubles = npt.NDArray[np.float64]
 _moving = partial(moving, ORBIT)
@@ -241,7 +231,7 @@ class OcclusionControl(NumberControl):
         points = mesh.vertices.astype(np.float64) @ _about_upright(asked["turn"]).T
         size, distance = _fitting(points, asked["size"], asked["distance"] * seen.far, seen.near)
         ahead = np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
-        cover = silhouette(ahead, mesh.faces)
+        cover = silhouettes.silhouette(ahead, mesh.faces)
         if cover is None:
             return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
         return _solved(seen, cover, asked, size, distance)
@@ -277,13 +267,13 @@ class _Seen:
         points = _from_camera(vertices @ pose[:3, :3].T + pose[:3, 3], camera)
         if (model := scene.camera_model) is not None:
             model = model.with_numbers(so_far["camera.lens"].detach().cpu()) if "camera.lens" in so_far else model
-            shown = rim = _looked(model, (0.0, 1.0), (0.0, 1.0), GRID)
+            shown = rim = _looked(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
             directions = _through(model, points, mesh.faces)
         else:
             fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
             shift = _numpy(so_far, "camera.shift", np.zeros(2))
-            frame = Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
-            found = silhouette(points, mesh.faces, frame)
+            frame = silhouettes.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
+            found = silhouettes.silhouette(points, mesh.faces, frame)
             shown, rim = frame.spread(), frame.corners()
             directions = None if found is None else found.directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
@@ -294,8 +284,8 @@ class _Seen:
 def _through(model: CameraModel, points: Doubles, faces: npt.NDArray[np.uint32]) -> Doubles | None:
     """Unit directions (N, 3) in which a mesh, with vertices (V, 3) in camera coordinates, is seen through a lens, each
     for the same area of the picture, or None."""
-    axes = middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
-    cover = silhouette(points @ axes.T, faces)
+    axes = silhouettes.middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
+    cover = silhouettes.silhouette(points @ axes.T, faces)
     if cover is None:
         return None
     places, seen = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
@@ -304,7 +294,7 @@ def _through(model: CameraModel, points: Doubles, faces: npt.NDArray[np.uint32])
         if bool(seen.all())
         else ((0.0, 0.0), (1.0, 1.0))
     )
-    looked = _looked(model, (left, right), (top, bottom), RASTER)
+    looked = _looked(model, (left, right), (top, bottom), silhouettes.RASTER)
     hidden = looked[cover.contains(*(looked @ axes.T).T)]
     return hidden if len(hidden) else None
 
@@ -334,12 +324,14 @@ def _from_camera(world: Doubles, camera: Doubles) -> Doubles:
 # ---- where the occluder goes ----------------------------------------------------------------------------------------
 
 
-def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: float, distance: float) -> Placement:
+def _solved(
+    seen: _Seen, cover: silhouettes.Silhouette, asked: Mapping[str, float], size: float, distance: float
+) -> Placement:
     """Find the angle at which the wanted share is hidden."""
     assert seen.directions is not None
-    axes = middle_axes(seen.directions)
-    sweep = Passage(seen.directions, cover, axes, asked["direction"])
-    outside = angle_outside(seen.shown, seen.rim, cover, axes, asked["direction"])
+    axes = silhouettes.middle_axes(seen.directions)
+    sweep = silhouettes.Passage(seen.directions, cover, axes, asked["direction"])
+    outside = silhouettes.angle_outside(seen.shown, seen.rim, cover, axes, asked["direction"])
     angle = sweep.solve(max(asked["coverage"], EASE), outside)
     if asked["coverage"] < EASE:
         angle = outside + (angle - outside) * asked["coverage"] / EASE

@@ -16,19 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError,
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.files import JsonObject
-from advsearch.settings.values import (
-    HEADER,
-    NAMED,
-    SCHEMA,
-    all_finite,
-    as_python,
-    is_file,
-    is_shallow,
-    put,
-    read_yaml,
-    shown,
-    split_names,
-)
+from advsearch.settings import values as written
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -198,7 +186,7 @@ def as_flags(setting: Setting, value: Any) -> list[str]:
     if setting.field == "epsilon" and isinstance(value, (dict, tuple)):
         pairs = [f"{name}={_number(given)}" for name, given in value.items()] if isinstance(value, dict) else value
         return [setting.flag, ",".join(str(one) for one in pairs)]
-    if setting.field in NAMED and isinstance(value, dict):
+    if setting.field in written.NAMED and isinstance(value, dict):
         options = {name: given for name, given in value.items() if name != "name"}
         return [setting.flag, f"{value['name']}={_flow(options)}"]
     if setting.field == "resolution":
@@ -260,11 +248,11 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     def __init__(self, **data: Any) -> None:
-        deep = {name: value for name, value in data.items() if not is_shallow(value)}
+        deep = {name: value for name, value in data.items() if not written.is_shallow(value)}
         if deep:
             raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
         try:
-            super().__init__(**as_python(data))
+            super().__init__(**written.as_python(data))
         except ValidationError as error:
             raise _settings_error(type(self), error.errors(include_url=False)) from None
 
@@ -280,7 +268,7 @@ class Config(BaseModel):
     @classmethod
     def _finite(cls, value: Any) -> Any:
         """Refuse NaN and infinity however deep they are, and whole numbers that no machine has."""
-        if not all_finite(value):
+        if not written.all_finite(value):
             raise ValueError("not finite")
         return value
 
@@ -310,10 +298,10 @@ class Config(BaseModel):
             FileFormatError: the file is missing, empty or not such a mapping.
             InputError: as for the class; the message names the file.
         """
-        data = {name: value for name, value in read_yaml(path).items() if name not in ("schema", "command")}
+        data = {name: value for name, value in written.read_yaml(path).items() if name not in ("schema", "command")}
         data = cls.of_this_version(data)
         for name, value in (overrides or {}).items():
-            put(data, name, value)
+            written.put(data, name, value)
         try:
             return cls(**data)
         except SettingsError as error:
@@ -358,9 +346,9 @@ class Config(BaseModel):
 
     def to_yaml(self) -> str:
         """Return the YAML form; `from_yaml` of it gives an equal configuration."""
-        data = {"schema": SCHEMA, "command": self.command, **self.plain()}
+        data = {"schema": written.SCHEMA, "command": self.command, **self.plain()}
         note = f"# But it can't be: {self._in_words()}\n" if self._only_here else ""
-        return HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
+        return written.HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
 
     def plain(self) -> JsonObject:
         """Return every setting by the name it has in YAML, as JSON values."""
@@ -387,7 +375,7 @@ class Config(BaseModel):
         given = {name: value for name, value in self.plain().items() if name not in self.free}
         for name in FILES:
             if isinstance(value := given.get(name), str):
-                given[name] = ",".join(Path(part).name for part in split_names(value))
+                given[name] = ",".join(Path(part).name for part in written.split_names(value))
         return given
 
     def command_line(self) -> str:
@@ -406,7 +394,7 @@ class Config(BaseModel):
 
     def _in_words(self) -> str:
         """What only this Python session has, in a sentence."""
-        *first, last = map(shown, self._only_here)
+        *first, last = map(written.shown, self._only_here)
         listed = f"{', '.join(first)} and {last}" if first else last
         return f"{listed} {'exist' if first else 'exists'} only in the Python session that asked."
 
@@ -420,7 +408,7 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
         name = str(error["loc"][0])
         if name not in known:
             return UnknownNameError("setting", name, {one.name for one in declared})
-        got = "nothing" if error["type"] == "missing" else shown(error["input"])
+        got = "nothing" if error["type"] == "missing" else written.shown(error["input"])
         if known[name].form in ("assignments", "controls") and len(error["loc"]) > 1:
             got = f"{error['loc'][1]}={got}"
         problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
@@ -429,10 +417,10 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
 
 def _absolute(value: str | None) -> str | None:
     """Return the absolute path of `value` where it is a file, and the name it is otherwise; of a list, each part."""
-    return None if value is None else ",".join(map(_absolute_file, split_names(value)))
+    return None if value is None else ",".join(map(_absolute_file, written.split_names(value)))
 
 
 def _absolute_file(name: str) -> str:
-    path, mark, part = (name, "", "") if is_file(name) else name.partition("#")
-    is_path = ("/" in path or Path(path).suffix != "") and is_file(path)
+    path, mark, part = (name, "", "") if written.is_file(name) else name.partition("#")
+    is_path = ("/" in path or Path(path).suffix != "") and written.is_file(path)
     return f"{Path(path).resolve()}{mark}{part}" if is_path else name

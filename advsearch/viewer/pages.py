@@ -22,19 +22,8 @@ from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
+from advsearch.viewer import document
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.document import (
-    again,
-    data_script,
-    data_url,
-    document,
-    facts_table,
-    heading,
-    part_links,
-    scrolled,
-    study_table,
-    subject_html,
-)
 from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, write_sweep_page
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
@@ -65,7 +54,7 @@ def object_section(data: bytes) -> Html | None:
 
 def object_data(data: bytes) -> list[Html]:
     """Return the script that holds the object, if there is one."""
-    return [data_script(base64.b64encode(data).decode("ascii"), "object-file")] if data else []
+    return [document.data_script(base64.b64encode(data).decode("ascii"), "object-file")] if data else []
 
 
 def _header(data: bytes) -> dict[str, dict[str, object]]:
@@ -106,13 +95,13 @@ def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
         *([] if drawn else _figures(run, given.said)),
         *(_section(run, one, given.said) for one in given.sections if one.only in ("", "page") and not one.empty),
         _links(run, parts) if parts and all(isinstance(one, str) for one in parts) else None,
-        join_html(element("h2", "Cost and conditions"), facts_table(facts)),
-        again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
+        join_html(element("h2", "Cost and conditions"), document.facts_table(facts)),
+        document.again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
     )
     subject = subject_of(result, given)
-    what = join_html(result.command, "; " if subject else None, subject_html(*(("", one) for one in subject)))
-    header = heading(what, given.said, remarks_of(result, given))
-    return document(
+    what = join_html(result.command, "; " if subject else None, document.subject_html(*(("", one) for one in subject)))
+    header = document.heading(what, given.said, remarks_of(result, given))
+    return document.document(
         f"{run.name}, {result.command}", header, main, footer=f"run {run.name}. This page needs no other file."
     )
 
@@ -130,11 +119,15 @@ def _section(run: Path, one: AnswerPart, said: str) -> Html:
     if one.draw is not None:
         words = " ".join([f"{one.title}.", *(one.text or [said])])
         chart = element("div", *(study_chart(one.draw, words, width, one.height) for width in (WIDE, NARROW)))
-    table = study_table(one.heads, one.rows, part_links(run, one.parts), one.shares) if one.heads else None
+    table = (
+        document.study_table(one.heads, one.rows, document.part_links(run, one.parts), one.shares)
+        if one.heads
+        else None
+    )
     inside = join_html(
         *(element("p", text) for text in one.text if text and one.draw is None),
         chart or _figure(run, one.figure, " ".join(one.text) or one.title),
-        (table or facts_table({row[0]: row[1] for row in one.rows})) if one.rows else None,
+        (table or document.facts_table({row[0]: row[1] for row in one.rows})) if one.rows else None,
         *(_pictures(run, group) for group in one.pictures),
         element("p", one.note, class_="soft") if one.note else None,
     )
@@ -148,7 +141,7 @@ def _pictures(run: Path, group: Iterable[Picture]) -> Html | None:
     figures = [
         element(
             "figure",
-            element("img", src=data_url(file.read_bytes(), KINDS[file.suffix.lower()]), alt=one.caption),
+            element("img", src=document.data_url(file.read_bytes(), KINDS[file.suffix.lower()]), alt=one.caption),
             element("figcaption", one.caption),
         )
         for one in group
@@ -168,12 +161,12 @@ def _figure(run: Path, name: str, alt: str) -> Html | None:
     file = kept(run, name) if name else None
     if file is None:
         return None
-    picture = element("img", src=data_url(file.read_bytes(), "image/png"), alt=alt)
-    return element("figure", scrolled(picture, "wide"), class_="wide")
+    picture = element("img", src=document.data_url(file.read_bytes(), "image/png"), alt=alt)
+    return element("figure", document.scrolled(picture, "wide"), class_="wide")
 
 
 def _links(run: Path, parts: list[str]) -> Html:
-    linked = zip(parts, part_links(run, parts), strict=True)
+    linked = zip(parts, document.part_links(run, parts), strict=True)
     lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
     return element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines))
 

@@ -17,20 +17,9 @@ from pathlib import Path
 
 from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.report import wording
+from advsearch.report import sweeps, wording
 from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
 from advsearch.report.phrases import answer_text, beside_text, is_command, percent
-from advsearch.report.sweeps import (
-    DRIVE_HEADS,
-    difference_text,
-    distance_axes,
-    distance_of,
-    distance_sentence,
-    drive_rows,
-    drive_title,
-    surface_sentences,
-    wrong_text,
-)
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
@@ -226,13 +215,13 @@ def _drives(path: Path, summary: SweepSummary) -> Html:
     """What is said of whole drives, where frames of a path were swept, with frames of the worst one."""
     if not summary.drives:
         return Html("")
-    said = f"Frames of the worst drive, {drive_title(summary.drives[0])}, from the first to the last"
+    said = f"Frames of the worst drive, {sweeps.drive_title(summary.drives[0])}, from the first to the last"
     figure = _figure(path / "images" / "drive.png", said, wide=True)
     return join_html(
         element("h2", "Whole drives"),
         element("div", figure, class_="pictures") if figure else None,
         *(
-            join_html(element("p", drive_title(one)), study_table(DRIVE_HEADS, drive_rows(one)))
+            join_html(element("p", sweeps.drive_title(one)), study_table(sweeps.DRIVE_HEADS, sweeps.drive_rows(one)))
             for one in summary.drives
         ),
     )
@@ -240,11 +229,11 @@ def _drives(path: Path, summary: SweepSummary) -> Html:
 
 def _distance(summary: SweepSummary) -> Html:
     """How far away the object is seen, where the sweep of a detector tells."""
-    found = distance_of(summary)
+    found = sweeps.distance_of(summary)
     if found is None:
         return Html("")
-    said = distance_sentence(found)
-    charts = [study_chart(partial(distance_axes, found), said, width) for width in (WIDE, NARROW)]
+    said = sweeps.distance_sentence(found)
+    charts = [study_chart(partial(sweeps.distance_axes, found), said, width) for width in (WIDE, NARROW)]
     return join_html(element("h2", "How far away it is seen"), element("p", said), *charts)
 
 
@@ -252,7 +241,7 @@ def _surface(path: Path, summary: SweepSummary) -> Html:
     """Which parts of the surface go with wrong answers, where that was asked for."""
     if summary.surface is None:
         return Html("")
-    said = surface_sentences(summary.surface)
+    said = sweeps.surface_sentences(summary.surface)
     figure = _figure(path / "images" / "surface.png", " ".join(said), wide=True)
     tables = [_parts(one) for one in summary.surface.tables if one.strongest]
     return join_html(
@@ -270,9 +259,9 @@ def _parts(told: SurfaceTable) -> Html:
             f"{one.u:.3f}, {one.v:.3f}",
             ", ".join(f"{x:.3g}" for x in one.place),
             str(one.face),
-            wrong_text(one.seen),
-            wrong_text(one.hidden),
-            difference_text(one),
+            sweeps.wrong_text(one.seen),
+            sweeps.wrong_text(one.hidden),
+            sweeps.difference_text(one),
             f"{one.p:.2g}",
         )
         for one in told.strongest
