@@ -98,28 +98,26 @@ def chains_of(config: AttackConfig) -> list[Chain]:
         InputError: a setting that none of the controls takes, or a name comes twice.
     """
     if config.command == "gap":
-        return [[one] for one in _controls_of(config)]
-    return [[one] for one in _models_of(config)] if config.is_matrix else _objects_of(config)
+        return _controls_of(config)
+    if not config.is_matrix:
+        return _objects_of(config)
+    names = different(config.models, "model")
+    own = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
+    return [
+        [StudyAttack(AttackConfig.of(config, **more), f"{place:02d}-" + default_name(name, []), name)]
+        for place, (name, more) in enumerate(own)
+    ]
 
 
-def _controls_of(config: AttackConfig) -> Chain:
+def _controls_of(config: AttackConfig) -> list[Chain]:
     run_settings.check(config)
     attacks = []
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
             own = run_settings.alone(config, control, settings)
             one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
-            attacks.append(StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control))
+            attacks.append([StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control)])
     return attacks
-
-
-def _models_of(config: AttackConfig) -> Chain:
-    names = different(config.models, "model")
-    own = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
-    return [
-        StudyAttack(AttackConfig.of(config, **more), f"{place:02d}-" + default_name(name, []), name)
-        for place, (name, more) in enumerate(own)
-    ]
 
 
 def _objects_of(config: AttackConfig) -> list[Chain]:

@@ -125,7 +125,8 @@ def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
     for name in ("numpy", "torch", "mitsuba", "drjit", "render", "mitsuba-oidn", *_SMALL_PACKAGES):
         version = "" if name == "render" else installed_version(name)
         if version is None:
-            yield _absent(name)
+            status, why = (WARNING, f": {OPTIONAL[name]}") if name in OPTIONAL else (MISSING, "")
+            yield Component(name, "", status, f"not installed{why}", _reinstall(name))
         elif name in ("mitsuba", "drjit"):
             yield Component(name, version, OK, "tried by the render below")
         else:
@@ -153,12 +154,6 @@ def installed_version(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _absent(name: str) -> Component:
-    if name in OPTIONAL:
-        return Component(name, "", WARNING, f"not installed: {OPTIONAL[name]}", _reinstall(name))
-    return Component(name, "", MISSING, "not installed", _reinstall(name))
 
 
 def _tried(name: str, version: str, tried: dict[str, tuple[bool, str]]) -> Component:

@@ -224,7 +224,11 @@ def recoloured(original: Tensor, centres: Tensor, budget: Budget) -> Painter:
     """Return a few colours, from which each texel of the original (n, 3) sRGB takes its change by how much it resembles
     them: within a ball around the original's palette, the centres (k, 3)."""
     squared = (original[..., None, :] - centres).square().sum(dim=-1)
-    weights = torch.softmax(-squared / (2.0 * _spread(centres) ** 2), dim=-1)
+    spread = 1.0  # over which a colour's influence falls off: half the mean distance to the nearest other one
+    if len(centres) > 1:
+        apart = torch.cdist(centres, centres) + torch.diag(torch.full((len(centres),), 10.0))
+        spread = max(0.5 * float(apart.min(dim=1).values.mean()), 1e-3)
+    weights = torch.softmax(-squared / (2.0 * spread**2), dim=-1)
 
     def texels(u: Tensor) -> Tensor:
         change = weights.to(u.device) @ (u.reshape(-1, 3) - centres.to(u.device))
@@ -342,11 +346,3 @@ def palette(image: Tensor, weight: Floats, count: int) -> Tensor:
         centres = np.where(share[:, None] > 0.0, means / np.maximum(share[:, None], 1e-12), centres)
     order = np.argsort(-share, kind="stable")
     return torch.from_numpy(centres[order].clip(0.0, 1.0).astype(np.float32))
-
-
-def _spread(centres: Tensor) -> float:
-    """Distance over which a palette colour's influence falls off: half the mean distance to the nearest other one."""
-    if len(centres) < 2:
-        return 1.0
-    apart = torch.cdist(centres, centres) + torch.diag(torch.full((len(centres),), 10.0))
-    return max(0.5 * float(apart.min(dim=1).values.mean()), 1e-3)

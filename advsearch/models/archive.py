@@ -188,8 +188,7 @@ def _check_code(archive: Archive, code: dict[str, bytes]) -> None:
     if sum(map(len, code.values())) > LARGEST_CODE:
         raise refused(archive.path, f"has more than {LARGEST_CODE:,} bytes of source code")
     for name, content in code.items():
-        wrong = _code_problem(content)
-        if wrong:
+        if wrong := _code_problem(content):
             raise refused(archive.path, f"{name!r} {wrong}, which no plain network does")
 
 

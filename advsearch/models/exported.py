@@ -196,7 +196,7 @@ _GLOBALS = re.compile(
 """What the pickle of a tensor names; nothing of it runs anything."""
 
 _CONTAINERS = frozenset([None, "builtins.tuple", "builtins.list", "builtins.dict", "collections.OrderedDict"])
-_FORGOTTEN = {"metadata": dict, "guards_code": list}
+_FORGOTTEN: JsonObject = {"metadata": {}, "guards_code": []}
 _IDENTIFIERS = frozenset(
     "name as_name user_input_name forward_arg_names tensor_values sym_int_values sym_float_values "
     "sym_bool_values".split()
@@ -282,18 +282,15 @@ def _checked(path: Path, value: JsonValue, key: str) -> JsonValue:
 
 
 def _checked_object(path: Path, value: JsonObject, key: str) -> JsonObject:
-    return {name: _checked_item(path, name, inner, key) for name, inner in value.items()}
-
-
-def _checked_item(path: Path, name: str, inner: JsonValue, key: str) -> JsonValue:
-    if name in _FORGOTTEN:
-        return {} if _FORGOTTEN[name] is dict else []
-    wrong = "" if name == "" else _problem(name, key)
-    if name in ("as_custom_obj", "custom_obj") or (name == "custom_obj_values" and inner):
-        wrong = "holds a custom object, which is never loaded"
-    if wrong:
-        raise refused(path, wrong)
-    return _checked(path, inner, name)
+    checked: JsonObject = {}
+    for name, inner in value.items():
+        wrong = "" if name in ("", *_FORGOTTEN) else _problem(name, key)
+        if name in ("as_custom_obj", "custom_obj") or (name == "custom_obj_values" and inner):
+            wrong = "holds a custom object, which is never loaded"
+        if wrong:
+            raise refused(path, wrong)
+        checked[name] = _FORGOTTEN[name] if name in _FORGOTTEN else _checked(path, inner, name)
+    return checked
 
 
 def _problem(value: Any, key: str) -> str:

@@ -156,17 +156,14 @@ class Together(Task):
         return [(_joined([first for first, *_ in each]),) for each in zip(*said, strict=True)]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
-        judged = [one.judge(*own) for one, *own in self._each(output, truth)]
-        return [self._together(each) for each in zip(*judged, strict=True)]
-
-    def _together(self, each: Sequence[Judgement]) -> Judgement:
-        payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
-        said = (
-            _joined([one.answer for one in each]),
-            payloads if any(one is not None for one in payloads.values()) else None,
-        )
-        margin = math.nan if any(one.not_a_number for one in each) else max(one.margin for one in each)
-        return Judgement.of(min(one.score for one in each), margin, *said)
+        found = []
+        for each in zip(*(one.judge(*own) for one, *own in self._each(output, truth)), strict=True):
+            payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
+            payload = payloads if any(one is not None for one in payloads.values()) else None
+            margin = math.nan if any(one.not_a_number for one in each) else max(one.margin for one in each)
+            answer = _joined([one.answer for one in each])
+            found.append(Judgement.of(min(one.score for one in each), margin, answer, payload))
+        return found
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
         """See `Task.marks`: what is true of the first, maps of all, and what each model says under its name."""

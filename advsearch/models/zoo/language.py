@@ -313,16 +313,16 @@ class _Named(nn.Module):
             self.register_buffer(key, value)
 
     def forward(self, images: Tensor) -> Tensor:
-        return torch.stack([self._scores(image) for image in images])
-
-    def _scores(self, image: Tensor) -> Tensor:
-        first, past = self.reader.begin(image)
-        kept = (self.get_buffer(key).to(first.device) for key in ("stems", "rows", "columns", "counts"))
+        kept = (self.get_buffer(key).to(images.device) for key in ("stems", "rows", "columns", "counts"))
         stems, rows, columns, counts = kept
-        likely = first.log_softmax(dim=-1)[None]
-        if len(stems):
-            likely = torch.cat([likely, self.reader.go_on(stems, past).log_softmax(dim=-1).flatten(0, 1)])
-        return (likely[rows, columns] * counts).sum(dim=1)
+        scores = []
+        for image in images:
+            first, past = self.reader.begin(image)
+            likely = first.log_softmax(dim=-1)[None]
+            if len(stems):
+                likely = torch.cat([likely, self.reader.go_on(stems, past).log_softmax(dim=-1).flatten(0, 1)])
+            scores.append((likely[rows, columns] * counts).sum(dim=1))
+        return torch.stack(scores)
 
 
 class _Free(nn.Module):
@@ -333,16 +333,16 @@ class _Free(nn.Module):
         self.reader, self.tokenizer, self.ends, self.most = reader, tokenizer, ends, most
 
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
-        return [self._said(image) for image in images]
-
-    def _said(self, image: Tensor) -> dict[str, Any]:
-        logits, past = self.reader.begin(image)
-        steps, tokens = [logits], [int(logits.argmax())]
-        while tokens[-1] not in self.ends and len(tokens) < self.most:
-            steps.append(self.reader.go_on(logits.new_tensor([tokens[-1:]], dtype=torch.long), past)[0, -1])
-            tokens.append(int(steps[-1].argmax()))
-        text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
-        return {"text": text, "logits": torch.stack(steps), "begins": self.begins}
+        said = []
+        for image in images:
+            logits, past = self.reader.begin(image)
+            steps, tokens = [logits], [int(logits.argmax())]
+            while tokens[-1] not in self.ends and len(tokens) < self.most:
+                steps.append(self.reader.go_on(logits.new_tensor([tokens[-1:]], dtype=torch.long), past)[0, -1])
+                tokens.append(int(steps[-1].argmax()))
+            text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
+            said.append({"text": text, "logits": torch.stack(steps), "begins": self.begins})
+        return said
 
     def begins(self, word: str) -> list[int]:
         """Return the tokens that begin a word, in small letters or with a capital, after a blank or without one."""
