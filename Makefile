@@ -38,7 +38,7 @@ test: $(STAMP) ## run the tests; ARGS="-k name" picks some
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)
 
 test-quick: $(STAMP) ## run the quick tests of every room
-	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not medium" $(ARGS)
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not docs and not medium" $(ARGS)
 
 test-slow: $(STAMP) ## run the tests that take minutes; ARGS="--one-in 10" runs a tenth, others every day
 	@$(BIN)/python -m pytest -m slow $(ARGS)
@@ -49,12 +49,13 @@ test-zoo: $(STAMP) ## run the tests of torchvision's, timm's and transformers' n
 fuzz: $(STAMP) ## load 400 hostile files, each in bounds of time and memory; ARGS="--seed 1" makes others
 	@PYTHONPATH=tests $(BIN)/python -m fuzz $(ARGS)
 
-check: lint typecheck test ## everything that has to pass before a commit
+check: lint typecheck test docs ## everything that has to pass before a commit
 
-lint: $(STAMP) ## look for mistakes, for code that is not formatted and for pages that are not true of the code
+lint: $(STAMP) ## look for mistakes, for code that is not formatted for pages that are not true of the code and for bundled files that its scripts do not make
 	@$(BIN)/ruff check $(SOURCES)
 	@$(BIN)/ruff format --check --quiet $(SOURCES) || { echo "not formatted: run make format"; exit 1; }
 	@$(BIN)/python tools/check_docs.py
+	@$(BIN)/python -m advsearch.bundled.build --check
 
 format: $(STAMP) ## format the code and mend what can be mended
 	@$(BIN)/ruff format $(SOURCES)
@@ -63,7 +64,8 @@ format: $(STAMP) ## format the code and mend what can be mended
 typecheck: $(STAMP) ## mypy, strict
 	@$(BIN)/mypy
 
-docs: $(STAMP) ## build the documentation into build/site; fails on a broken link
+docs: $(STAMP) ## run what the pages say and build them into build/site; fails on a broken link
+	@$(BIN)/python -m pytest -q -n $(JOBS) -m docs
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -c constraints.txt -e '.[docs]'
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 

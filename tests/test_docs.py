@@ -265,6 +265,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     assert names["result"].search.renders == planned_renders(40)
 
 
+@pytest.mark.docs
 def test_the_page_about_losses_of_ones_own_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every block, after those before it, with smaller pictures and fewer steps than on the page."""
     page = DOCS / "own-loss.md"

@@ -122,6 +122,7 @@ def examples() -> list[list[str]]:
     return [line.split()[1:] for line in lines if line.startswith("advsearch")]
 
 
+@pytest.mark.docs
 def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_path: Path) -> None:
     """Its task, too, is searched, swept and rendered; all in one process."""
     small = ["--run", str(tmp_path / "own"), "--no-baseline", "--steps", "4", "--spp", "1", "--verify-spp", "1"]

@@ -35,6 +35,7 @@ SMALL = {
 }
 
 
+@pytest.mark.docs
 def test_the_steps_can_be_typed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -97,6 +97,7 @@ def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, Attack
     assert rows(tmp_path / "parts") == rows(whole[0])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("growing")
 def test_workers_make_the_matrices_and_the_rows_stay(
     whole: tuple[Path, AttackResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -112,6 +113,7 @@ def test_workers_make_the_matrices_and_the_rows_stay(
         attack_once(AttackConfig(**SMALL, object="mug", workers=2, run=str(tmp_path / "lost")))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("growing")
 def test_a_run_that_was_killed_between_a_comparison_and_its_evaluation_goes_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path

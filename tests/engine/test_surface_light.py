@@ -125,6 +125,7 @@ def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoi
     assert spp == {("search", None, 0), ("ranking", 8, 1)}
 
 
+@pytest.mark.slow
 def test_a_search_for_a_viewpoint_goes_on_with_the_same_rows(
     viewpoints: tuple[Path, AttackResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

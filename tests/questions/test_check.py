@@ -58,6 +58,7 @@ def kept(folder: Path) -> CheckResult:
     return result
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
     tmp_path: Path, whole: CheckResult, capfd: pytest.CaptureFixture[str]
 ) -> None:

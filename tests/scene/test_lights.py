@@ -181,6 +181,7 @@ def test_a_search_over_light_renders_its_basis_and_its_comparisons(monkeypatch: 
     assert renders["products"] == 18 and renders["search"] == 2 + 2 * 2 + 8  # basis, comparisons, ranking
 
 
+@pytest.mark.slow
 def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+import torch._dynamo  # by optimisers, too: before there are scenes, whose changes make Python collect what is new
 from safetensors import torch as safetensors
 from torch import Tensor, nn
 

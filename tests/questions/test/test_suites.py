@@ -447,6 +447,7 @@ def test_a_share_may_be_written_in_per_cent_and_an_unknown_claim_is_named(tmp_pa
 # ---- for other people's CI ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.docs
 def test_the_commands_of_the_jobs_in_the_docs_do_what_the_jobs_want(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -524,6 +525,7 @@ def test_a_search_and_a_suite_can_be_asserted(tmp_path: Path, monkeypatch: pytes
         assert_suite(suite)
 
 
+@pytest.mark.docs
 def test_the_pytest_file_of_the_docs_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every test in it, beside the suite of the same page; with fewer steps, and less to show, than on the page."""
     page = (Path(__file__).resolve().parents[3] / "docs" / "testing.md").read_text("utf-8")
