@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata, resources
 from pathlib import Path
@@ -241,20 +242,14 @@ def disk(folder: Path) -> Component:
 def check_hardware() -> Component:
     """Cores and memory."""
     cores = threads.cores()
-    memory = _memory()
+    memory = 0  # where the system does not tell
+    with suppress(AttributeError, ValueError, OSError):
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     detail = f"{platform.system()} {platform.machine()}, {cores} core{'s' * (cores > 1)}"
     detail += f", {memory / GIB:.1f} GiB of memory" if memory else ""
     if memory and memory < MEMORY_WANTED:
         return Component("machine", "", WARNING, detail, "a search peaks at 2.5 GiB: close other programs")
     return Component("machine", "", OK, detail)
-
-
-def _memory() -> int:
-    """Bytes of memory, or 0 where the system does not tell."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return 0
 
 
 def _ending(status: int | None, errors: str) -> str:

@@ -114,15 +114,13 @@ def _write(
     y = ends[3] if shape.true else ends[1] - high
     x, y = max(0, min(ends[0], size[0] - wide)), max(0, min(y, size[1] - high))
     rows = sorted(range(0, max(size[1] - high, 0) + 1), key=lambda one: (abs(one - y), one))
-    free = (one for one in rows if not any(_overlap((x, one, x + wide, one + high), other) for other in others))
+    free = (
+        one for one in rows if all(x > x1 or x0 > x + wide or one > y1 or y0 > one + high for x0, y0, x1, y1 in others)
+    )
     y = next(free, y)
     draw.rectangle((x, y, x + wide, y + high), fill=_colour(shape))
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
     return x, y, x + wide, y + high
-
-
-def _overlap(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> bool:
-    return one[0] <= other[2] and other[0] <= one[2] and one[1] <= other[3] and other[1] <= one[3]
 
 
 GAP, LINE = 8, 15

@@ -257,14 +257,12 @@ def formation_text(formation: Formation, gains: Mapping[str, float] | None = Non
     if formation.gain is not None:
         gain = f"gain {number_text(formation.gain)}"
     else:
-        each = "; ".join(f"{gain_name(name)} {number_text(value)}" for name, value in (gains or {}).items())
+        each = "; ".join(
+            f"{', '.join(map(short_name, name.split(', ')))} {number_text(value)}"
+            for name, value in (gains or {}).items()
+        )
         gain = "a gain for each scene" + (f": {each}" if each else "")
     return f"{made}, sampler {formation.sampler}, {gain}"
-
-
-def gain_name(name: str) -> str:
-    """Return an object and an environment without their folders."""
-    return ", ".join(short_name(one) for one in name.split(", "))
 
 
 def number_text(value: Any) -> str:

@@ -120,7 +120,11 @@ class Setting:
     def text(self) -> str:
         """What it is, its values with range and unit, and its default."""
         unit = f", in {self.unit}" if self.unit else ""
-        default = self.otherwise if self.default is None else _default(self.default)
+        default = self.otherwise if self.default is None else str(self.default)
+        if isinstance(self.default, dict):
+            default = ",".join(self.default)
+        elif isinstance(self.default, float):
+            default = f"{self.default:g}"
         return f"{self.description}: {self.expects}{unit}" + (f" (default: {default})" if default else "")
 
 
@@ -149,12 +153,6 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
             )
         )
     return tuple(declared)
-
-
-def _default(value: object) -> str:
-    if isinstance(value, dict):
-        return ",".join(value)
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _expected(info: FieldInfo) -> str:

@@ -317,14 +317,13 @@ class Depth(Task):
 
     def answers(self, output: Sequence[Map], count: int = 1) -> list[tuple[Answer, ...]]:
         """Return between which numbers each map is."""
-        return [(self._range(one),) for one in output]
-
-    def _range(self, one: Map) -> Answer:
-        ((said, values),) = one.items()
-        low, high = (float(end) for end in values.detach().aminmax())
-        if not math.isfinite(low + high):
-            return Answer(NOT_A_NUMBER)
-        return Answer(f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}")
+        found = []
+        for one in output:
+            ((said, values),) = one.items()
+            low, high = (float(end) for end in values.detach().aminmax())
+            text = f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}"
+            found.append((Answer(text if math.isfinite(low + high) else NOT_A_NUMBER),))
+        return found
 
     def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[Said]:
         """See `Task.said`; the payload has the factor by which the distance is off, what is left of the relief, and

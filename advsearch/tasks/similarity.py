@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -111,12 +111,22 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
     """
     names = folders_of(folder)
     root = Path(folder).expanduser()
-    paths = [(number, one) for number, (_, where) in enumerate(names) for one in _pictures(where)]
+    paths: list[tuple[int, Path]] = []
+    for number, (_, where) in enumerate(names):
+        found = _listed(where)
+        if not found:
+            raise InputError(f"references: expected pictures of {where.name} in {where}, got none; put some there")
+        paths += [(number, one) for one in found]
     if len(paths) > files.scaled(MOST):
         raise files.too_large(root, f"at most {files.scaled(MOST):,} reference pictures", f"{len(paths):,}")
     with torch.no_grad():
         shown = (_cut(torch.from_numpy(upright(one, SIDE)), model.input_size) for _, one in paths)
-        parts = [_features(model, batch, root) for batch in _batches(shown)]
+        parts = []
+        for batch in _batches(shown):
+            parts.append(model(batch))
+            if parts[-1].dim() != 2:
+                got = tuple(parts[-1].shape)
+                raise InputError(f"model {model.name}: expected features (N, D), got {got}; use another task")
     features = torch.cat(parts)
     broken = ~features.isfinite().all(dim=1)
     if bool(broken.any()):
@@ -181,13 +191,6 @@ def _listed(folder: Path) -> list[Path]:
         ) from None
 
 
-def _pictures(folder: Path) -> Sequence[Path]:
-    found = _listed(folder)
-    if not found:
-        raise InputError(f"references: expected pictures of {folder.name} in {folder}, got none; put some there")
-    return found
-
-
 def _cut(picture: Tensor, size: tuple[int, int]) -> Tensor:
     """Return the largest middle part of a picture (H, W, 3) that has the shape of the input."""
     height, width = picture.shape[:2]
@@ -202,13 +205,6 @@ def _batches(pictures: Iterator[Tensor]) -> Iterator[Tensor]:
     for _, alike in itertools.groupby(pictures, key=lambda one: one.shape):
         while batch := list(itertools.islice(alike, AT_ONCE)):
             yield torch.stack(batch)
-
-
-def _features(model: Model, pictures: Tensor, root: Path) -> Tensor:
-    features: Tensor = model(pictures)
-    if features.dim() != 2:
-        raise InputError(f"model {model.name}: expected features (N, D), got {tuple(features.shape)}; use another task")
-    return features
 
 
 METHODS = ("nearest", "linear")
