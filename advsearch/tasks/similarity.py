@@ -229,7 +229,7 @@ class Similarity(Classification):
       pictures of its own, so that one with many has no more votes than one with few, and every name has a gradient.
       The mean, so that one odd picture decides nothing where `k` is over 1. With 1, the default, an answer is right
       exactly where the nearest picture of all is.
-    - `linear`: those of a logistic regression on the reference features, of length 1 (`gallery.fitted`).
+    - `linear`: those of a logistic regression on the reference features, of length 1 (`fitted`).
 
     With `threshold` they are the cosine to the clean picture's features and the threshold, over `TEMPERATURE`.
 

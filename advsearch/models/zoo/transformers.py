@@ -50,7 +50,7 @@ def load(spec: str) -> Source:
     One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`, `language`).
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
-    image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
+    image processor (`library.measured`). Code in a repository is never run, and weights are read from safetensors
     alone. A repository that timm has saved goes to timm.
 
     Raises:
