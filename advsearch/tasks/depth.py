@@ -317,7 +317,7 @@ class Depth(Task):
 
     def answers(self, output: Sequence[Map], count: int = 1) -> list[tuple[Answer, ...]]:
         """Return between which numbers each map is."""
-        found = []
+        found: list[tuple[Answer, ...]] = []
         for one in output:
             ((said, values),) = one.items()
             low, high = (float(end) for end in values.detach().aminmax())
