@@ -5,7 +5,7 @@
 
 Those of logits are **maximised**. Each takes logits (N, C) and labels: (N,) int64, or the indices of a label set of
 which every answer is right; each is an objective by itself. Those of colours are a **cost**. All return (N,) and are
-differentiable; formulas are in `advsearch.attacks.logit_objectives` and `advsearch.engine.objective`.
+differentiable; formulas are in `advsearch.attacks.objective_functions` and `advsearch.engine.objective`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from advsearch.attacks import logit_objectives as of_logits
+from advsearch.attacks import objective_functions as of_logits
 from advsearch.engine import objective
 from advsearch.errors import InputError
 

@@ -1,9 +1,9 @@
 """Questions that are rooms of their own: `advsearch/questions/NAME/`, found by the name of their command.
 
 What is below them (the list of settings, of results, of pages) asks here, by name, so that it imports none of them. A
-room has `settings.CONFIG`, `carry_out.NAME_from_config`, `answer.RESULT`, `words.shown`, `words.claims` and
-`command.COMMAND`, and `page.page` where its page is of its own kind; a question that needs less has less. The tool
-works without those whose folder is missing.
+room is the command of the question (`COMMAND`), and has `settings.CONFIG`, `carry_out.NAME_from_config`,
+`answer.RESULT`, `answer.shown` and `answer.claims`, and `page.page` where its page is of its own kind; a question that
+needs less has less. The tool works without those whose folder is missing.
 """
 
 from __future__ import annotations

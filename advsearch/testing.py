@@ -124,7 +124,7 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
     """
     __tracebackhide__ = True
     # late: torch takes long to import
-    from advsearch.engine.turn import in_turn
+    from advsearch.engine.naming import in_turn
     from advsearch.questions.test.carry_out import test_from_config
 
     with in_turn():
@@ -148,8 +148,7 @@ def _asserted(
     __tracebackhide__ = True
     # late: torch takes long to import
     from advsearch.engine import loading
-    from advsearch.engine.naming import exists_here, model_name
-    from advsearch.engine.turn import in_turn
+    from advsearch.engine.naming import exists_here, in_turn, model_name
     from advsearch.questions.test.carry_out import test_from_config
 
     name = str(claim["claim"]).replace("_", "-")

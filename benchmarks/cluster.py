@@ -43,12 +43,11 @@ from simulated_cluster import Simulated, coordinator  # noqa: E402
 from sweep import ConstantRenderer, resident  # noqa: E402
 
 from advsearch.attacks import Evaluation  # noqa: E402
+from advsearch.cluster import Event  # noqa: E402
 from advsearch.cluster.coordinator import DEPTH  # noqa: E402
-from advsearch.cluster.executor import Event  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
-from advsearch.engine.sharing import Sent  # noqa: E402
-from advsearch.engine.sweeps import swept_scene  # noqa: E402
-from advsearch.engine.sweeps.job import KIND  # noqa: E402
+from advsearch.engine.journal import Sent  # noqa: E402
+from advsearch.engine.sweeps import KIND, swept_scene  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402

@@ -17,8 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from advsearch.explanations.observations import Factor, Mask, Numbers, Observations
-from advsearch.explanations.rules import CountedRule, find_rules
+from advsearch.explanations import CountedRule, Factor, Mask, Numbers, Observations, find_rules
 from advsearch.questions.explain.findings import find_importance
 
 FACTORS = (

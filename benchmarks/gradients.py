@@ -33,8 +33,8 @@ from advsearch.config import AttackConfig  # noqa: E402
 from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.scene.formation import EVERYTHING  # noqa: E402
 from advsearch.scene.gradients import Group  # noqa: E402
-from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 
 POSE = {"pose": {"on_ground": "no", "rotation": [-30, 30], "x": [-0.15, 0.15], "y": [-0.15, 0.15], "z": [0.05, 0.35]}}

@@ -20,10 +20,9 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.cli.output import watch_progress  # noqa: E402
-from advsearch.questions.harden.answer import HardenResult, Share  # noqa: E402
+from advsearch.questions.harden.answer import HEADS, HardenResult, Share, hardened_rows  # noqa: E402  # noqa: E402
 from advsearch.questions.harden.carry_out import harden_from_config  # noqa: E402
 from advsearch.questions.harden.settings import HardenConfig  # noqa: E402
-from advsearch.questions.harden.words import HEADS, hardened_rows  # noqa: E402
 from advsearch.runs.directory import CONFIG, is_run  # noqa: E402
 from advsearch.settings import parse_assignment  # noqa: E402
 

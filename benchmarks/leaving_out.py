@@ -34,7 +34,7 @@ from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import bounces_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.surface_light import CHECK_SPP, levels_off
-from advsearch.scene.leaving_out import NOTHING
+from advsearch.scene.formation import NOTHING
 from advsearch.scene.surface.renderer import SurfaceRenderer
 
 PAIRS = (

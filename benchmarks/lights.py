@@ -27,7 +27,7 @@ threads.configure()
 
 from advsearch.attacks.draws import Seeds  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
-from advsearch.engine.sweeps.job import KIND  # noqa: E402
+from advsearch.engine.sweeps import KIND  # noqa: E402
 from advsearch.engine.sweeps.swept_scene import SweptScene  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
 from advsearch.tasks import Judgement  # noqa: E402

@@ -22,14 +22,14 @@ threads.configure()
 from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
 from advsearch.questions.precision.answer import Recommended  # noqa: E402
-from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
-from advsearch.questions.precision.gradient import GradientBench, estimated_parts  # noqa: E402
-from advsearch.questions.precision.image import (  # noqa: E402
+from advsearch.questions.precision.benches import (  # noqa: E402
     REFERENCE_SAMPLER,
     PictureBench,
     variants,
 )
-from advsearch.questions.precision.points import MeasuredSetting, Sample, point_of  # noqa: E402
+from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
+from advsearch.questions.precision.gradient import GradientBench, estimated_parts  # noqa: E402
+from advsearch.questions.precision.points import MeasuredSetting, point_of  # noqa: E402
 from advsearch.questions.precision.rounds import TimeBudget  # noqa: E402
 from advsearch.questions.precision.settings import PrecisionConfig  # noqa: E402
 
@@ -116,9 +116,9 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
         loss = smooth_loss(renderer.formation.resolution, config.seed)
         bench = GradientBench(renderer, loss, inside(renderer), part, exact)
     bench.refer(budget, SEED, lambda: None)
-    samples = [Sample(*bench.measure(setting, SEED + number)) for number in range(REPEATS)]
+    samples = [bench.measure(setting, SEED + number) for number in range(REPEATS)]
     point = point_of(setting, samples, floor=bench.floor(setting, "error"))
-    assert statistics.fmean(sample.seconds for sample in samples) > 0.0
+    assert statistics.fmean(seconds for _, seconds in samples) > 0.0
     return point.error, point.known
 
 

@@ -31,7 +31,7 @@ from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
 from advsearch.engine.problem import Problem  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.scene.description import SceneDescription  # noqa: E402
-from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
+from advsearch.scene.formation import EVERYTHING  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import BASE_COLOR, MitsubaScene  # noqa: E402
 from advsearch.scene.mitsuba_backend.variant import mitsuba  # noqa: E402
 from advsearch.tasks import Classification, Facts  # noqa: E402

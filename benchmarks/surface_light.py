@@ -61,8 +61,7 @@ from advsearch.questions.recipe.description import planned, read_recipe  # noqa:
 from advsearch.questions.recipe.settings import RecipeConfig  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
-from advsearch.scene.surface.plan import why_not  # noqa: E402
-from advsearch.scene.surface.renderer import SurfaceRenderer  # noqa: E402
+from advsearch.scene.surface.renderer import SurfaceRenderer, why_not  # noqa: E402
 
 SCENES = ("mug@studio", "bottle@studio", "bowl@kitchen")
 SPP = 8

@@ -31,15 +31,17 @@ threads.configure()
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.controls import Space  # noqa: E402
 from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
-from advsearch.engine.sweeps import swept_scene  # noqa: E402
+from advsearch.engine.sweeps import (  # noqa: E402
+    Job,
+    NamedScene,
+    swept_scene,
+)
 from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
-from advsearch.engine.sweeps.job import Job, NamedScene  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
-from advsearch.scene.formation import ImageFormation  # noqa: E402
-from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
+from advsearch.scene.formation import EVERYTHING, ImageFormation  # noqa: E402
 from advsearch.scene.mitsuba_backend.denoise import denoise  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene  # noqa: E402
 from advsearch.tasks import Classification  # noqa: E402

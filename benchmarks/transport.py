@@ -29,7 +29,7 @@ threads.configure()
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
-from advsearch.scene.transport.renderer import LinearRenderer  # noqa: E402
+from advsearch.scene.transport.matrix import LinearRenderer  # noqa: E402
 
 EPSILON = 0.1
 SPP = 8

@@ -48,8 +48,7 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.evaluation import Evaluate
-from advsearch.attacks.sample_count import LADDER, MarginsOf, margins_of
-from advsearch.attacks.trials import Trials, clopper_pearson
+from advsearch.attacks.trials import LADDER, MarginsOf, Trials, clopper_pearson, margins_of
 from advsearch.attacks.verification import (
     OVER_CONDITIONS,
     OVER_CONFIDENCE,

@@ -36,8 +36,8 @@ from advsearch.questions.region.answer import RegionResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.stability.answer import CaseRow
 from advsearch.questions.test.answer import SuiteResult
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import END, Fields, Result
+from advsearch.runs.results.attack import AttackSummary, LinearTransport, SharedWork, VerifiedRate
+from advsearch.runs.results.base import CleanScene, Fields, Formation, Result, SceneResult, StudyResult, VariedValue
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import Setting, settings
@@ -270,19 +270,41 @@ def endings(record: Record) -> str:
 
 
 def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
-    """The fields of a result in the order in which they are written, those that say themselves in one row."""
+    """The fields that a result has of its own, in the order in which they are written."""
 
     def make(record: Record) -> str:
-        described = kind.described()
-        names = sorted(described, key=lambda name: name in END)
-        told = {name: _field(described[name]) for name in names}
-        written = {name: described[name].alias or name for name in names}
-        plain = [f"`{name}`" for name in ("schema", "command") if issubclass(kind, Result)]
-        plain += [f"`{name}`" for name in names if not told[name]]
-        first = [[", ".join(plain), "what was asked for, and of what"]] if plain else []
-        return table(["field", "holds"], first + [[f"`{written[name]}`", told[name]] for name in names if told[name]])
+        once = EVERYWHERE if issubclass(kind, Result) else ()
+        told = {one.alias or name: _field(one) for name, one in kind.described().items() if name not in once}
+        return table(["field", "holds"], [[f"`{name}`", text] for name, text in told.items() if text])
 
     return make
+
+
+ASKED = "environment controls object objects model policy objective".split()
+EVERYWHERE = {**StudyResult.described(), **SceneResult.described(), "objective": None}
+"""Fields that are told once for all results: ASKED, and those that say how the run went."""
+PARTS_OF_SEVERAL: dict[str, type[Fields]] = {
+    "image_formation": Formation,
+    "clean": CleanScene,
+    "conditions": VariedValue,
+    "verified": VerifiedRate,
+    "transport": LinearTransport,
+    "shared": SharedWork,
+}
+"""What is in fields of several results, by the name that most of these have; told once."""
+
+
+def every_answer(record: Record) -> str:
+    """The fields that all results have."""
+    asked = ", ".join(f"`{name}`" for name in ("schema", "command", *ASKED))
+    rows = [[f"`{name}`", _field(one)] for name, one in EVERYWHERE.items() if one is not None and name not in ASKED]
+    return _wrapped(f"What was asked for, and of what: {asked}.") + "\n" + table(["field", "holds"], rows)
+
+
+def several_answers(record: Record) -> str:
+    """What is in fields of several results."""
+    rows = [[f"`{name}`", f"{_first_sentence(kind)}: {_inside(kind)}"] for name, kind in PARTS_OF_SEVERAL.items()]
+    return table(["field", "holds"], rows)
 
 
 def _field(field: FieldInfo | ComputedFieldInfo) -> str:
@@ -290,11 +312,15 @@ def _field(field: FieldInfo | ComputedFieldInfo) -> str:
     annotation = field.annotation if isinstance(field, FieldInfo) else field.return_type
     inside = [one for one in _types(annotation) if isinstance(one, type) and issubclass(one, Fields)]
     text = field.description or (_first_sentence(inside[0]) if inside else "")
-    parts = [
+    return f"{text}: {_inside(inside[0])}" if inside and inside[0] not in PARTS_OF_SEVERAL.values() else text
+
+
+def _inside(kind: type[Fields]) -> str:
+    """The fields of what is in a field."""
+    return ", ".join(
         f"`{part.alias or name}`" + (f" ({part.description})" if part.description else "")
-        for name, part in (inside[0].model_fields.items() if inside else ())
-    ]
-    return f"{text}: {', '.join(parts)}" if parts else text
+        for name, part in kind.model_fields.items()
+    )
 
 
 def _first_sentence(kind: type[Fields]) -> str:
@@ -471,17 +497,19 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     **{(f"controls/{kind}.md", kind): control(kind) for kind in OWN if (DOCS / "controls" / f"{kind}.md").is_file()},
     ("policies/pgd.md", "pgd"): policy("pgd"),
     ("design.md", "endings"): endings,
-    ("design.md", "attack-fields"): result_fields(AttackSummary),
-    ("sweeps.md", "sweep-fields"): result_fields(SweepSummary),
-    ("questions.md", "curve-fields"): result_fields(CurveResult),
-    ("questions.md", "matrix-fields"): result_fields(MatrixResult),
-    ("questions.md", "replay-fields"): result_fields(ReplayResult),
-    ("questions.md", "gap-fields"): result_fields(GapResult),
-    ("questions.md", "region-fields"): result_fields(RegionResult),
-    ("explain.md", "explain-fields"): result_fields(ExplainResult),
-    ("compare.md", "compare-fields"): result_fields(CompareResult),
-    ("harden.md", "harden-fields"): result_fields(HardenResult),
-    ("testing.md", "test-fields"): result_fields(SuiteResult),
+    ("answers.md", "every-answer"): every_answer,
+    ("answers.md", "several-answers"): several_answers,
+    ("answers.md", "attack-fields"): result_fields(AttackSummary),
+    ("answers.md", "curve-fields"): result_fields(CurveResult),
+    ("answers.md", "matrix-fields"): result_fields(MatrixResult),
+    ("answers.md", "sweep-fields"): result_fields(SweepSummary),
+    ("answers.md", "gap-fields"): result_fields(GapResult),
+    ("answers.md", "region-fields"): result_fields(RegionResult),
+    ("answers.md", "replay-fields"): result_fields(ReplayResult),
+    ("answers.md", "explain-fields"): result_fields(ExplainResult),
+    ("answers.md", "compare-fields"): result_fields(CompareResult),
+    ("answers.md", "harden-fields"): result_fields(HardenResult),
+    ("answers.md", "test-fields"): result_fields(SuiteResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,
     ("recipe-results.md", "recipe-results"): recipe_results,

@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import advsearch
-from advsearch.questions.recipe.answer import RecipeResult
+from advsearch.questions.recipe.answer import RecipeResult, told_once
 from advsearch.questions.recipe.carry_out import NOTE, recipe_from_config
 from advsearch.questions.recipe.description import read_recipe
 from advsearch.questions.recipe.settings import RecipeConfig
-from advsearch.questions.recipe.words import told_once
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store

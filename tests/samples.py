@@ -240,7 +240,7 @@ def make_answered(path: Path, config: AttackConfig, u: np.ndarray) -> Path:
 def keep_object(run: Path) -> None:
     """Put the mug, and the same painted black and white, among what a run has to turn."""
     from advsearch.runs.directory import OBJECT_FILE
-    from advsearch.scene.exporting.gltf import PosedMesh, web_glb
+    from advsearch.scene.glb import PosedMesh, web_glb
     from advsearch.scene.library import load_object
 
     mug = load_object("mug")

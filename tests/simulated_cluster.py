@@ -7,8 +7,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
+from advsearch.cluster import Disconnected, Ended, Event, Joined, Left, Work
 from advsearch.cluster.coordinator import Coordinator
-from advsearch.cluster.executor import Disconnected, Ended, Event, Joined, Left, Work
 from advsearch.cluster.worker import Carried, Failure, Files, Ready, prepare
 from advsearch.errors import ClusterError
 
@@ -17,7 +17,7 @@ HERE = {"processor": "here"}
 
 @dataclass
 class Simulated:
-    """What `advsearch.cluster.executor.Pool` asks for.
+    """What `advsearch.cluster.Pool` asks for.
 
     Attributes:
         call: what a worker does with a range.

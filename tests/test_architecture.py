@@ -88,7 +88,7 @@ RULES = {
     "cli": Rule(None),
     "": Rule({"api", "engine", "losses", "models", "questions", "testing"}, set()),
 }
-"""As in docs/design.md, "Rooms, and who may know whom". The empty name is `advsearch/__init__.py`."""
+"""As in docs/design.md, "Packages and imports". The empty name is `advsearch/__init__.py`."""
 
 DISTRIBUTIONS = {"PIL": "pillow", "yaml": "PyYAML", "mitsuba_oidn": "mitsuba-oidn"}
 """Where a package is installed under another name than it is imported."""
@@ -132,11 +132,11 @@ def imports(module: str, path: Path) -> frozenset[str]:
 def room(module: str) -> str:
     """The room of one of our modules: the first name below `advsearch`; empty for the package itself.
 
-    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room; so does the command of
-    a question.
+    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room; so does the package of
+    a question, which is its command.
     """
     name = module.split(".")[1] if "." in module else ""
-    if name == "__main__" or (name == "questions" and module.endswith(".command")):
+    if name == "__main__" or (name == "questions" and module.count(".") == 2):
         return "cli"
     folder = SOURCES["advsearch"]
     return name if name == "bundled" or (folder / name).is_dir() or (folder / f"{name}.py").is_file() else ""
@@ -174,7 +174,7 @@ def test_rooms_import_only_what_they_may() -> None:
     assert sorted(broken_rules()) == []
 
 
-LIGHT = {"settings", "answer", "words", "page", "command"}
+LIGHT = {"settings", "answer", "page"}
 """What a room has for those who only read or show an answer."""
 
 
@@ -216,7 +216,7 @@ def test_an_answer_is_read_and_shown_without_what_renders() -> None:
     broken = [
         f"{path.relative_to(ROOT)} imports {name}"
         for question, module, path, names in questions()
-        if module in LIGHT - {"command"}
+        if module in LIGHT
         for name in names
         if name.startswith(heavy) or name.endswith(".carry_out")
     ]
@@ -258,7 +258,7 @@ def test_only_the_backend_speaks_mitsuba() -> None:
 
 
 def test_the_design_in_one_glance() -> None:
-    """As in docs/design.md, "Rooms, and who may know whom": bottom never reaches top, the command line is the roof."""
+    """As in docs/design.md, "Packages and imports": bottom never reaches top, the command line is the roof."""
     assert not any("cli" in (rule.rooms or ()) for rule in RULES.values())
     below: dict[str, set[str]] = {"models": set(), "tasks": {"models"}, "attacks": {"tasks"}}
     for name, rooms in below.items():

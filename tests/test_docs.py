@@ -32,8 +32,8 @@ from advsearch.cli.export import WRITERS
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
 from advsearch.config import CONFIGS, AttackConfig, RenderConfig, SceneConfig, SweepConfig
-from advsearch.engine import run_settings
 from advsearch.engine.loading import as_controls
+from advsearch.engine.naming import check_run_settings, given_to
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.files import MESHES
 from advsearch.questions.compare.settings import CompareConfig
@@ -143,8 +143,8 @@ def check_names(config: Config) -> None:
         assert config.recipe in ("list", "mine.yaml") or planned(read_recipe(config.recipe), config)
         return
     assert isinstance(config, SceneConfig)
-    run_settings.check(config)
-    run_settings.given_to(config, config.controls)
+    check_run_settings(config)
+    given_to(config, config.controls)
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:

@@ -14,7 +14,7 @@ from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.api import carry_out as answered
 from advsearch.attacks import Evaluation, Query, make_policy
-from advsearch.attacks.sample_count import choose_spp, most_samples
+from advsearch.attacks.trials import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as plan_text
 from advsearch.config import AttackConfig, SweepConfig
@@ -23,7 +23,7 @@ from advsearch.engine.sweeps.swept_scene import OneModel
 from advsearch.questions.plan.carry_out import plan_from_config
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.questions.precision.settings import PrecisionConfig
-from advsearch.questions.region import growing as region
+from advsearch.questions.region import carry_out as region
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.runs.directory import RunDirectory

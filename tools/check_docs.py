@@ -21,7 +21,7 @@ from types import ModuleType
 
 import reference_scenes
 
-from advsearch.attacks import POLICIES, clopper_pearson, planned_renders, sample_count, smallest, verification
+from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_renders, trials, verification
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
@@ -37,16 +37,14 @@ from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region import carry_out as mapping
-from advsearch.questions.region import growing as region
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs import directory, export, store
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import Result
-from advsearch.runs.results.render import RenderResult
+from advsearch.runs.results.base import RenderResult, Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene import environments, exposure, library
 from advsearch.scene.description import FRAME_FILL
-from advsearch.scene.importing.images import TEXTURE_LIMIT
+from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import settings
@@ -181,7 +179,7 @@ def names() -> Iterator[str]:
     for target in re.findall(r"^([a-z-]+):.*?## ", read(ROOT / "Makefile"), re.M):
         if f"`{target}`" not in text and f"make {target}" not in text:
             yield f"docs/development.md: expected the target {target}"
-    yield from absent("design.md", [f"| [`{path.name}`]" for path in (ROOT / "benchmarks").glob("[!_]*.py")])
+    yield from absent("development.md", [f"| [`{path.name}`]" for path in (ROOT / "benchmarks").glob("[!_]*.py")])
 
 
 PLAIN = set(
@@ -242,8 +240,8 @@ def _looks() -> tuple[int, int, int]:
 MADE_BY_HAND = [
     ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
     ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
-    ("design.md", f"at {', '.join(map(str, sample_count.LADDER[:-1]))} and {sample_count.LADDER[-1]} samples a pixel"),
-    ("design.md", "Looks are after {}, {} and {} renders".format(*sample_count.looks_of(verification.TRIAL_LOOKS[0]))),
+    ("design.md", f"at {', '.join(map(str, trials.LADDER[:-1]))} and {trials.LADDER[-1]} samples a pixel"),
+    ("design.md", "Looks are after {}, {} and {} renders".format(*trials.looks_of(verification.TRIAL_LOOKS[0]))),
     ("design.md", f"{TRIALS_OVER} with `--over`, {TRIALS} with `--smallest`"),
     ("design.md", f"must reach {verification.PASS_PERCENT_OVER} % of the trials in which the clean scene is right"),
     ("design.md", "rounded up: {0} of {0}, or {1} of {2}".format(*_looks())),
@@ -251,8 +249,8 @@ MADE_BY_HAND = [
     ("design.md", f"at most {mitsuba_scene.MAX_DEPTH} segments"),
     ("questions.md", {8: "Eight renders of the best configurations"}[planned_renders(0)]),
     ("questions.md", f"**Verified** by {verification.TRIAL_LOOKS[0]} fresh renders"),
-    ("questions.md", f"until they are within {100 * (smallest.RATIO - 1):.0f} % of each other"),
-    ("questions.md", {12: "or twelve searches are done"}[smallest.ROUNDS]),
+    ("questions.md", f"until they are within {100 * (candidates.RATIO - 1):.0f} % of each other"),
+    ("questions.md", {12: "or twelve searches are done"}[candidates.ROUNDS]),
     (
         "questions.md",
         f"What counts on the way is {FEWEST_TRIALS} trials without a failure, or, after one, {TRIALS} in all",
@@ -260,8 +258,8 @@ MADE_BY_HAND = [
     ("questions.md", f"**Verified** on up to {TRIALS_OVER} conditions"),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
-    ("questions.md", {8: "as long as eight random pictures"}[region.PROBES]),
-    ("questions.md", {4: "with other seeds, up to four times"}[region.ATTEMPTS]),
+    ("questions.md", {8: "as long as eight random pictures"}[mapping.PROBES]),
+    ("questions.md", {4: "with other seeds, up to four times"}[mapping.ATTEMPTS]),
     ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
     ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
     ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),

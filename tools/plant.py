@@ -102,14 +102,14 @@ FAULTS = (
     ),
     Fault(
         "exporting: normals are flipped",
-        "advsearch/scene/exporting/gltf.py",
+        "advsearch/scene/glb.py",
         "_y_up(_unit(mesh.normals))",
         "_y_up(_unit(-mesh.normals))",
         ("tests/api/test_export_scene.py",),
     ),
     Fault(
         "exporting: degrees for radians",
-        "advsearch/scene/exporting/cycles.py",
+        "advsearch/scene/cycles.py",
         '"fov": math.radians(fov),',
         '"fov": fov,',
         ("tests/scene/test_cycles.py",),
@@ -193,7 +193,7 @@ FAULTS = (
     ),
     Fault(
         "policies: a mean keeps its bias",
-        "advsearch/attacks/policies/adam.py",
+        "advsearch/attacks/policies/pgd.py",
         "mean = state.mean / (1.0 - self.beta1**state.taken)",
         "mean = state.mean",
         ("tests/attacks/policies/test_policy_adam.py",),
@@ -207,7 +207,7 @@ FAULTS = (
     ),
     Fault(
         "engine: answers of workers come as they are done",
-        "advsearch/engine/sharing.py",
+        "advsearch/engine/journal.py",
         "number = numbers[id(done.items[0])]",
         "number = turn + len(early)",
         ("tests/engine/test_attack_workers.py",),
@@ -305,9 +305,9 @@ FAULTS = (
     ),
     Fault(
         "explanations: a rule is counted on the rows that chose it",
-        "advsearch/explanations/rules.py",
-        "rule = _counted(conditions, counting.right[inside], counting.right[~inside])",
-        "rule = _counted(conditions, *(choosing.right[covered(conditions, choosing) == one] for one in (True, False)))",
+        "advsearch/explanations/__init__.py",
+        "here, elsewhere = counting.right[inside], counting.right[~inside]",
+        "here, elsewhere = (choosing.right[covered(conditions, choosing) == one] for one in (True, False))",
         ("tests/questions/test_explanations.py",),
     ),
     Fault(
@@ -319,7 +319,7 @@ FAULTS = (
     ),
     Fault(
         "recipes: right and wrong are mixed up",
-        "advsearch/questions/recipe/figures/agreement.py",
+        "advsearch/questions/recipe/given.py",
         "right_wrong=counts[True, False],",
         "right_wrong=counts[False, True],",
         ("tests/questions/test_recipe.py",),

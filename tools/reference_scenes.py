@@ -19,9 +19,8 @@ from advsearch.questions.harden.scenes import varied
 from advsearch.scene import library
 from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import ImageFormation
-from advsearch.scene.framing import filling_distance
-from advsearch.scene.leaving_out import EVERYTHING
+from advsearch.scene.formation import EVERYTHING, ImageFormation
+from advsearch.scene.geometry import filling_distance
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import resolve

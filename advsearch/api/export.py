@@ -27,7 +27,7 @@ from advsearch.controls.texture import TextureControl
 from advsearch.engine.attack_parts import judged_alone, problem_from_config
 from advsearch.engine.loading import as_controls, load_scene
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import kept_answer
+from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
@@ -36,13 +36,12 @@ from advsearch.runs.images import read_png, to_8bit
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.summary import attack_of, read_result
 from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.assets import Floats, Ints, Mesh
 from advsearch.scene.description import NO_MAP, OBJECT
-from advsearch.scene.exporting.gltf import PLAIN, glb, posed
-from advsearch.scene.mitsuba_backend.files.writing import NAME, SCATTERINGS, write_scene
+from advsearch.scene.glb import PLAIN, glb, posed
+from advsearch.scene.mitsuba_backend.writing import NAME, SCATTERINGS, write_scene
 from advsearch.scene.parts import HazePart
-from advsearch.scene.raster import doubled_areas
-from advsearch.scene.surface_map import Ints, rasterised
+from advsearch.scene.raster import doubled_areas, rasterised
 
 GLB, XML = ".glb", ".xml"
 

@@ -8,6 +8,7 @@ docstrings are made from both (`asks`).
 from __future__ import annotations
 
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -19,8 +20,7 @@ import numpy as np
 from torch import nn
 
 from advsearch.engine import loading
-from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, model_name
-from advsearch.engine.turn import in_turn
+from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, in_turn, model_name
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import told
@@ -40,24 +40,29 @@ class RunKeywords(TypedDict, total=False):
     overwrite: bool
 
 
-class PictureKeywords(TypedDict, total=False):
-    """Scene, pictures and machine, of every question that renders."""
+class RenderedKeywords(TypedDict, total=False):
+    """Light, pictures and machine, of every question that renders."""
 
     environment: Path | Names | None
-    up: Literal["y", "z"] | None
-    camera: str | None
     set: Mapping[str, float | str | Sequence[float]] | None
     exposure: float | None
     resolution: int | str | tuple[int, int] | None
     labels: Path | Names | None
     prompt: Names | None
-    label: int | np.integer[Any] | Names | None
     texture_resolution: int | None
     denoise: Literal["oidn", "none"]
     pixel_sampler: Literal["independent", "multijitter"]
     seed: int
     threads: int | None
     deterministic: bool
+
+
+class PictureKeywords(RenderedKeywords, total=False):
+    """And scene, of every question about one."""
+
+    up: Literal["y", "z"] | None
+    camera: str | None
+    label: int | np.integer[Any] | Names | None
 
 
 class NamedKeywords(RunKeywords, total=False):
@@ -162,6 +167,15 @@ class _Signature(inspect.Signature):
 
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
 
+KEPT = "The run is kept, in `run` or under runs/."
+SAME = {
+    "object": "from `load_scene`, or the name of an object, or a file of one.",
+    "model": "from `load_model`, or what that takes.",
+    "progress": "True shows a bar, False none, None one on a terminal; or told how far it is.",
+}
+RAISED = "InputError: anything that the caller can put right; nothing is written then."
+"""What the docstrings of many questions say alike: of the run, of arguments, and of errors."""
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 Made = TypeVar("Made", bound=Config)
 
@@ -227,13 +241,28 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                         plain |= _named(loaded, plain, stack)
                 return function(*args, **plain)
 
-        text = inspect.cleandoc(function.__doc__ or "")
-        listed = textwrap.indent("\n".join(lines), "    ")
-        asked.__doc__ = text.replace("\n\nRaises:", f"\n{listed}\n\nRaises:", 1)
+        asked.__doc__ = _docstring(function.__doc__ or "", [one.name for one in plain], config.command, lines)
         asked.__signature__ = signature  # type: ignore[attr-defined]
         return asked  # type: ignore[return-value]
 
     return decorate
+
+
+def _docstring(text: str, names: Sequence[str], command: str, settings: Sequence[str]) -> str:
+    """A question's own docstring with what all of them say: where the run is kept, their arguments, and what is raised.
+
+    Args:
+        text: its own: what it does, and the arguments of which `SAME` does not say it.
+        names: of its arguments.
+        command: of its settings.
+        settings: a line for each.
+    """
+    said, _, own = inspect.cleandoc(text).partition("\n\nArgs:\n")
+    if "other arguments are the settings of" not in " ".join(said.split()):
+        said += f"\n\nAll other arguments are the settings of `advsearch {command}`. {KEPT}"
+    told = {one.partition(":")[0]: one.rstrip() for one in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own)) if one}
+    listed = [told.get(name, f"{name}: {SAME.get(name)}") for name in names] + [*settings]
+    return f"{said}\n\nArgs:\n{textwrap.indent(chr(10).join(listed), '    ')}\n\nRaises:\n    {RAISED}"
 
 
 def configured(config: type[Made], **given: object) -> Made:

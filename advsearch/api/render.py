@@ -18,14 +18,13 @@ from torch import Tensor, nn
 
 from advsearch import models
 from advsearch.config import RenderConfig
-from advsearch.engine import rendering, run_settings
+from advsearch.engine import rendering
 from advsearch.engine.attack_parts import parts_in
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.naming import load_models, scene_of
+from advsearch.engine.naming import check_run_settings, given_to, in_turn, load_models, scene_of
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import pictures_of, writable
 from advsearch.engine.sweeps.summary import SweepResult
-from advsearch.engine.turn import in_turn
 from advsearch.errors import InputError
 from advsearch.files import read_bytes
 from advsearch.models import Model
@@ -33,8 +32,7 @@ from advsearch.progress import NullProgress, Progress, shows_progress
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.images import read_png
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import Result
-from advsearch.runs.results.render import RenderResult
+from advsearch.runs.results.base import RenderResult, Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_answer, read_result
 from advsearch.scene.importing.files import LARGEST_FILE
@@ -140,8 +138,8 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         if spec is not None and out.exists() and os.path.exists(spec) and out.samefile(spec):
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
     progress.stage("loading the scene and the model")
-    run_settings.check(config)
-    controls = run_settings.given_to(config, config.controls)
+    check_run_settings(config)
+    controls = given_to(config, config.controls)
     scene = scene_of(config)
     task = make_task(config.task)
     (model,), notes = load_models([config.model], task, config)

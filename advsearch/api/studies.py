@@ -16,13 +16,12 @@ from typing import TypeVar
 
 from advsearch import rooms
 from advsearch.api import carry_out
-from advsearch.cluster.executor import Call, Work
-from advsearch.cluster.opening import executor_of
+from advsearch.cluster import Call, Work
+from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import CONFIGS, AttackConfig
-from advsearch.engine import run_settings
-from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.naming import different, load_models
+from advsearch.engine.judging import one_label_for_several
+from advsearch.engine.naming import check_run_settings, different, load_models, settings_alone
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
@@ -40,7 +39,7 @@ from advsearch.runs.summary import attack_of, read_result
 from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES, Config, read_yaml
 from advsearch.tasks import make_task
-from advsearch.viewer.pages import write_page
+from advsearch.viewer.pages import keep_answer
 
 
 def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
@@ -110,11 +109,11 @@ def chains_of(config: AttackConfig) -> list[Chain]:
 
 
 def _controls_of(config: AttackConfig) -> list[Chain]:
-    run_settings.check(config)
+    check_run_settings(config)
     attacks = []
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
-            own = run_settings.alone(config, control, settings)
+            own = settings_alone(config, control, settings)
             one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
             attacks.append([StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control)])
     return attacks
@@ -233,9 +232,7 @@ def carry_out_study(
         result = result_of(rows, common)
         for suffix, data in figure_of_answer(shown(result)).items():
             write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _label_for_all(config: AttackConfig) -> list[str]:

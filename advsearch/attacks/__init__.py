@@ -25,9 +25,8 @@ from advsearch.attacks.policies import (
     make_policy,
     seeded,
 )
-from advsearch.attacks.sample_count import SampleCount, choose_spp
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
-from advsearch.attacks.trials import Trials, clopper_pearson
+from advsearch.attacks.trials import SampleCount, Trials, choose_spp, clopper_pearson
 from advsearch.attacks.verification import Ending, Verification, count_right, run_trials, verify
 
 __all__ = [

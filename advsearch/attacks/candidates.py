@@ -1,20 +1,19 @@
-"""What a search may answer with: the few best configurations it has seen, and many different failures.
-
-The largest of many noisy values is mostly a lucky one (the winner's curse): with noise of one logit, the best of 40
-equal configurations looks two logits better than it is. So a search keeps several candidates, renders each again with
-seeds it has not used, the same seeds for all, and believes only those renders.
-"""
+"""What a search may answer with: the few best configurations, rendered again with seeds it has not used, as the largest
+of many noisy values is mostly a lucky one (the winner's curse); many different failures; and the smallest change, a
+bracket of scales of all budgets, whose upper end passed the trials, and at whose lower end a search found nothing."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from advsearch.attacks.domain import Domain
 from advsearch.attacks.trials import CONFIDENCE, edge_of
+from advsearch.errors import InputError
 
 SAME = 1e-4
 """Configurations that differ by less than this in every element are one candidate (an 8-bit level is 4e-3)."""
@@ -22,15 +21,9 @@ SAME = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A configuration worth a second look.
-
-    Attributes:
-        u: (d,) the configuration.
-        objective: its raw objective when it was admitted, biased upwards.
-        success: whether that render was a success.
-        again: objectives of its renders since then, in the search and in the ranking; -inf for one that was not finite.
-        successes: how many of these were a success.
-    """
+    """A configuration (d,) worth a second look: the objective (biased upwards) and success of the render that admitted
+    it, the objectives of its renders since then, -inf for one that was not finite, and how many of these were a
+    success."""
 
     u: Tensor
     objective: float
@@ -45,7 +38,6 @@ class Candidate:
 
     @property
     def rate(self) -> float:
-        """Fraction of new renders that are a success; of the raw one if there are none."""
         return self.successes / len(self.again) if self.again else float(self.success)
 
 
@@ -131,7 +123,6 @@ class FailureShare:
             evaluated.
         interval: 95 %; covers the share at least as often, however the draws were adapted, at any number of them.
         effective: failures of equal weight that would be worth as much: (sum w)^2 / sum w^2 (Kish 1965).
-        draws: how many there were.
     """
 
     estimate: float | None
@@ -183,13 +174,8 @@ MOST = 24
 
 @dataclass(frozen=True, eq=False)
 class FoundFailure:
-    """A configuration that a search claims to be a success, and stands for others near it.
-
-    Attributes:
-        u: (d,) float32.
-        objective: that of its one render; biased upwards where it is the largest of many.
-        ranges: by position in u the low and the high end of where the others lie, in u.
-    """
+    """A configuration (d,) that a search claims to be a success, the objective of its one render, biased upwards, and
+    where the others lie that it stands for: both ends in u, by position."""
 
     u: Tensor
     objective: float
@@ -228,7 +214,6 @@ def most_different(at: Tensor, worst: Sequence[float], around: Tensor, apart: Te
         worst: (n,) objectives.
         around: (k,) bool: ranges whose ends are the same place.
         apart: (k,) bool: discrete choices, where different is 1 apart.
-        most: how many to return at most.
     """
     order = sorted(range(len(at)), key=lambda number: -worst[number])
     at = at[order].double()
@@ -242,3 +227,173 @@ def most_different(at: Tensor, worst: Sequence[float], around: Tensor, apart: Te
         nearest = torch.minimum(nearest, away.norm(dim=1))
         nearest[picked] = -1.0
     return [order[number] for number in picked]
+
+
+RATIO = 1.05
+"""The bracket is closed once high / low is at most this."""
+
+SMALLEST_SCALE = 1e-3
+"""No smaller scale than this is tried."""
+
+ROUNDS = 12
+"""Searches at most."""
+
+ATTEMPTS = 6
+"""Steps outwards that the confirmation of the upper end takes at most."""
+
+SHORTENED = 1.0 + (RATIO - 1.0) / 5.0
+"""An answer's length is bisected until the ends are within this: a fifth of the bracket's ratio."""
+
+MOST_CHECKS = 1 + math.ceil(math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(SHORTENED)))
+"""Configurations that go through the trials after a search, at most: its answer, and those of the bisection."""
+
+Search = Callable[[Domain, int], Tensor]
+"""(domain, round) -> the best configuration a search finds there; round numbers its seeds."""
+
+Passes = Callable[[Tensor, int], bool]
+"""(u, check) -> whether a configuration passes the trials; check numbers its seeds."""
+
+
+Likely = Callable[[Tensor], bool]
+"""u -> whether a configuration would probably pass: a guess that costs next to nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bracket:
+    """Where the smallest scale lies.
+
+    Attributes:
+        low: at this scale a search found nothing; 0 where none has failed.
+        high: at this scale `u` passes; infinity where nothing passed at all.
+        u: (d,) a configuration within `high`; None where nothing passed.
+        found_by: number of the search that found `u`, or the longer change that it is the end of.
+        confirmed: whether `u` has passed again, with new seeds (see `confirmed`).
+    """
+
+    low: float
+    high: float
+    u: Tensor | None
+    searches: int
+    checks: int
+    found_by: int = 0
+    confirmed: bool = False
+
+    @property
+    def closed(self) -> bool:
+        """Whether high is within `RATIO` of low."""
+        return self.u is not None and self.high <= RATIO * (1.0 + 1e-9) * self.low
+
+
+def scaled(domain: Domain, scale: float) -> Domain:
+    """Return the domain with every budget multiplied by `scale`, in (0, 1]."""
+    names = (block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None)
+    bare = [name or "a block" for name in dict.fromkeys(names)]
+    if bare:
+        raise InputError(
+            f"smallest: expected controls with a budget (texture, geometry, patch, ...), got {', '.join(bare)}, "
+            "whose parameters have ranges and no epsilon; leave it out"
+        )
+    blocks = tuple(replace(block, epsilon=float(block.epsilon or 0.0) * scale) for block in domain.blocks)
+    return replace(domain, blocks=blocks)
+
+
+def shrunk(domain: Domain, u: Tensor, scale: float) -> Tensor:
+    """Return the configuration moved towards the start, its change multiplied by `scale`."""
+    return domain.project(domain.start + scale * (u - domain.start))
+
+
+def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | None = None) -> Bracket:
+    """Bracket the smallest scale of the domain's budgets at which a configuration passes.
+
+    1. A search in the whole budget. If its answer fails the trials, there is nothing to shrink.
+    2. The answer is moved towards the start, by bisection in the logarithm of its length, to the shortest that passes:
+       a handful of trials, no search.
+    3. A search at half the scale reached, then at the geometric mean of the bracket's ends; each answer that passes is
+       shortened as in 2, each that fails raises the lower end; until it is closed or `ROUNDS` searches are done.
+
+    For a linear model and a gradient policy the first search points the right way and 2 ends within its own step of the
+    optimum, so that the result is within `RATIO` of the closed form.
+
+    Args:
+        likely: says where 2 begins, and from where it goes on in growing steps; None to bisect from the whole length.
+
+    Returns:
+        The bracket; not `closed` if the searches did not suffice.
+    """
+    u = search(domain, 0)
+    state = Bracket(0.0, math.inf, None, 1, 1)
+    if not passes(u, 0):
+        return replace(state, low=1.0)
+    state = _shorten(replace(state, high=1.0, u=u), passes, domain, likely)
+    while state.searches < ROUNDS and state.high > RATIO * state.low and state.high > SMALLEST_SCALE:
+        floor = state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
+        scale = max(floor, state.high / RATIO if state.high <= RATIO**2 * state.low else floor)
+        inside = scaled(domain, scale)
+        u = search(inside, state.searches)
+        passed = passes(u, state.checks)
+        state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
+        if passed:
+            state = replace(state, high=scale, u=u, found_by=state.searches - 1)
+            state = _shorten(state, passes, domain, likely)
+        else:
+            state = replace(state, low=scale)
+    return state
+
+
+def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2, attempts: int = ATTEMPTS) -> Bracket:
+    """Return the bracket with its upper end moved out until the configuration there passes several times in a row.
+
+    What lies exactly on the edge passes its trials by chance, and the one that was chosen among many passed by luck. So
+    it is tried again with new seeds; where it fails, the change grows by a fortieth.
+
+    Args:
+        times: in a row.
+        attempts: steps outwards at most; what the last one leads to is returned untried, and not `confirmed`.
+    """
+    if bracket.u is None:
+        return bracket
+    edge, reached, at = bracket.u, bracket.high, 1.0
+    for _ in range(attempts):
+        if all(passes(bracket.u, bracket.checks + again) for again in range(times)):
+            return replace(bracket, checks=bracket.checks + times, confirmed=True)
+        at *= math.sqrt(RATIO)
+        high = min(1.0, reached * at)
+        farther = scaled(domain, high).project(domain.start + at * (edge - domain.start))
+        bracket = replace(bracket, high=high, u=farther, checks=bracket.checks + times)
+    return bracket
+
+
+def _shorten(state: Bracket, passes: Passes, domain: Domain, likely: Likely | None) -> Bracket:
+    """Bisect the length of the configuration until the ends are within `SHORTENED`.
+
+    With a guess it is tried there first, and then farther and farther from there, but never beyond the middle.
+    """
+    if state.u is None:
+        raise RuntimeError("there is no configuration to shorten")
+    longest, length, low = state.u, state.high, max(state.low, SMALLEST_SCALE * state.high)
+
+    def at(scale: float) -> Tensor:
+        return shrunk(scaled(domain, scale), longest, scale / length)
+
+    best, high, checks = state.u, length, state.checks
+    middle, stride = math.sqrt(high * low), math.inf
+    if likely is not None:
+        middle, stride = _crossing(lambda scale: likely(at(scale)), low, high), SHORTENED
+    while high > SHORTENED * low:
+        shorter = at(middle)
+        if passes(shorter, checks):
+            best, high = shorter, middle
+            middle = max(math.sqrt(high * low), high / stride)
+        else:
+            low = middle
+            middle = min(math.sqrt(high * low), low * stride)
+        stride, checks = stride * stride, checks + 1
+    return replace(state, high=high, u=best, checks=checks)
+
+
+def _crossing(likely: Callable[[float], bool], low: float, high: float) -> float:
+    """Return the shortest length in (low, high) of which a guess says that it passes, to within `SHORTENED`."""
+    while high > SHORTENED * low:
+        middle = math.sqrt(high * low)
+        low, high = (low, middle) if likely(middle) else (middle, high)
+    return math.sqrt(high * low)

@@ -43,17 +43,8 @@ Doubles = NDArray[np.float64]
 
 
 class Draws:
-    """Points of [0, 1)^dimensions by number.
-
-    Args:
-        dimensions: numbers of a point; 0 is fine.
-        sampler: "sobol" or "random".
-        seed: root; the streams are called `name`.
-        name: of the streams.
-
-    Raises:
-        InputError: no such sampler, or more dimensions than Sobol points have.
-    """
+    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams are called `name`. 0 dimensions
+    are fine."""
 
     def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
         if sampler not in SAMPLERS:
@@ -103,12 +94,7 @@ class Draws:
 
 
 class Seeds:
-    """Seeds of one stream by number, many at once: much faster than `advsearch.seeds.stream` for every one.
-
-    Args:
-        root: the run's root seed.
-        name: of the stream.
-    """
+    """Seeds of one stream by number, many at once: much faster than `advsearch.seeds.stream` for every one."""
 
     def __init__(self, root: int, name: str) -> None:
         self._root, self._name = root, name
@@ -126,15 +112,7 @@ class Seeds:
 
 @dataclass(frozen=True)
 class Product:
-    """The product of axes with so many values each. No axis at all has one point.
-
-    Attributes:
-        sizes: number of values of each axis, at least 1; the last runs fastest.
-        count: number of points; may be larger than any list could hold.
-
-    Raises:
-        InputError: an axis has no values.
-    """
+    """The product of axes with so many values each, at least 1; the last runs fastest. No axis at all has one point."""
 
     sizes: tuple[int, ...]
     count: int = field(init=False)
@@ -145,11 +123,7 @@ class Product:
         object.__setattr__(self, "count", math.prod(self.sizes))
 
     def digits(self, index: int) -> tuple[int, ...]:
-        """Return the place of a point on every axis.
-
-        Raises:
-            IndexError: the number is under 0 or not under `count`.
-        """
+        """Return the place of a point on every axis."""
         if not 0 <= index < self.count:
             raise IndexError(f"expected a point from 0 to {self.count - 1}, got {index}")
         found = [0] * len(self.sizes)
@@ -158,7 +132,6 @@ class Product:
         return tuple(found)
 
     def index(self, digits: Sequence[int]) -> int:
-        """Return the number of the point at these places; the inverse of `digits`."""
         number = 0
         for size, digit in zip(self.sizes, digits, strict=True):
             number = number * size + digit

@@ -9,24 +9,26 @@ An objective is a callable `(output, images, truth) -> values`, the larger the n
 - values: (N,), differentiable.
 
 What `get_objective` returns is called with a fourth argument where there is a configuration: `more`, which gives what a
-user's function asks for by the names of its parameters (`advsearch.attacks.own_objective`). Objectives of features, how
-far a picture has moved from the clean one in the eyes of the network, are here; those of logits have a module.
+user's function asks for by the names of its parameters: it is called with `(output, images, truth)`, or `(output,
+labels)` as losses of torch are, and asks for more by the names of further ones.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, Protocol, final
 
 import torch
-from torch import Tensor
-from torch.nn import functional
+from torch import Tensor, nn
 
-from advsearch.attacks.logit_objectives import (
+from advsearch.attacks.objective_functions import (
+    ReadFeatures,
+    cosine_distance,
     cross_entropy,
     dlr,
+    feature_distance,
     log_odds,
     margin,
     targeted_cross_entropy,
@@ -34,8 +36,8 @@ from advsearch.attacks.logit_objectives import (
     targeted_log_odds,
     targeted_margin,
 )
-from advsearch.attacks.own_objective import More, Objective, checked, form_of, nothing_more
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import told
 from advsearch.registry import Registry
 from advsearch.tasks import TASKS, Classification, Depth, Segmentation, Similarity, Task
 from advsearch.tasks.classification import ClassTask
@@ -43,107 +45,150 @@ from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import Together
 
-NEARBY = 1e-3
-"""Distances under this fraction of the clean features' length count as none: the distance is rounded off there."""
+ASKED = ("u", "texture", "textures", "inputs", "configuration")
+"""What a function may ask for by the names of further parameters."""
 
-ReadFeatures = Callable[[Tensor], Tensor]
-"""From images (N, H, W, 3), display-referred sRGB in [0, 1], to features (N, F): what
-`advsearch.models.features.features_of` returns, say."""
+TRUTHS = ("target", "targets", "labels", "label", "truth")
+"""What the second of two parameters is called in a loss of outputs and right answers alone."""
+
+IMAGES = ("images", "image")
+"""What the second of two parameters is called in a function that forgot the third."""
+
+More = Callable[[str], Any]
+"""Gives what is asked for by one of the names in `ASKED`, at the configuration of each picture."""
 
 
-def feature_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
-    """How far the features of the picture lie from those of the clean one, in lengths of the clean ones.
+class Objective(Protocol):
+    """The signature of an objective, called by position; see `advsearch.attacks.objectives`."""
 
-    With f0 the features of the clean picture, e = (f - f0) / |f0|, r a fixed unit vector and h = `NEARBY`,
+    def __call__(self, output: Any, images: Tensor, truth: Any, more: More = ..., /) -> Tensor:
+        """Return (N,) values to maximise."""
+        ...
 
-        sqrt(|e + h r|^2 + h^2) - sqrt(2) h,
 
-    which is |e| to within 3 h, exactly 0 at e = 0, and has a finite gradient everywhere. The plain |e| has none at the
-    clean picture, where every search starts, and |e|^2 and a smoothed |e| have their minimum there: a gradient of zero,
-    which a search without noise would never leave. Hence r: at the clean picture the gradient is r / (sqrt(2) |f0|), at
-    the full strength of a distance, and beyond a few h it is that of |e|. The direction of r (drawn once, from a fixed
-    seed) does not matter: every direction leads away, and after the first step the distance itself shows which leads
-    away fastest. With a noisy renderer the noise does the same.
+def nothing_more(name: str) -> Any:
+    """Refuse what is asked for where there is no configuration."""
+    raise InputError(f"objective: asks for `{name}`, and there is no configuration here; pass `more`, which gives it")
 
-    The idea is that of Sabour et al. 2016, who lead a picture's features to those of another one; here they lead away.
 
-    It looks at no label: it needs no right answer, leads to no class in particular, and what counts as success is
-    checked by the answer as ever. Where f0 is zero its length counts as 1.
+@dataclass(frozen=True)
+class Form:
+    """Which arguments a function takes: (output, images, truth), or without `images`, and what it asks for beside them,
+    of `ASKED`."""
 
-    Args:
-        features: differentiable; called once here, and once more per evaluation, which costs one more run of the
-            network.
-        clean: (H, W, 3) or (N, H, W, 3): the clean picture, or several renders of it, whose features are averaged.
-            Take as little noise as you can afford: noise of the search's own renders is a distance as well.
+    images: bool = True
+    asked: tuple[str, ...] = ()
 
-    Returns:
-        An objective (logits, images, labels) -> (N,), at least 0 but for h, that looks at the images only.
 
-    Raises:
-        InputError: the features are not (N, F), or not finite.
+def form_of(function: Callable[..., Any]) -> Form:
+    """Return which arguments a function takes.
+
+    The names of its first two parameters ask for nothing, nor does a third one in the place of the truth.
     """
-    reference = _reference(features, clean)
-    length = torch.linalg.vector_norm(reference)
-    scale = torch.where(length > 0.0, length, torch.ones_like(length))
-    away = _away(reference)
-
-    def objective(logits: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
-        moved = (features(images) - reference) / scale + away
-        squared = moved.square().sum(dim=1) + NEARBY**2
-        distance: Tensor = squared.sqrt() - math.sqrt(2.0) * NEARBY
-        return distance
-
-    objective.__name__ = objective.__qualname__ = "feature_distance"
-    return objective
-
-
-def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
-    """One minus the cosine of the features and those of the clean picture: from 0 where they are the same to 2.
-
-    That is |e|^2 / 2 for e the difference of both at length 1. Its gradient is zero at the clean picture, where every
-    search starts, so `h` e . r is added, with r and `h` as in `feature_distance`: at the clean picture the gradient
-    leads along r, and beyond a few `h` it is that of the distance.
-
-    Args:
-        features: of the clean picture; called once, here.
-        clean: as for `feature_distance`.
-
-    Returns:
-        An objective (features (N, F), images, labels) -> (N,), at least 0 but for `h`^2, that looks at the features
-        only, whatever their length.
-
-    Raises:
-        InputError: as for `feature_distance`.
-    """
-    reference = functional.normalize(_reference(features, clean), dim=0)
-    away = _away(reference)
-
-    def objective(output: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
-        moved = functional.normalize(output, dim=1) - reference.to(output)
-        distance: Tensor = moved.square().sum(dim=1) / 2.0 + moved @ away.to(output)
-        return distance
-
-    return objective
-
-
-def _away(reference: Tensor) -> Tensor:
-    """Return a fixed direction (F,) of length `NEARBY`."""
-    away = torch.randn(reference.shape, generator=torch.Generator().manual_seed(0)).to(reference)
-    return away * (NEARBY / float(torch.linalg.vector_norm(away)))
-
-
-def _reference(features: ReadFeatures, clean: Tensor) -> Tensor:
-    """Return the mean features (F,) of the clean pictures."""
-    with torch.no_grad():
-        found = features(clean if clean.dim() == 4 else clean[None])
-    if found.dim() != 2:
-        raise InputError(f"objective: expected features of shape (N, F), got {tuple(found.shape)}")
-    if not bool(torch.isfinite(found).all()):
+    if isinstance(function, type):
+        raise InputError(f"objective: expected a name or a function (output, images, truth), got {told(function)}")
+    try:
+        signature = inspect.signature(function.forward if isinstance(function, nn.Module) else function)
+    except ValueError:  # built in: nothing to look at
+        return Form()
+    by_position = [one.name for one in signature.parameters.values() if one.kind in (0, 1)]
+    asked = tuple(
+        one.name for one in signature.parameters.values() if one.name in ASKED and one.name not in by_position[:2]
+    )
+    own = [name for name in by_position if name not in asked]
+    images = not (len(own) >= 2 and (own[1] in TRUTHS or (len(own) == 2 and own[1] not in (*IMAGES, *ASKED))))
+    images = images or any(one.kind is one.VAR_POSITIONAL for one in signature.parameters.values())
+    try:
+        signature.bind(*([None] * (3 if images else 2)), **dict.fromkeys(asked))
+    except TypeError as error:
         raise InputError(
-            "objective: expected finite features of the clean picture, got NaN or infinity; check that the "
-            "model answers it"
+            f"objective {name_of(function)!r}: expected a function that takes (output, images, truth) or (output, "
+            f"labels), and beside them any of {', '.join(ASKED)} by name: {error}"
+        ) from None
+    return Form(images, asked)
+
+
+def checked(function: Callable[..., Tensor]) -> Objective:
+    """Wrap a user's function: a scalar becomes (1,), and a wrong type, shape or a lost gradient is an InputError.
+
+    The function returns (N,), or a scalar, for which it is called with one picture at a time. A label set of one class
+    comes as (N,) int64, as torch's losses take it. What it raises itself passes through. NaN values pass too: a search
+    has a rule for them.
+
+    Raises:
+        InputError: the function takes other arguments; see `form_of`.
+    """
+    name, form = name_of(function), form_of(function)
+
+    def objective(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        asked, count = {one: more(one) for one in form.asked}, images.shape[0]
+        given = (output, images, labels_of(truth, output, count))
+        try:
+            values = function(*(given if form.images else given[::2]), **asked)
+        except TypeError as error:
+            if not (isinstance(given[2], tuple) and "not tuple" in str(error)):
+                raise
+            raise InputError(
+                f"objective {name!r}: expected one right answer for a loss of torch, got {len(truth)} (indices "
+                f"{truth}); use those of advsearch.losses, or name one with `label`"
+            ) from error
+        if isinstance(values, Tensor) and values.ndim == 0 and count > 1:
+            each = [objective(output[k : k + 1], images[k : k + 1], truth, _part(asked, k)) for k in range(count)]
+            values = torch.cat(each)
+        values = _values(name, values, count)
+        seen = [one for one in (images, output, *asked.values()) if isinstance(one, Tensor)]
+        wanted = torch.is_grad_enabled() and any(one.requires_grad for one in seen)
+        if wanted and not values.requires_grad:
+            raise InputError(
+                f"objective {name!r}: the result does not depend on the output or the images differentiably; "
+                "remove .detach(), torch.no_grad() or argmax, or choose a policy without gradients (random)"
+            )
+        return values
+
+    return objective
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """Return what a function is called in messages."""
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def _values(name: str, values: Any, count: int) -> Tensor:
+    if not isinstance(values, Tensor):
+        raise InputError(
+            f"objective {name!r}: expected a torch tensor of shape ({count},), got {type(values).__name__}; "
+            "compute it with torch operations and don't call .item(), float() or .numpy()"
         )
-    return found.mean(dim=0)
+    if not values.is_floating_point():
+        raise InputError(
+            f"objective {name!r}: expected floating-point values, got {values.dtype}; a count or a comparison has "
+            "no gradient"
+        )
+    found: Tensor = values.reshape(1) if values.ndim == 0 and count == 1 else values
+    if found.shape != (count,):
+        raise InputError(
+            f"objective {name!r}: expected one value per image, shape ({count},), got {tuple(found.shape)}; "
+            "reduce over everything but the first axis"
+        )
+    return found
+
+
+def labels_of(truth: Any, output: Any, count: int) -> Any:
+    """Return the truth as a user's function gets it: a label set of one class as (N,) int64, anything else as it is."""
+    if isinstance(truth, tuple) and len(truth) == 1 and isinstance(truth[0], int) and isinstance(output, Tensor):
+        return torch.full((count,), truth[0], device=output.device)
+    return truth
+
+
+def _part(asked: Mapping[str, Any], picture: int) -> More:
+    """Return what gives what was asked for of several pictures for one of them."""
+    one = slice(picture, picture + 1)
+
+    def more(name: str) -> Any:
+        found = asked[name]
+        return found[one] if isinstance(found, Tensor) else {key: value[one] for key, value in found.items()}
+
+    return more
 
 
 __all__ = [
@@ -199,8 +244,6 @@ class ObjectiveKind:
 
 
 def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
-    """An objective that asks for nothing more."""
-
     def plain(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
         return function(output, images, truth)
 
@@ -209,10 +252,6 @@ def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
 
 def _score_of(task: Task) -> Objective:
     return _plain(lambda output, images, truth: task.score(output, truth))
-
-
-def _pixel_margin_of(task: Segmentation) -> Objective:
-    return _plain(lambda output, images, truth: task.pixel_margin(output, truth))
 
 
 _OWN = {
@@ -260,7 +299,8 @@ _OWN = {
         ),
         ObjectiveKind(
             "pixel_margin", "the largest wrong logit minus the largest right one, mean over the object's pixels",
-            "logits (log-odds)", task=Segmentation.name, of_task=_pixel_margin_of,
+            "logits (log-odds)", task=Segmentation.name,
+            of_task=lambda task: _plain(lambda output, images, truth: task.pixel_margin(output, truth)),
         ),
     )
 }  # fmt: skip
@@ -342,7 +382,6 @@ def check_objective(
     """Check, before anything is loaded, that there is such an objective and that it can do what is asked.
 
     Args:
-        objective: a name, or a function.
         task: name of the task whose outputs it will get.
         targeted: whether there is a target.
         minimise: whether a right answer is sought.

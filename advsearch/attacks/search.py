@@ -14,8 +14,19 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Candidate, Failures, admit, best, contenders, with_last
 from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
-from advsearch.attacks.evaluation import Evaluate, Evaluation, Phase, Query, most_at_once, usable
-from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable
+from advsearch.attacks.evaluation import (
+    NO_COUNTS,
+    Counts,
+    Evaluate,
+    Evaluation,
+    Phase,
+    Policy,
+    Proposal,
+    Query,
+    affordable,
+    most_at_once,
+    usable,
+)
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.verification import Ending
 from advsearch.errors import InputError
@@ -270,7 +281,6 @@ class _Log:
             begun = time.perf_counter()
 
     def _compare(self, gradient: Tensor | None) -> None:
-        """Note the cosine of a gradient with the one before that was not zero."""
         if gradient is None or not bool(gradient.any()):
             return
         if self.before is not None:
@@ -337,7 +347,6 @@ def _look(log: _Log, indices: Sequence[int]) -> None:
 
 
 def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
-    """Put together what the log holds."""
     nothing = Candidate(log.domain.start, math.nan, False)
     answer = best(log.pool) if log.pool else nothing
     found = answer.rate >= 0.5 and stopped is not Ending.INTERRUPTED

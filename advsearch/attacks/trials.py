@@ -1,16 +1,23 @@
-"""Counting successes, and saying how sure the count is."""
+"""Counting successes, saying how sure the count is, and how many samples a pixel trials need (docs/design.md).
+
+Monte Carlo noise takes part of the margin away, and less of it the more samples there are. So the margin *drifts*
+with the sample count, and a verification in the middle of that drift credits the scene with what the noise did.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise, product
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import bdtr, betaincinv, ndtri
+from scipy.special import bdtr, betaincinv, ndtri, stdtrit
+from torch import Tensor
 
+from advsearch.attacks.evaluation import Evaluate, Query
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
@@ -60,9 +67,6 @@ def paired_difference(both: int, first: int, second: int, neither: int) -> tuple
         first: in which the first alone happens.
         second: likewise.
         neither: in which none happens.
-
-    Raises:
-        InputError: there is no pair, or less than none.
     """
     n = both + first + second + neither
     if n < 1 or min(both, first, second, neither) < 0:
@@ -93,9 +97,6 @@ def mcnemar(first: int, second: int) -> float:
 
     Returns:
         In (0, 1]; 1 without such pairs.
-
-    Raises:
-        InputError: one is less than 0.
     """
     if min(first, second) < 0:
         raise InputError(f"pairs: expected numbers from 0, got {first} and {second}")
@@ -103,7 +104,6 @@ def mcnemar(first: int, second: int) -> float:
 
 
 def _wilson(share: float, n: int) -> tuple[float, float]:
-    """Wilson's score interval of a share of n, 95 %."""
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
     middle, half = share + z * z / (2 * n), z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
     return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
@@ -111,14 +111,8 @@ def _wilson(share: float, n: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Trials:
-    """How often something happened in independent trials.
-
-    Attributes:
-        successes: from 0 to `trials`.
-        trials: at least 1.
-        spp: samples per pixel of every trial.
-        confidence: of the Clopper-Pearson interval; larger than 95 % where trials might have ended at several looks.
-    """
+    """How often something happened in independent trials of so many samples a pixel, and the confidence of the
+    Clopper-Pearson interval, larger than 95 % where trials might have ended at several looks."""
 
     successes: int
     trials: int
@@ -127,7 +121,6 @@ class Trials:
 
     @property
     def rate(self) -> float:
-        """Fraction of trials that succeeded."""
         return self.successes / self.trials
 
     @property
@@ -184,19 +177,16 @@ class ConfidenceSequence:
             raise InputError(f"confidence: expected a number between 0 and 1, got {self.confidence}")
 
     def add(self, value: float) -> None:
-        """Take note of a draw in [0, 1]."""
         if not 0.0 <= value <= 1.0:
             raise InputError(f"draw: expected a number from 0 to 1, got {value}")
         self._counts[value] += 1
 
     @property
     def count(self) -> int:
-        """Draws so far."""
         return sum(self._counts.values())
 
     @property
     def mean(self) -> float:
-        """Their mean; NaN where there is none."""
         return sum(value * count for value, count in self._counts.items()) / self.count if self.count else float("nan")
 
     def is_over(self, mean: float) -> bool:
@@ -223,3 +213,200 @@ def capital(mean: float, counts: Mapping[float, int]) -> float:
         for value, count in counts.items():
             total += count * np.log(1.0 - STAKES + STAKES * (value / mean))
     return float(np.logaddexp.reduce(total) - np.log(len(STAKES)))
+
+
+LADDER = (4, 16, 64, 256)
+"""Sample counts to try; each quarters the variance of the one before."""
+
+LOOKS = (4, 8)
+"""Renders of a configuration at each sample count after which one looks at them."""
+
+MOST_LOOKED_AT = 20
+"""Renders of a sample count of which no more are made to look at, though there be more trials."""
+
+MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
+"""(spp, seeds) -> margins in logits, one of each render."""
+
+
+def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, sought: bool = True, keep: int = 0) -> MarginsOf:
+    """Return the margins of one configuration under the conditions that the scene comes with; the rows of all sample
+    counts are numbered together, and the first `keep` pictures of each are wanted."""
+    made = Counter[int]()
+
+    def margins(spp: int, seeds: Sequence[int]) -> list[float]:
+        numbers = range(made[spp], made[spp] + len(seeds))
+        asked = enumerate(zip(seeds, numbers, strict=True), made.total())
+        made[spp] += len(seeds)
+        queries = [
+            Query(u, seed, kind, row, spp=spp, drawn=False, sought=sought, keep=number < keep)
+            for row, (seed, number) in asked
+        ]
+        return [answer.said.score for answer in evaluate(queries)]
+
+    return margins
+
+
+@dataclass(frozen=True)
+class Rung:
+    """The margins of one configuration at one sample count.
+
+    Attributes:
+        name: which configuration, e.g. "clean".
+        mean: mean margin over the seeds.
+        half_width: how far the mean may lie on the other side of the true one (Student's t), in 5 % of all cases, after
+            all looks together.
+        drift: mean here minus mean at the rung below; NaN at the first.
+        settled: whether more samples would leave the margin on its side of zero; see `choose_spp`.
+    """
+
+    name: str
+    spp: int
+    mean: float
+    half_width: float
+    drift: float
+    settled: bool
+
+
+@dataclass(frozen=True)
+class SampleCount:
+    """The choice: samples a pixel, whether all margins are shown to stay on their sides (if not, it is the last rung of
+    the ladder), a row for each configuration and rung that was measured, and the renders spent."""
+
+    spp: int
+    converged: bool
+    table: tuple[Rung, ...]
+    renders: int
+
+
+def choose_spp(
+    margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = LADDER, trials: int = 0
+) -> SampleCount:
+    """Climb a ladder of sample counts with each configuration until more of them would not change the verdict; return
+    the highest rung that one of them needed.
+
+    A verdict asks on which side of zero the margin is. A configuration has settled at a rung, with the mean margin m
+    there and m' at the rung below, when on that side, with all of their uncertainty, are
+
+    - m,
+    - m + (m - m'), where the margin would be if noise took once more as much as it took from the rung below to here:
+      the error that is left falls with the sample count, so it is smaller than the change that led here,
+    - every single render of the rung; and, where these are fewer than the trials, m even with the deviation of one.
+
+    So the mean without noise is on that side, and noise moves no trial to the other. A margin at zero never settles:
+    its verdict does depend on the noise, and `converged` says so. That a margin settles on the wrong side happens in
+    5 % of all cases at most (`benchmarks/verdicts.py`).
+
+    The rungs are looked at after some of the renders, and again after more if that does not settle it. Each look has
+    its share of the 5 % (Bonferroni).
+
+    Three quarters of the samples of a whole ladder are those of its last rung. So a look that cannot settle anything,
+    as far as the noise so far tells (`_may_settle`), is left out; where none is left that could, or one configuration
+    has not settled, the last rung is taken as it is. That may take `converged` away, but never gives it.
+
+    Render number k of every rung has the seed of trial number k (`run_trials`), so whoever keeps answers needs not make
+    the first trials again.
+
+    Args:
+        margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each renders what it is asked for. The
+            first should be the one that is least likely to settle.
+        ladder: sample counts, rising, at least one. A single one is returned as it is, unmeasured and not converged.
+        trials: that will follow under the same conditions. So many renders are one more look, as at the rung that is
+            chosen they are those trials; 0 where other trials follow.
+    """
+    if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
+        raise InputError(f"verify_spp: expected rising sample counts of at least 1, got {list(ladder)}")
+    if len(ladder) == 1:
+        return SampleCount(ladder[0], False, (), 0)
+    table, renders, reached, looks = list[Rung](), 0, 1, looks_of(trials)
+    for name, render in margins.items():
+        values = _climbed(render, seed, ladder, looks, trials)
+        below: list[float] = []
+        for spp, found in zip(ladder, values, strict=False):
+            table.append(_rung(name, spp, found, below, len(looks), trials))
+            below = found
+        renders, reached = renders + sum(map(len, values)), max(reached, len(values) - 1)
+        if not table[-1].settled:
+            return SampleCount(ladder[-1], False, tuple(table), renders)
+    return SampleCount(ladder[reached], True, tuple(table), renders)
+
+
+def _climbed(
+    margins: MarginsOf, seed: int, ladder: Sequence[int], looks: Sequence[int], trials: int
+) -> list[list[float]]:
+    """Return the margins of one configuration at each rung, up to that at which it settles or beyond which none can
+    settle it."""
+    values: list[list[float]] = [[] for _ in ladder]
+    places = list(product(range(1, len(ladder)), looks))
+    for number, (level, count) in enumerate(places):
+        if not any(_may_settle(values, ladder, *later, len(looks)) for later in places[number:]):
+            break
+        if not _may_settle(values, ladder, level, count, len(looks)):
+            continue
+        for one in (level - 1, level):
+            new = range(len(values[one]), count)
+            values[one] += margins(ladder[one], [trial_seed(seed, number) for number in new]) if new else []
+        if _settled(values[level], values[level - 1], len(looks), trials):
+            break
+    return [found for found in values if found]
+
+
+def _settled(here: Sequence[float], below: Sequence[float], looks: int, trials: int) -> bool:
+    """Whether the margins of a rung and of the one below show that more samples change nothing; see `choose_spp`."""
+    mean, count, one = _mean(here), min(len(here), len(below)), _deviation(here)
+    ahead, ahead_error = 2.0 * mean - _mean(below), math.hypot(2.0 * one, _deviation(below)) / math.sqrt(count)
+    side, quantile = math.copysign(1.0, mean), _quantile(count, looks)
+    error = one / math.sqrt(count) if count == trials else one
+    far = side * mean > quantile * error and side * ahead > quantile * ahead_error
+    return far and all(side * value > 0.0 for value in here)
+
+
+def _may_settle(values: Sequence[list[float]], ladder: Sequence[int], level: int, count: int, looks: int) -> bool:
+    """Whether so many renders at a rung may show that the margin has settled there, by what has been rendered.
+
+    The mean may be off by its standard error, and may move on by as much as it has moved before. Deviations stay; at
+    rungs that were not rendered they fall with the root of the samples.
+    """
+    known = [one for one in range(level + 1) if values[one]]
+    if not known:
+        return True
+    if values[level] and min(values[level]) <= 0.0 <= max(values[level]):
+        return False
+    best, mean = values[known[-1]], {one: _mean(values[one]) for one in known}
+    moved = abs(mean[known[-1]] - mean[known[-2]])
+    largest = abs(mean[known[-1]]) + moved + _deviation(best) / math.sqrt(len(best))
+    below, here = (
+        _deviation(values[one]) if values[one] else _deviation(best) * math.sqrt(ladder[known[-1]] / ladder[one])
+        for one in (level - 1, level)
+    )
+    return math.hypot(2.0 * here, below) * _quantile(count, looks) / math.sqrt(count) <= largest
+
+
+def looks_of(trials: int = 0) -> tuple[int, ...]:
+    """Return after how many renders of a rung one looks, see `choose_spp`."""
+    return (*LOOKS, trials) if LOOKS[-1] < trials <= MOST_LOOKED_AT else LOOKS
+
+
+def most_samples(configurations: int, ladder: Sequence[int] = LADDER, trials: int = 0) -> int:
+    """Return the samples a pixel that `choose_spp` renders in all, at most: where only the last rung settles it."""
+    return configurations * looks_of(trials)[-1] * sum(ladder) if len(ladder) > 1 else 0
+
+
+def _rung(name: str, spp: int, values: Sequence[float], below: Sequence[float], looks: int, trials: int) -> Rung:
+    mean, half_width = _mean(values), _quantile(len(values), looks) * _deviation(values) / math.sqrt(len(values))
+    if not below:
+        return Rung(name, spp, mean, half_width, math.nan, False)
+    return Rung(name, spp, mean, half_width, mean - _mean(below), _settled(values, below, looks, trials))
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values)
+
+
+def _deviation(values: Sequence[float]) -> float:
+    mean = _mean(values)
+    return math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
+
+
+def _quantile(count: int, looks: int) -> float:
+    """Of Student's t, for one end of the interval of a mean of so many values at one of the looks."""
+    return float(stdtrit(count - 1, 1.0 - (1.0 - CONFIDENCE) / looks))

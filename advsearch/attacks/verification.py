@@ -1,9 +1,5 @@
-"""The independent re-check of a search's answer (docs/design.md, "Verification"). A verdict's rule stands here only.
-
-Every trial renders a configuration with a seed nobody has used, at a sample count shown to be high enough, with the
-pixels rounded to 8 bits, and has a task judge what the model says of it. The clean configuration goes through exactly
-the same trials as a control group.
-"""
+"""The independent re-check of a search's answer (docs/design.md, "Verification"): fresh seeds, enough samples, 8 bits,
+a task that judges, and a control group of the clean configuration. A verdict's rule stands here only."""
 
 from __future__ import annotations
 
@@ -102,7 +98,6 @@ class Rule:
         return max(share, self.fewest)
 
     def allowed(self, trials: int) -> int:
-        """Return how many of `trials` may fail."""
         return trials - self.needed(trials)
 
     @property
@@ -111,7 +106,6 @@ class Rule:
         return next(n for n in itertools.count(1) if clopper_pearson(self.share(n), n)[0] >= LEAST_RATE)
 
     def share(self, trials: int) -> int:
-        """Return the percentage of so many trials, rounded up."""
         return -(-self.percent * trials // 100)
 
     def succeeded(self, trial: Judgement, clean: Judgement) -> bool:
@@ -177,7 +171,6 @@ class Verification:
         adversarial: successes, by `Rule.succeeded`.
         clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
             group is the shorter.
-        renders: renders spent here.
         stopped: why there are no more trials: "asked for" (as many as were), "decided" (the verdict is certain, or
             stands).
         outcomes: of each trial of the second group, whether it is a success; None where it does not count, as under
@@ -197,13 +190,11 @@ class Verification:
 
     @property
     def counting(self) -> tuple[Judgement, ...]:
-        """The trials that the rate is of; all of them where none counts."""
         trials = zip(self.adversarial_trials, self.outcomes, strict=True)
         return tuple(trial for trial, outcome in trials if outcome is not None) or self.adversarial_trials
 
     @property
     def successes(self) -> tuple[Judgement, ...]:
-        """The trials that are a success."""
         return tuple(trial for trial, outcome in zip(self.adversarial_trials, self.outcomes, strict=True) if outcome)
 
 
@@ -225,18 +216,8 @@ def run_trials(
     end sooner where `until`, asked after every trial, says so.
 
     Args:
-        evaluate: answers the queries; see `Query`.
-        u: (d,) the configuration.
-        spp: samples a pixel.
-        seed: root of the seeds.
-        trials: how many there are then.
         first: how many of them there are already, which are left out.
-        kind: of their rows.
         keep: the pictures of the first so many are wanted.
-        until: see above.
-
-    Raises:
-        InputError: trials or spp under 1.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
@@ -291,30 +272,18 @@ def verify(
     is shown by the probability of every outcome (`benchmarks/verdicts.py`).
 
     Args:
-        evaluate: answers the queries; see `Query`.
         domain: the budget; the clean configuration is its start.
-        u: (d,) the answer; projected into the domain again.
-        claim: the search's ending.
-        spp: samples per pixel, from `choose_spp`.
         seed: root seed. Must not be one that the search rendered with through the same stream.
         trials: per group; or rising numbers, see above.
         clean: the first trials of the clean configuration, where `run_trials` has run them with the same spp and seed
             (one control group serves the attack and its baseline); what is missing is run here.
-        rule: when the claim counts.
-        kind: of the rows of the answer's trials.
-        control: of the rows of those of the clean configuration.
-        keep: the pictures of so many of them are wanted.
         curtailed: see above; for an answer of which only the verdict matters.
-
-    Raises:
-        InputError: trials or spp under 1.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     least = 0 if curtailed or len(looks) == 1 else rule.fewest
     u, beside, done, renders = domain.project(u), list(clean), list[Judgement](), 0
 
     def tried(others: Sequence[Judgement]) -> tuple[bool | None, ...]:
-        """What comes of trials, beside the clean ones."""
         return tuple(
             rule.succeeded(trial, clean) if clean.right or not rule.conditional else None
             for trial, clean in zip(others, beside, strict=False)

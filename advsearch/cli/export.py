@@ -16,11 +16,10 @@ from advsearch.cli.question import Command
 from advsearch.errors import InputError
 from advsearch.report.sheets import MOST_SHEETS, write_sheets
 from advsearch.runs.directory import PARTS, find_run
-from advsearch.runs.export import FORMATS, write_rows
+from advsearch.runs.export import FORMATS, write_rows, write_threedb
 from advsearch.runs.fiftyone import write_fiftyone
 from advsearch.runs.files import placed_by, replacing
 from advsearch.runs.store import NAME, Store
-from advsearch.runs.threedb import write_threedb
 from advsearch.viewer.thumbnails import kept_pictures, name_of_object, pictured
 
 Written = tuple[dict[str, object], str]

@@ -77,7 +77,7 @@ def _inside(scene: str) -> str:
 
     # late, so that --help answers at once
     from advsearch.scene.importing.scenes import MITSUBA_FILE, node_names
-    from advsearch.scene.mitsuba_backend.files.scene import contents
+    from advsearch.scene.mitsuba_backend.scene_files import contents
 
     path = Path(scene)
     names = contents(path).objects if path.suffix.lower() == MITSUBA_FILE else node_names(path)

@@ -110,7 +110,7 @@ def _slow(whole: ObjectAsset) -> list[str]:
 def _mitsuba(args: argparse.Namespace, out: Path | None) -> Callable[[], int]:
     """Read and picture, as its first camera sees it, a Mitsuba scene; return what prints what was understood."""
     # late: another thing has this name here
-    from advsearch.scene.mitsuba_backend.files.scene import contents
+    from advsearch.scene.mitsuba_backend.scene_files import contents
 
     found = contents(Path(args.file))
     warnings: tuple[str, ...] = ()
@@ -170,7 +170,7 @@ def _threedb_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _import_threedb(args: argparse.Namespace) -> int:
-    from advsearch.engine.sweeps.imported import import_threedb  # takes seconds
+    from advsearch.engine.sweeps.summary import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)
     if args.json:

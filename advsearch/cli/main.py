@@ -29,14 +29,14 @@ from advsearch.rooms import there
 
 GROUPS = {
     "ask: what does a model get wrong?": {
-        "attack": "advsearch.questions.attack.command",
-        "sweep": "advsearch.questions.sweep.command",
-        "gap": "advsearch.questions.gap.command",
-        "region": "advsearch.questions.region.command",
-        "explain": "advsearch.questions.explain.command",
-        "compare": "advsearch.questions.compare.command",
-        "recipe": "advsearch.questions.recipe.command",
-        "harden": "advsearch.questions.harden.command",
+        "attack": "advsearch.questions.attack",
+        "sweep": "advsearch.questions.sweep",
+        "gap": "advsearch.questions.gap",
+        "region": "advsearch.questions.region",
+        "explain": "advsearch.questions.explain",
+        "compare": "advsearch.questions.compare",
+        "recipe": "advsearch.questions.recipe",
+        "harden": "advsearch.questions.harden",
     },
     "look: at scenes, names and answers": {
         "render": "advsearch.cli.show:RENDER render a picture of a scene, and say what the model sees in it",
@@ -44,18 +44,18 @@ GROUPS = {
         "show what a run found, or the details of a control, a policy, a task or a recipe",
         "view": "advsearch.cli.dashboard:VIEW write the page of a run again, or a folder that any web server can serve",
         "dashboard": "advsearch.cli.dashboard:DASHBOARD show the pages of runs in a browser on this machine",
-        "report": "advsearch.questions.report.command",
+        "report": "advsearch.questions.report",
         "list": "advsearch.cli.names:LIST "
         "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes",
         "labels": "advsearch.cli.names:LABELS find the names of a model's classes, as --label takes them",
     },
     "trust: does an answer hold, and is the tool right?": {
-        "test": "advsearch.questions.test.command",
-        "replay": "advsearch.questions.replay.command",
-        "check": "advsearch.questions.check.command",
-        "plan": "advsearch.questions.plan.command",
-        "precision": "advsearch.questions.precision.command",
-        "stability": "advsearch.questions.stability.command",
+        "test": "advsearch.questions.test",
+        "replay": "advsearch.questions.replay",
+        "check": "advsearch.questions.check",
+        "plan": "advsearch.questions.plan",
+        "precision": "advsearch.questions.precision",
+        "stability": "advsearch.questions.stability",
         "doctor": "advsearch.cli.doctor:DOCTOR check every part that a run needs, with versions and how to mend it",
     },
     "files and runs: repeat, continue, bring in, take out": {

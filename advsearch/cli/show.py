@@ -22,8 +22,7 @@ from advsearch.report.phrases import seen_cells, seen_text
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
-from advsearch.runs.results.base import plain
-from advsearch.runs.results.render import RenderResult
+from advsearch.runs.results.base import RenderResult, plain
 from advsearch.runs.summary import NAME, read_result
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
 
 def photos_of(run: Path) -> PhotoAgreement | None:
     """Return how photographs agree with the run's renderings; None where there are none."""
-    from advsearch.questions.photographs.files import FOLDER  # works without that room
+    from advsearch.questions.photographs.answer import FOLDER  # works without that room
 
     if not (run / IMAGES / FOLDER).is_dir():
         return None

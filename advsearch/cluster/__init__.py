@@ -1,5 +1,185 @@
-"""Work on many processors: batches carried out somewhere, here by default, and on workers of Dask when asked.
+"""Work on many processors: batches carried out by an `Executor`, in this process (`InProcess`), or on a `Pool` of
+workers (`coordinator.Coordinator`). Anybody may do it, any number of times: it depends on the batch and the run's
+settings alone."""
 
-`executor` is all that the rest of advsearch knows of it. A batch may be carried out by anybody, any number of times:
-what comes of it depends on it and on the run's settings alone.
-"""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from advsearch.files import JsonObject
+
+Call = Callable[[Sequence[Any]], Any]
+"""What carries out one batch; a pure function of it."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What batches are of, so that another process can carry them out.
+
+    Attributes:
+        function: ``"package.module:function"``; it takes the settings and returns a `Call`.
+        settings: JSON values that decide everything.
+        files: names of those settings that may hold paths, separated by commas. Files go along with the work.
+        threads: processor threads of a worker.
+        seconds: that a batch may take at least, where that is known beforehand; None goes by the median.
+        ahead: whether a worker has its next batch before it is done with one; not where batches take long.
+    """
+
+    function: str
+    settings: JsonObject
+    files: tuple[str, ...] = ()
+    threads: int = 1
+    seconds: float | None = None
+    ahead: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Done:
+    """What came of one batch, or of a part of one that workers died of; what the call returned; who carried it out,
+    empty in this process; what machine that is, by its name in `Workforce.machines`, None where it is like this one;
+    and why nothing came back, only of batches of one item."""
+
+    items: Sequence[Any]
+    value: Any
+    worker: str = ""
+    machine: str | None = None
+    lost: str = ""
+
+
+@dataclass
+class Workforce:
+    """How the workers did.
+
+    Attributes:
+        workers: that are ready.
+        most: that were ready at once.
+        lost: that went away before they were told to.
+        refused: that cannot do the work, and why, in words.
+        retried: batches that were given out again.
+        batches: that came back.
+        busy: seconds that workers spent on batches.
+        loading: seconds that they spent on getting ready.
+        alive: seconds that they were there and ready.
+        machines: name to description of those that are not like this one.
+        link: of a page that shows the workers; empty where there is none.
+    """
+
+    workers: int = 0
+    most: int = 0
+    lost: int = 0
+    refused: int = 0
+    retried: int = 0
+    batches: int = 0
+    busy: float = 0.0
+    loading: float = 0.0
+    alive: float = 0.0
+    machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    link: str = ""
+
+    @property
+    def told(self) -> dict[str, float | str]:
+        counts = {"lost": self.lost, "retried": self.retried}
+        return {"workers": self.workers, **{name: count for name, count in counts.items() if count}}
+
+
+class Executor(Protocol):
+    """Carries out batches."""
+
+    @property
+    def facts(self) -> Workforce | None:
+        """How the workers do; None where there are none."""
+
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+        """Carry out batches, and yield what comes of them, in any order, each once.
+
+        Only a few are taken from `batches` before their results are asked for. Where nobody goes on asking, what is
+        under way comes to nothing, and other batches may follow.
+
+        Raises:
+            AdvsearchError: what a batch raises, or there is nobody who can carry it out.
+        """
+
+
+class InProcess:
+    """Carries out one batch after the other in this process."""
+
+    facts: Workforce | None = None
+
+    def __init__(self, call: Call) -> None:
+        self._call = call
+
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+        """See `Executor.results`; they come in order."""
+        for items in batches:
+            yield Done(items, self._call(items))
+
+
+@dataclass(frozen=True)
+class Joined:
+    """The worker with that address is there."""
+
+    worker: str
+
+
+@dataclass(frozen=True)
+class Left:
+    """The worker with that address has gone, because it was told to or for another reason."""
+
+    worker: str
+    told: bool = False
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The call with that ticket has ended, and has returned the value."""
+
+    ticket: int
+    value: Any
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """The call with that ticket came to no end, because its worker or the connection went; the reason in words."""
+
+    ticket: int
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Disconnected:
+    """The scheduler has gone, and all workers with it."""
+
+
+Event = Joined | Left | Ended | Dropped | Disconnected
+
+
+class Pool(Protocol):
+    """A pool of workers, each of which does one call after the other in the order in which it was given them."""
+
+    @property
+    def link(self) -> str:
+        """Of a page that shows the workers; empty where there is none."""
+
+    @property
+    def where(self) -> str:
+        """What it is, in a user's words."""
+
+    def submit(self, ticket: int, worker: str, function: Callable[..., Any], *args: Any) -> None:
+        """Have a worker call a function of a module; an `Ended` or `Dropped` with this ticket follows."""
+
+    def restart(self, worker: str) -> None:
+        """End a worker that does not answer; another may join in its place."""
+
+    def forget(self, ticket: int) -> None:
+        """Nothing will be done with the answer of this call."""
+
+    def events(self, seconds: float) -> list[Event]:
+        """Return what has happened since the last time; wait so long at most where nothing has."""
+
+    def reconnect(self) -> None:
+        """Find the scheduler again, or start another."""
+
+    def close(self) -> None:
+        """Let the workers go, those that were started for this pool for ever."""

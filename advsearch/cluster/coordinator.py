@@ -1,9 +1,6 @@
-"""Gives batches to workers and takes what comes of them, whatever happens to the workers.
-
-Every batch is pinned to one worker, which has `DEPTH` of them at most. A batch whose worker died is given to another,
-from then on as the only one that a worker has, so that it is known what it died of: after `DEATHS` such deaths the
-batch is cut in halves, and a single item that has as many is given up in words. A worker that takes far longer than
-the median counts as dead. Answers that come later than that change nothing: their tickets are not known any more.
+"""Gives batches to workers, `DEPTH` at most to each, and takes what comes of them. A batch whose worker died is then
+the only one that a worker has, so that it is known what it died of: after `DEATHS` it is cut in halves, and a single
+item given up in words. A worker that takes far longer than the median counts as dead; its late answers change nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.cluster.executor import Disconnected, Done, Dropped, Ended, Event, Joined, Left, Pool, Work, Workforce
+from advsearch.cluster import Disconnected, Done, Dropped, Ended, Event, Joined, Left, Pool, Work, Workforce
 from advsearch.cluster.worker import Carried, Failure, Files, MachineInfo, Ready, carry_out_batch, machine_name, prepare
 from advsearch.errors import ClusterError
 
@@ -63,18 +60,7 @@ class _Worker:
 
 
 class Coordinator:
-    """An `Executor` over a pool of workers.
-
-    Args:
-        pool: the workers.
-        work: what batches are of.
-        key: of the work, by its content.
-        files: that it needs.
-        version: of advsearch.
-        machine: this one, where rows of its kind need no mark.
-        tell: told what a person should read.
-        clock: seconds, growing.
-    """
+    """An `Executor` over a pool of workers. Rows that are made on a machine like `machine` need no mark."""
 
     def __init__(
         self,
@@ -106,11 +92,6 @@ class Coordinator:
         self._counted_at = self._alone_since = self._looked_at = clock()
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
-        """See `Executor.results`.
-
-        Raises:
-            ClusterError: nobody can carry them out, or the scheduler has gone.
-        """
         self._let_go()  # what an earlier call has left under way
         self._call += 1
         call, source = self._call, iter(batches)

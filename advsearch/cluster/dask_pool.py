@@ -1,30 +1,34 @@
-"""A pool of Dask's workers: of processes on this machine, of a scheduler that runs, or of a cluster that is started.
-
-Dask carries calls and answers, and starts and watches processes; who does what is decided in `coordinator`. All of it
-runs in an event loop of its own, in a thread. Nothing is kept on the cluster: an answer is fetched and let go.
-
-What is relied on (https://distributed.dask.org): the scheduler tells the topic "all" of each worker that it adds and
-removes; a call that is pinned to a worker runs nowhere else; a nanny starts a worker that died again, at another
-address; processes are spawned, and end with their parent.
-"""
+"""From what a user says (`workers`, `cluster`) to an executor over workers of Dask, in an event loop of its own. Relied
+on (https://distributed.dask.org): the scheduler tells the topic "all" of each worker that it adds and removes; a call
+that is pinned to a worker runs nowhere else; a nanny starts a worker that died again, at another address; processes are
+spawned, and end with their parent."""
 
 from __future__ import annotations
 
+import ast
 import asyncio
+import hashlib
+import importlib
 import importlib.util
+import json
 import logging
 import queue
+import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from advsearch.cluster.executor import Disconnected, Dropped, Ended, Event, Joined, Left
-from advsearch.cluster.worker import Failure
-from advsearch.errors import ClusterError
+from advsearch import threads
+from advsearch.cluster import Disconnected, Dropped, Ended, Event, Executor, Joined, Left, Work
+from advsearch.cluster.coordinator import Coordinator
+from advsearch.cluster.worker import Failure, read_files, this_machine, version
+from advsearch.errors import ClusterError, FileFormatError, InputError
+from advsearch.settings import read_yaml
 
 CONNECT, RECONNECT = 30.0, 120.0
 """Seconds to find a scheduler at first, and to find it again when it has gone."""
@@ -55,15 +59,8 @@ CONFIG = {
 
 @dataclass(frozen=True)
 class Site:
-    """Where workers are.
-
-    Attributes:
-        where: in a user's words.
-        address: of a scheduler that runs; empty where a cluster is started.
-        start: makes the cluster; takes keywords of Dask's classes.
-        security: keywords of Dask's `Security`.
-        count: workers to ask a cluster for; None leaves it as it starts.
-    """
+    """Where workers are, in a user's words: the address of a scheduler that runs, or what starts a cluster and with how
+    many workers (None: as it starts); and keywords of Dask's `Security`."""
 
     where: str
     address: str = ""
@@ -96,14 +93,7 @@ def local(workers: int) -> Site:
 
 
 class DaskPool:
-    """See `pool.Pool`. Close it.
-
-    Args:
-        place: where the workers are.
-
-    Raises:
-        ClusterError: there is no scheduler, or it could not be started.
-    """
+    """See `pool.Pool`. Close it."""
 
     def __init__(self, place: Site) -> None:
         self.where, self.link = place.where, ""
@@ -209,7 +199,8 @@ class DaskPool:
                         "one with dask scheduler, check address and certificates, and go on with advsearch resume"
                     ) from error
                 await asyncio.sleep(LOOK)
-        self.link = self._dashboard()
+        drawn = importlib.util.find_spec("bokeh") is not None  # what Dask draws its pages with
+        self.link = str(self._client.dashboard_link or "") if drawn else ""
         self._known = set()
         self._client.subscribe_topic("all", self._told)
         await self._look_around()
@@ -231,10 +222,6 @@ class DaskPool:
                     await asyncio.wait_for(one.close(), RESTART)
                 except Exception:  # its other end is not there any more
                     logging.getLogger(__name__).debug("closing %r failed", one, exc_info=True)
-
-    def _dashboard(self) -> str:
-        drawn = importlib.util.find_spec("bokeh") is not None  # what Dask draws its pages with
-        return str(self._client.dashboard_link or "") if drawn else ""
 
     async def _call(self, ticket: int, worker: str, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
         # comes with the extra `dask`
@@ -274,7 +261,6 @@ class DaskPool:
                 logging.getLogger(__name__).debug("%s could not be ended", worker, exc_info=True)
 
     def _told(self, event: tuple[float, Any]) -> None:
-        """The scheduler tells of a worker."""
         _, message = event
         action = message.get("action") if isinstance(message, Mapping) else None
         if action == "add-worker":
@@ -328,3 +314,130 @@ def _failure(error: Exception) -> Failure:
     if isinstance(error, (ImportError, AttributeError)):
         return Failure(f"it cannot begin ({text}); install the same advsearch there", unfit=True)
     return Failure(text, trace=text)
+
+
+LOCAL = "local"
+"""The cluster of this machine's own processes."""
+
+SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
+
+CLASSES = {
+    **dict.fromkeys(
+        ("SLURMCluster", "PBSCluster", "LSFCluster", "SGECluster", "MoabCluster", "OARCluster", "HTCondorCluster"),
+        "dask_jobqueue",
+    ),
+    "KubeCluster": "dask_kubernetes.operator",
+}
+"""Classes of clusters that a file may name, and where each is; anything else would be code that the file runs."""
+
+
+@contextmanager
+def executor_of(
+    work: Work, *, workers: int | None, cluster: str | None, tell: Callable[[str], None]
+) -> Iterator[Executor | None]:
+    """Open an executor of a work for the block, on a cluster by its scheduler's address, "local", or a YAML file; None
+    where everything is done in this process."""
+    if workers is None and cluster is None:
+        yield None
+        return
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("workers: needs Dask; pip install 'advsearch[dask]', or leave `workers` out") from None
+    files = read_files(work)
+    said = [work.function, work.settings, work.threads, sorted(files.named.items())]
+    key = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:32]
+    place = place_of(workers, cluster)
+    pool = DaskPool(place)
+    try:
+        if pool.link:
+            tell(f"Dask shows its workers at {pool.link}")
+        yield Coordinator(pool, work, key, files, version(), this_machine(), tell)
+    finally:
+        pool.close()
+
+
+def check_main() -> None:
+    """Check that workers on this machine can import the script that runs: each does, as `multiprocessing` has it, and
+    would ask again what is asked outside of `if __name__ == "__main__":`."""
+    main, name = sys.modules["__main__"], '`if __name__ == "__main__":`'
+    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
+    frame = sys._current_frames().get(threading.main_thread().ident or 0)
+    while frame is not None and not (frame.f_code.co_name == "<module>" and frame.f_globals is vars(main)):
+        frame = frame.f_back
+    if file is None or frame is None or (spec is not None and spec.name.endswith("__main__")):
+        return
+    try:
+        tree = ast.parse(Path(file).read_text(encoding="utf-8"))
+    except OSError:
+        raise InputError(f"workers: expected a script that they can import, got {file}; put it into a file") from None
+    except (ValueError, SyntaxError):
+        return
+    line, guards = frame.f_lineno, ("__name__", "parent_process", "current_process")
+    for one in (node for node in ast.walk(tree) if isinstance(node, ast.If) and node.lineno <= line):
+        leaves = any(isinstance(part, ast.NotEq) for part in ast.walk(one.test))  # where it is imported
+        if (leaves or line <= (one.end_lineno or 0)) and any(guard in ast.unparse(one.test) for guard in guards):
+            return
+    raise InputError(
+        f"workers: expected {file} to ask under {name}, got a call outside of it, in line {line}; put it there: "
+        "every worker imports the script and would ask again"
+    )
+
+
+def place_of(workers: int | None, cluster: str | None) -> Site:
+    """Return where so many workers are: of a scheduler's address, "local", or a YAML file; by default on this machine,
+    one a core."""
+    if cluster is None or cluster == LOCAL:
+        check_main()
+        return local(workers or threads.cores())
+    if cluster.startswith(SCHEMES):
+        if workers is not None:
+            raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
+        return Site(cluster, address=cluster)
+    path = Path(cluster)
+    if path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            f"cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, local, or a .yaml file, got "
+            f"{cluster!r}"
+        )
+    return _from_file(path, workers)
+
+
+def _from_file(path: Path, workers: int | None) -> Site:
+    said = read_yaml(path)
+    unknown = sorted(set(said) - {"address", "class", "arguments", "workers", "security"})
+    if unknown or ("address" in said) == ("class" in said):
+        got = f"got {', '.join(map(str, unknown))}" if unknown else "got both or neither"
+        raise FileFormatError(
+            f"{path}: expected either address, or class with arguments and workers; beside it security; {got}"
+        )
+    security, arguments = (_mapping(path, said, name) for name in ("security", "arguments"))
+    for name in ("tls_ca_file", "tls_client_cert", "tls_client_key", "tls_scheduler_cert", "tls_scheduler_key"):
+        if isinstance(security.get(name), str):
+            security[name] = str(path.parent / security[name])
+    count = workers if workers is not None else said.get("workers")
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+        raise FileFormatError(f"{path}: workers: expected a whole number of at least 1, got {count!r}")
+    if "address" in said:
+        if not str(said["address"]).startswith(SCHEMES):
+            raise FileFormatError(f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT")
+        if count is not None:
+            raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
+        return Site(str(said["address"]), address=str(said["address"]), security=security or None)
+    name = str(said["class"])
+    if name not in CLASSES:
+        raise FileFormatError(f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}")
+    module = CLASSES[name]
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except ImportError:
+        package = module.partition(".")[0].replace("_", "-")
+        raise InputError(f"cluster: {name} needs {package}; pip install {package}") from None
+    return Site(name, start=lambda **more: found(**{**arguments, **more}), security=security or None, count=count or 1)
+
+
+def _mapping(path: Path, said: Mapping[str, Any], name: str) -> dict[str, Any]:
+    given = said.get(name) or {}
+    if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
+        raise FileFormatError(f"{path}: {name}: expected names and values, got {given!r}")
+    return dict(given)

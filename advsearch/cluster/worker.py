@@ -1,12 +1,6 @@
-"""What runs on a worker. It gets ready for a work once, then carries out batches of it; it never sees the store.
-
-Errors go back as values: an exception of ours may not survive being pickled, and says more than its class.
-
-A worker says what it runs on, as far as it decides the last bits of a row, and whether it is the same advsearch. Files
-that a work needs are known by the digest of what is in them, and are sent once, where they are not. A mesh may name
-other files beside it, so what goes along with one is its folder: the files in it and below of the kinds that a scene
-consists of.
-"""
+"""What runs on a worker: it gets ready for a work once, then carries out batches. Errors go back as values, as they may
+not survive being pickled. Files that a work needs are known by their digest and sent once; with a mesh goes its folder,
+files in it and below of the kinds that a scene consists of."""
 
 from __future__ import annotations
 
@@ -29,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
-from advsearch.cluster.executor import Call, Work
+from advsearch.cluster import Call, Work
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
@@ -42,11 +36,7 @@ MachineInfo = dict[str, str]
 
 @cache
 def this_machine() -> MachineInfo:
-    """Return the processor, libLLVM, and versions of packages.
-
-    Raises:
-        EnvironmentSetupError: there is no libLLVM that can be used; the message says what to type.
-    """
+    """Return the processor, libLLVM, and versions of packages."""
     llvm = ".".join(map(str, ensure_llvm().version))
     return {"processor": processor(), "LLVM": llvm, **{name: _version(name) for name in PACKAGES}}
 
@@ -96,12 +86,8 @@ LARGEST = 1 << 30
 
 @dataclass(frozen=True)
 class Files:
-    """The files that a work's settings name.
-
-    Attributes:
-        named: of each path in the settings, the digest of its folder's part and its name in it.
-        contents: of each digest, relative path to content; empty where they are not sent.
-    """
+    """The files that a work's settings name: of each path, the digest of its folder's part and its name in it; and of
+    each digest, relative path to content, empty where they are not sent."""
 
     named: Mapping[str, tuple[str, str]]
     contents: Mapping[str, Mapping[str, bytes]]
@@ -113,7 +99,6 @@ class Files:
 
     @property
     def named_only(self) -> Files:
-        """The same without contents."""
         return Files(self.named, {})
 
 
@@ -122,11 +107,7 @@ class MissingError(Exception):
 
 
 def read_files(work: Work) -> Files:
-    """Read the files that the settings of a work name.
-
-    Raises:
-        InputError: together they are larger than can be sent.
-    """
+    """Read the files that the settings of a work name."""
     named, contents = {}, {}
     for path in _paths(work):
         files = _contents(path)
@@ -142,12 +123,7 @@ def read_files(work: Work) -> Files:
 
 
 def write_files(work: Work, files: Files, folder: Path) -> Work:
-    """Write files that were sent into folders of their digests, and return the work with the paths that hold here.
-
-    Raises:
-        MissingError: a file was not sent, and is not here.
-        OSError: they cannot be written.
-    """
+    """Write files that were sent into folders of their digests, and return the work with the paths that hold here."""
     for digest, contents in files.contents.items():
         for name, data in contents.items():
             path = folder / digest / name
@@ -165,7 +141,6 @@ def write_files(work: Work, files: Files, folder: Path) -> Work:
 
 
 def _here(path: str, digest: str, sent: Path) -> str:
-    """The path that has the file here: the same as there, or that of what was sent."""
     for one in (Path(path), sent):
         if one.is_file() and _digest(_contents(one)) == digest:
             return str(one)
@@ -218,12 +193,7 @@ _one_at_a_time = threading.Lock()
 
 @dataclass(frozen=True)
 class Ready:
-    """A worker is ready.
-
-    Attributes:
-        machine: what it runs on.
-        seconds: that it took.
-    """
+    """A worker is ready."""
 
     machine: MachineInfo
     seconds: float
@@ -231,12 +201,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class Carried:
-    """A batch was carried out.
-
-    Attributes:
-        value: what came of it.
-        seconds: that it took.
-    """
+    """A batch was carried out."""
 
     value: Any
     seconds: float
@@ -244,15 +209,8 @@ class Carried:
 
 @dataclass(frozen=True)
 class Failure:
-    """Something went wrong.
-
-    Attributes:
-        text: what, as a user reads it.
-        unfit: whether the worker is at fault and another one may do it.
-        forgotten: whether the worker has not got ready, or not any more.
-        missing: whether it lacks files.
-        trace: of what is a bug; empty for an error that a user can put right.
-    """
+    """Something went wrong, as a user reads it: another worker may do it (`unfit`), the worker is not ready (any more),
+    or it lacks files. What is a bug has a trace."""
 
     text: str
     unfit: bool = False
@@ -262,14 +220,7 @@ class Failure:
 
 
 def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
-    """Get ready for a work.
-
-    Args:
-        key: of the work.
-        work: what is to be done.
-        files: that it needs.
-        asked: the version of advsearch that asks.
-    """
+    """Get ready for a work that a version of advsearch asks for."""
     begun = time.perf_counter()
     if version() != asked:
         return Failure(f"it has advsearch {version()}, and {asked} asks; install the same on both", unfit=True)

@@ -20,7 +20,7 @@ from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.road import on_its_ground
+from advsearch.scene.grounds import on_its_ground
 from advsearch.scene.settings import CHANNELS
 
 COLOR = "backdrop.color"

@@ -21,8 +21,8 @@ from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.gradients import WHOLE_RANGE as WHOLE_RANGE
 from advsearch.scene.gradients import Budget as Budget
 from advsearch.scene.gradients import Group as Group
-from advsearch.scene.parameters import Parameter as Parameter
 from advsearch.scene.parts import MeshPart, PluginPart
+from advsearch.scene.settings import Parameter as Parameter
 
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 """No scene inputs yet."""

@@ -1,9 +1,9 @@
 """The `camera` control: an orbit around the object, the lens, and the exposure.
 
 The camera looks at the middle of the object in its default pose. Its lens bends as a calibrated one does where a
-coefficient is asked for, or a camera file has one: see `advsearch.scene.cameras.model`. While the distance is not
+coefficient is asked for, or a camera file has one: see `advsearch.scene.camera_model`. While the distance is not
 searched or set, it follows the field of view so that the object keeps its place in the picture (a dolly zoom), down to
-where the camera would enter the sphere around the object: see `advsearch.scene.framing`.
+where the camera would enter the sphere around the object: see `advsearch.scene.geometry`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
-from advsearch.scene.cameras.model import COEFFICIENTS, NUMBERS, OF_KIND, CameraModel, pinhole
+from advsearch.scene.camera_model import COEFFICIENTS, NUMBERS, OF_KIND, CameraModel, pinhole
 from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
-from advsearch.scene.framing import framing_distance, middle
-from advsearch.scene.geometry import affine, camera_to_world
+from advsearch.scene.geometry import affine, camera_to_world, framing_distance, middle
 from advsearch.scene.settings import CAMERA, ORBIT, moving
 
 SENSOR_WIDTH = 36.0

@@ -32,7 +32,7 @@ from advsearch.controls.base import NOTHING, BoundControl, Choice, Control, Grou
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.surface_map import welded
+from advsearch.scene.raster import welded
 
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -1,7 +1,7 @@
 """The `haze` control: a uniform haze around camera and object, by how dense it is and of which colour.
 
 A share `1 - exp(-density * l)` of the light is taken out of a line of length l (Beer and Lambert), and scattered light
-comes in: `advsearch.scene.mitsuba_backend.haze_path` has the equation. Colour is the share that is scattered and not
+comes in: `advsearch.scene.mitsuba_backend.own_plugins` has the equation. Colour is the share that is scattered and not
 absorbed, per channel: white haze takes nothing away, dark haze is smoke. Haze fills a ball; the environment is outside.
 """
 

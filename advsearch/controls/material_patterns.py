@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from advsearch.scene.assets import Floats, Material, Mesh
-from advsearch.scene.surface_map import looked_up, texel_positions
+from advsearch.scene.raster import looked_up, texel_positions
 
 Doubles = npt.NDArray[np.float64]
 Grid = tuple[Doubles, Doubles]

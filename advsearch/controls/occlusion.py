@@ -27,7 +27,7 @@ from advsearch.errors import InputError
 from advsearch.files import reading
 from advsearch.scene import library, silhouettes
 from advsearch.scene.assets import Material, Mesh, ObjectAsset, normalised
-from advsearch.scene.cameras.model import CameraModel
+from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, object_to_world
 from advsearch.scene.importing.objects import import_object

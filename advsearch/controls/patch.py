@@ -23,7 +23,7 @@ from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, One
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.importing.images import read_picture
+from advsearch.scene.importing.pictures import read_picture
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")

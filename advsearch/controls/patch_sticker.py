@@ -21,11 +21,11 @@ from scipy import spatial
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import Doubles, camera_to_world, object_to_world
-from advsearch.scene.surface_map import Charts, MeshSurface, rasterised
+from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.raster import Charts, MeshSurface, rasterised
 
 BASE_SIDES = (512, 1024)
 """Smallest and largest side of the base-colour map that is painted into, in texels."""

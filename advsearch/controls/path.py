@@ -23,8 +23,7 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
 from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
-from advsearch.scene.framing import middle
-from advsearch.scene.geometry import affine, camera_to_world, object_to_world
+from advsearch.scene.geometry import affine, camera_to_world, middle, object_to_world
 from advsearch.scene.settings import GEOMETRIC, ORBIT, moving
 
 APPROACH, PASS, TURN = "approach", "pass", "orbit"

@@ -26,7 +26,7 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.mitsuba_backend.sunsky import sunsky_tables
+from advsearch.scene.mitsuba_backend.parts import sunsky_tables
 
 ROWS, COLUMNS = 256, 512
 """Size of the map."""

@@ -25,11 +25,11 @@ from torch import Tensor
 from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Control, Group, Parameter, Value
 from advsearch.controls.values import LARGEST_EPSILON
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.assets import Bools, Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.surface_map import Mask, texel_area, texels_of_faces
+from advsearch.scene.raster import texel_area, texels_of_faces
 
 RESOLUTIONS = (256, 512)
 """Smallest and largest side that is taken from the object's own texture when none is asked for."""
@@ -163,7 +163,7 @@ class TextureControl(Control):
         where = self._texels_of(mesh, names, (own.shape[0], own.shape[1]))
         return BoundTexture(self.name, mesh.name, own, self._painter(mesh.mesh, own, where), where, ", ".join(names))
 
-    def _texels_of(self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]) -> Mask:
+    def _texels_of(self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]) -> Bools:
         """Which texels (h, w) only lookups on some materials read."""
         known, whose = part.mesh.materials, "the object" if part.name == OBJECT else part.name
         if not known:
@@ -180,7 +180,7 @@ class TextureControl(Control):
             )
         return where
 
-    def _painter(self, mesh: Mesh, original: Tensor, where: Mask | None) -> Painter:
+    def _painter(self, mesh: Mesh, original: Tensor, where: Bools | None) -> Painter:
         shape = original.shape[0], original.shape[1]
         mask = torch.ones(shape, dtype=torch.bool) if where is None else torch.from_numpy(where)
         texels = original[mask]
@@ -266,7 +266,7 @@ class BoundTexture(BoundControl):
     are."""
 
     def __init__(
-        self, name: str, on: str, original: Tensor, painter: Painter, where: Mask | None = None, materials: str = ""
+        self, name: str, on: str, original: Tensor, painter: Painter, where: Bools | None = None, materials: str = ""
     ) -> None:
         self.name = name
         self._on = on

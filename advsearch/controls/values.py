@@ -21,8 +21,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import ENVIRONMENT, SceneDescription, check_one_environment
-from advsearch.scene.parameters import Parameter
-from advsearch.scene.settings import SETTINGS
+from advsearch.scene.settings import SETTINGS, Parameter
 
 Number = float | str
 

@@ -18,31 +18,17 @@ from advsearch import seeds
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
 from advsearch.attacks.policies import POLICIES
-from advsearch.cluster.executor import Executor, Work
-from advsearch.cluster.opening import executor_of
+from advsearch.cluster import Executor, Work
+from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.config.attack import OVER_NUMBERS, OVER_ONE, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.values import sentences
-from advsearch.engine import run_settings
-from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
-from advsearch.engine.loading import (
-    SCENE,
-    Controls,
-    Scene,
-    framed,
-    lent,
-    make_renderer,
-)
-from advsearch.engine.metrics import Metrics, load_metrics
-from advsearch.engine.naming import (
-    AnyModel,
-    load_models,
-    scene_of,
-    several,
-)
+from advsearch.engine.judging import Described, Looked, Metrics, check_truth, facts_of, load_metrics, shown
+from advsearch.engine.loading import SCENE, Controls, Scene, framed, lent, make_renderer
+from advsearch.engine.naming import AnyModel, check_run_settings, given_to, load_models, scene_of, several
 from advsearch.engine.objective import AnyObjective, objective_for, print_terms, task_for
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import CleanMatrix, reason_against
@@ -53,8 +39,7 @@ from advsearch.progress import Progress
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.directory import only_here as only_python_has
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import next_count
-from advsearch.scene.leaving_out import EVERYTHING, NOTHING
+from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
@@ -72,16 +57,12 @@ class AttackParts:
     """Everything that was asked for, found and loaded.
 
     Attributes:
-        config: the settings.
-        scene: loaded.
         loaded: the model, and what was said of it.
         task: not yet on the model.
         controls: what is searched.
         over: what varies by chance.
         objective: a name, or a function of the caller's.
-        policy: likewise.
         keep: whether the run is kept in a folder.
-        metrics: columns of the rows.
         clean: the matrix of light transport of the clean scene, which attacks may share.
     """
 
@@ -99,11 +80,7 @@ class AttackParts:
 
 
 def parts_of(config: AttackConfig) -> AttackParts:
-    """Find and load everything that a configuration names; nothing is rendered.
-
-    Raises:
-        InputError: anything that whoever asked can put right.
-    """
+    """Find and load everything that a configuration names; nothing is rendered."""
     if len(config.objects) > 1:
         raise one_only("object", config.objects)
     searched, drawn = controls_given(config, config.controls, config.over)
@@ -116,11 +93,7 @@ def parts_of(config: AttackConfig) -> AttackParts:
 
 
 def parts_in(run: Path) -> AttackParts:
-    """Find and load everything that the run of an attack was asked with, as its answer is judged.
-
-    Raises:
-        InputError: only the Python session that asked has what judges it.
-    """
+    """Find and load everything that the run of an attack was asked with, as its answer is judged."""
     if needed := [one for one in only_python_has(run) if not one.startswith(SEARCHED_WITH)]:
         raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its answer")
     return parts_of(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
@@ -139,9 +112,9 @@ def controls_given(
 ) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
     """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
     budget."""
-    run_settings.check(config)
+    check_run_settings(config)
     without_budget = config.model_copy(update={"epsilon": None})
-    return run_settings.given_to(config, searched), run_settings.given_to(without_budget, drawn)
+    return given_to(config, searched), given_to(without_budget, drawn)
 
 
 def task_and_objective(
@@ -162,35 +135,22 @@ def models_as_one(model: AnyModel | Sequence[AnyModel], config: AttackConfig, ta
 
 def check_from_config(config: AttackConfig) -> None:
     """Refuse what a configuration names that is not there, contradicts itself, or could not be judged; nothing is
-    rendered.
-
-    Raises:
-        InputError: as for `parts_of`.
-    """
+    rendered."""
     job = parts_of(config)
     _task(job, shows=False)
     _space(job, framed(job.scene.description, config.resolution or job.loaded[0].input_size))
 
 
 def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
-    """Load what a configuration describes without searching: the problem, and warnings on the way.
-
-    Args:
-        config: what.
-        denoise: another denoiser than the configuration's.
-    """
+    """Load what a configuration describes without searching: the problem, and warnings on the way."""
     job = parts_of(AttackConfig.of(config, denoise=denoise or config.denoise))
     problem = problem_on(job)
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
 
 def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, list[str]]:
-    """Return the problem that an attack was asked with, and warnings on the way.
-
-    Args:
-        parts: as a result has them.
-        **changes: settings that are different; of another `model`, its name.
-    """
+    """Return the problem that an attack was asked with, other settings in `changes` (of another `model`, its name), and
+    warnings on the way."""
     config = parts.config.model_copy(update=changes)
     model = (
         models_as_one(config.model, config, parts.task) if "model" in changes else (parts.loaded[0], [*parts.loaded[1]])
@@ -201,17 +161,7 @@ def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, li
 
 
 def problem_of(config: AttackConfig, scene: Scene, model: Model, *, differentiated: bool = True) -> Problem:
-    """Return the problem of a configuration on a scene and a model that are there, in place of those that it names.
-
-    Args:
-        config: what is asked for.
-        scene: a loaded one.
-        model: a loaded one.
-        differentiated: whether outlines may be; see `make_renderer`.
-
-    Raises:
-        InputError: as for `parts_of`.
-    """
+    """Return the problem of a configuration on a scene and a model that are there, in place of those that it names."""
     return problem_on(parts_given(config, scene, model), differentiated=differentiated)
 
 
@@ -281,7 +231,6 @@ def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Desc
 
 
 def _space(job: AttackParts, description: SceneDescription) -> Space:
-    """The searched controls and those that vary by chance, on a framed scene."""
     return make_space((*job.controls, *job.over), description)
 
 
@@ -319,14 +268,7 @@ def judged_alone(config: AttackConfig) -> AttackConfig:
 def executor_for(
     config: SceneConfig, function: str, progress: Progress, *, ahead: bool = True
 ) -> AbstractContextManager[Executor | None]:
-    """Return what carries out a function of a configuration, as its workers and cluster say; None for this process.
-
-    Args:
-        config: its settings are the function's.
-        function: see `Work`, as `ahead`.
-        progress: told what a person should read.
-        ahead: see there.
-    """
+    """Return what carries out a function of a configuration, as its workers and cluster say; None for this process."""
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     work = Work(function, settings, FILES, config.used_threads or 1, ahead=ahead)
     workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))

@@ -1,12 +1,6 @@
-"""Searches over base colours under conditions that vary by chance, by a matrix of light transport for each of many.
-
-Evaluations draw conditions from the bank. It begins with few and grows with each evaluation of the first half, by one
-for `GROWTH` that it draws; what is new is looked at at once. The second half is for learning what there is. Every
-`EVERY` evaluations the present configuration is traced under conditions that no matrix was made for: where these are
-not clearly better for the model than those in the bank, the bank does not grow until the next comparison. The oldest
-matrices make room where there is no memory. All of that follows from the seed, so that a run that goes on makes the
-same matrices and comparisons again.
-"""
+"""Searches over base colours under conditions that vary by chance, by a matrix of light transport for each of a growing
+bank of them (docs/transport.md). All of it follows from the seed, so that a run that goes on makes the same matrices
+and comparisons again."""
 
 from __future__ import annotations
 
@@ -29,7 +23,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Conditions, Deviation, Predictor, Tick, deviation_of
 from advsearch.files import scaled
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.transport.renderer import MOST_BYTES, LinearRenderer
+from advsearch.scene.transport.matrix import MOST_BYTES, LinearRenderer
 
 FIRST = 8
 """Conditions in the bank at first, in what an evaluation draws."""
@@ -63,11 +57,8 @@ def stratified(domain: Domain, number: int, seed: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """A matrix, and the numbers of the conditions that it was made for.
-
-    Attributes:
-        alone: whether base colours under it depend on what is searched alone.
-    """
+    """A matrix, and the numbers of the conditions that it was made for; `alone` if base colours under it depend on what
+    is searched alone."""
 
     number: int
     numbers: Tensor
@@ -77,15 +68,9 @@ class Condition:
 
 @dataclass
 class Bank(Predictor):
-    """The matrices of a run whose searches look at conditions that vary by chance.
-
-    Attributes:
-        problem: what is searched.
-        steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        answers: what is asked for light, as far as the next comparison.
-        grown: the comparisons, by index of the evaluation, after which the bank went on growing.
-        gaps: by how much the objective was larger in the bank than under unseen conditions, by comparison.
-    """
+    """The matrices of a run whose searches look at conditions that vary by chance: `steps` evaluations each, and what
+    comes after them belongs to the ranking, and is traced. After the comparisons `grown`, by evaluation, the bank went
+    on growing; `gaps` are by how much the objective was larger in it than under unseen conditions."""
 
     problem: Problem
     steps: int
@@ -140,6 +125,11 @@ class Bank(Predictor):
         answer = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
         return replace(answer, picture=to_8_bit(self._picture(query.u))) if query.keep else answer
 
+    def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
+        wholes = [torch.cat([u, one.numbers]) for one in chosen]
+        found = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
+        return replace(found, predicted=1)
+
     def _come_to(self, query: Query) -> None:
         """Compare where that is due, and have the matrices that there are by then."""
         if query.kind == "search" and query.phase == "search":
@@ -160,21 +150,14 @@ class Bank(Predictor):
         order = torch.randperm(len(rest), generator=generator).tolist()
         return new + [rest[number] for number in order[: count - len(new)]]
 
-    def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
-        wholes = [torch.cat([u, one.numbers]) for one in chosen]
-        found = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
-        return replace(found, predicted=1)
-
     def _pictures(self, chosen: Sequence[Condition], u: Tensor) -> Tensor:
         """Predicted pictures (N, H, W, 3) of u under conditions, with a graph."""
         alone = self.problem.searched_space.inputs(u)
-        return torch.stack([self._shown(one, u, alone) for one in chosen])
-
-    def _shown(self, one: Condition, u: Tensor, alone: dict[str, Tensor]) -> Tensor:
-        whole = torch.cat([u, one.numbers])
-        if not one.alone:
-            return one.renderer(whole)
-        return one.renderer.shown({name: alone[name] for name in one.renderer.there}, whole)
+        pictures = []
+        for one in chosen:
+            whole, made = torch.cat([u, one.numbers]), one.renderer
+            pictures.append(made.shown({name: alone[name] for name in made.there}, whole) if one.alone else made(whole))
+        return torch.stack(pictures)
 
     def _picture(self, u: Tensor) -> Tensor:
         """The picture of u under the conditions that the scene comes with."""
@@ -215,14 +198,10 @@ class Bank(Predictor):
         if first < wanted:
             self.seconds += time.perf_counter() - begun
 
-    def _numbers(self, number: int) -> Tensor:
-        """The condition with this number."""
-        assert self.problem.conditions is not None
-        return stratified(self.problem.conditions, number, seeds.stream(self.problem.seed, "bank"))
-
     def _query(self, number: int) -> Query:
-        """What is asked for the condition with this number: the light at its place."""
-        whole = torch.cat([self._place(number), self._numbers(number)])
+        assert self.problem.conditions is not None
+        numbers = stratified(self.problem.conditions, number, seeds.stream(self.problem.seed, "bank"))
+        whole = torch.cat([self._place(number), numbers])
         return Query(whole, seeds.stream(self.problem.seed, "bank matrix", number), spp=SPP, wanted="light")
 
     def _condition(self, number: int) -> Condition:

@@ -1,9 +1,5 @@
-"""Measures gradient estimators on a scene as it is: error, noise and cost, against differences (docs/gradients.md).
-
-A *probe* is a direction in u along which a derivative is measured: one coordinate, or, for a group of many (texels,
-modes), one direction in all of them. The reference is a central difference of the loss with common random numbers, at
-two step sizes, repeated with other seeds until its own noise is known and small.
-"""
+"""Measures gradient estimators on a scene as it is: error, noise and cost, along *probes*, directions in u, against
+central differences with common random numbers at two step sizes (docs/gradients.md)."""
 
 from __future__ import annotations
 
@@ -47,14 +43,9 @@ has a share of its range for a step, which may be too wide."""
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A direction along which a derivative is measured.
-
-    Attributes:
-        group: the group of coordinates.
-        name: `control.parameter`, with the coordinate's number if the group has several and they are probed singly.
-        direction: (d,) largest element 1; zero outside the group.
-        step: half-width of a difference along the direction.
-    """
+    """A `direction` (d,) along which a derivative is measured, largest element 1, zero outside the group; a difference
+    along it has the half-width `step`. The name is `control.parameter`, with the coordinate's number if a group has
+    several and they are probed singly."""
 
     group: Group
     name: str
@@ -64,15 +55,9 @@ class Probe:
 
 @dataclass(frozen=True)
 class Reference:
-    """A derivative by high-sample central differences.
-
-    Attributes:
-        value: mean over seeds, extrapolated from the two steps to a step of zero (Richardson).
-        noise: its standard error together with a quarter of the steps' disagreement.
-        steps: value at the larger and at the smaller step.
-        factor: the larger step as a multiple of the probe's.
-        renders: primal renders spent.
-    """
+    """A derivative by high-sample central differences: the mean over seeds, extrapolated from two `steps` to zero
+    (Richardson). Its `noise` is the standard error together with a quarter of the steps' disagreement; `factor` is the
+    larger step as a multiple of the probe's."""
 
     value: float
     noise: float
@@ -83,16 +68,8 @@ class Reference:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one estimator says along a probe.
-
-    Attributes:
-        estimator: its name.
-        value: mean over seeds.
-        noise: standard deviation of one estimate.
-        repeats: how many there were.
-        seconds: median time of one gradient of the group.
-        factor: step of its differences as a multiple of the plan's.
-    """
+    """What one estimator says along a probe: the mean over seeds, the standard deviation (`noise`) and median seconds
+    of one estimate. Differences are `factor` times as wide as planned."""
 
     estimator: str
     value: float
@@ -100,11 +77,6 @@ class Estimate:
     repeats: int
     seconds: float
     factor: float = 1.0
-
-    @property
-    def standard_error(self) -> float:
-        """Of the mean."""
-        return self.noise / math.sqrt(max(1, self.repeats))
 
 
 def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
@@ -297,7 +269,8 @@ def reference(
     if none is, the one with the least noise goes on.
     """
     before = renderer.renders
-    pairs = {factor: _Pairs(_widened(probe, factor)) for factor in factors}
+    steps = {factor: probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step) for factor in factors}
+    pairs = {factor: _Pairs(replace(probe, step=step)) for factor, step in steps.items()}
     for factor, tried in pairs.items():
         tried.extend(renderer, loss, u, seed, spp, until=repeats[0])
         if tried.error <= goal * abs(tried.value):
@@ -311,10 +284,6 @@ def reference(
     return Reference(found.value, found.noise, found.both, renderer.renders - before, best)
 
 
-def _widened(probe: Probe, factor: float) -> Probe:
-    return probe if factor == 1.0 else replace(probe, step=min(STEP_RANGE[1], factor * probe.step))
-
-
 @dataclass
 class _Pairs:
     """Differences at a probe's step and at half of it, with the same seeds."""
@@ -324,7 +293,6 @@ class _Pairs:
     narrow: list[float] = field(default_factory=list)
 
     def extend(self, renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, *, until: int) -> None:
-        """Add seeds until there are so many."""
         for number in range(len(self.wide), until):
             noise = seeds.stream(seed, "reference", number)
             self.wide.append(_difference(renderer, loss, u, self.probe, self.probe.step, noise, spp))
@@ -332,7 +300,6 @@ class _Pairs:
 
     @property
     def both(self) -> tuple[float, float]:
-        """Mean at the larger and at the smaller step."""
         return statistics.fmean(self.wide), statistics.fmean(self.narrow)
 
     @property
@@ -342,23 +309,18 @@ class _Pairs:
 
     @property
     def value(self) -> float:
-        """Mean of the extrapolated ones."""
         return statistics.fmean(self._at_zero)
 
     @property
     def error(self) -> float:
-        """Standard error of `value`."""
-        return _error(self._at_zero)
+        values = self._at_zero
+        return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.inf
 
     @property
     def noise(self) -> float:
         """Standard error together with a quarter of the steps' disagreement."""
         wide, narrow = self.both
         return math.hypot(self.error, 0.25 * (wide - narrow))
-
-
-def _error(values: Sequence[float]) -> float:
-    return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.inf
 
 
 def _difference(renderer: Renderer, loss: Loss, u: Tensor, probe: Probe, step: float, seed: int, spp: int) -> float:
@@ -377,14 +339,9 @@ def _difference(renderer: Renderer, loss: Loss, u: Tensor, probe: Probe, step: f
 
 @dataclass(frozen=True)
 class Agreement:
-    """How good an estimate is beside a reference, see `agreement`; the numbers are relative to the derivative's size.
-
-    Attributes:
-        status: in a word.
-        error: distance of the estimates' mean from the reference.
-        doubt: how much of it noise explains: `CONFIDENCE` standard errors of both.
-        noise: standard deviation of one estimate.
-    """
+    """How good an estimate is beside a reference, see `agreement`, relative to the derivative's size: the `error` of
+    the mean, how much of it noise explains (`doubt`: `CONFIDENCE` standard errors of both), and the `noise` of one
+    estimate."""
 
     status: GradientStatus
     error: float
@@ -407,7 +364,7 @@ def agreement(estimate: Estimate, against: Reference, beside: Sequence[Reference
     """
     size = max([abs(against.value), *(SMALL * abs(one.value) for one in beside)])
     difference = abs(estimate.value - against.value)
-    doubt = CONFIDENCE * math.hypot(estimate.standard_error, against.noise)
+    doubt = CONFIDENCE * math.hypot(estimate.noise / math.sqrt(max(1, estimate.repeats)), against.noise)
     status: GradientStatus
     if difference <= doubt and against.noise > LOUD * size:
         status = "reference unusable"

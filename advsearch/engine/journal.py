@@ -1,9 +1,6 @@
-"""The journal of a run: what was asked and answered, as rows of its store. A question that is in it is not asked again.
-
-So a run that was stopped goes on by asking everything once more, in the same order: it reads back what it knows, and a
-search comes to where it was by being told all of it. It goes on only with the functions and networks that it began
-with, which settings call by name only.
-"""
+"""The journal of a run: what was asked and answered, as rows of its store. What is in it is not asked again, so a run
+goes on by asking everything once more, with the functions and networks that it began with; the rest is answered in
+order, by workers where there are some."""
 
 from __future__ import annotations
 
@@ -14,10 +11,12 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import groupby
 from types import CodeType
-from typing import Any
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -25,16 +24,93 @@ from torch import Tensor
 
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.cluster.executor import Workforce
-from advsearch.engine.problem import Problem
-from advsearch.engine.rows import LOST, judged, judgement_of, trial_row
-from advsearch.engine.sharing import Shared
-from advsearch.errors import InputError
+from advsearch.cluster import Call, Executor, Workforce
+from advsearch.engine.problem import Prepared, Problem
+from advsearch.engine.record import LOST, judged, judgement_of, no_answer, trial_row
+from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
 from advsearch.tasks.together import Ensemble
+
+Sent: TypeAlias = tuple[str, Prepared | None, Query]
+"""The name of the problem, what it has been prepared with, and what is asked."""
+
+
+class Answering(Protocol):
+    """What answers queries: a `Problem`, or a scene of a sweep."""
+
+    prepared: Any
+
+    def answers(self, queries: Sequence[Query]) -> Iterable[Evaluation]:
+        """See `advsearch.attacks.evaluation.Evaluate`."""
+
+
+@dataclass
+class Shared:
+    """Answers queries of a problem: several at once by an executor of `answering`, where there is one, and all others
+    here. Its `name` tells it from others that workers hold."""
+
+    problem: Problem
+    executor: Executor | None = None
+    name: str = ""
+
+    def __call__(self, queries: Sequence[Query]) -> Iterable[Evaluation]:
+        if self.executor is None or len(queries) < 2:
+            return map(self.problem.evaluate, queries)
+        return self._sent(self.executor, queries)
+
+    @property
+    def facts(self) -> Workforce | None:
+        """How the workers do; None where there are none."""
+        return None if self.executor is None else self.executor.facts
+
+    @property
+    def told(self) -> dict[str, float | str]:
+        """The same, beside a bar."""
+        return {} if self.facts is None else self.facts.told
+
+    def _sent(self, executor: Executor, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """What workers say, each when it is its turn."""
+        sent: list[Sent] = [(self.name, self.problem.prepared, query) for query in queries]
+        early, turn = dict[int, Evaluation](), 0
+        numbers = {id(one): number for number, one in enumerate(sent)}
+        results: Any = executor.results([one] for one in sent)
+        with closing(results):
+            for done in results:
+                number = numbers[id(done.items[0])]
+                answer = lost(queries[number], done.lost) if done.lost else done.value[0]
+                early[number] = replace(answer, machine=done.machine)
+                while turn in early:
+                    self.problem.renderer.non_finite += early[turn].non_finite
+                    yield early.pop(turn)
+                    turn += 1
+
+
+def answering(named: Callable[[str], Answering]) -> Call:
+    """Return what answers queries that were sent: what a worker does."""
+
+    def call(sent: Sequence[Sent]) -> list[Evaluation]:
+        found = list[Evaluation]()
+        for name, some in groupby(sent, lambda one: one[0]):
+            listed, asked = list(some), named(name)
+            asked.prepared = listed[0][1]  # the same of all that are sent together
+            found += asked.answers([query for _, _, query in listed])
+        return found
+
+    return call
+
+
+def lost(query: Query, why: str) -> Evaluation:
+    """Return what stands for an answer that nobody could give."""
+    if query.wanted != "judgement":
+        what = "a picture" if query.wanted == "picture" else "the light of a condition"
+        raise ClusterError(f"{what}: {why}; `advsearch resume RUN workers=null` makes it here")
+    gradient = torch.zeros_like(query.u) if query.gradient else None
+    cost = 0 if query.phase is None else query.samples
+    return Evaluation(math.nan, gradient, False, cost=cost, judgement=no_answer(why), lost=True)
+
 
 MADE_OF = "made of"
 """The note of functions and weights."""
@@ -49,16 +125,7 @@ NEAR, LEAST = 1e-3, 1e-4
 def check_made_of(
     run: RunDirectory, models: Sequence[Model], functions: Mapping[str, Callable[..., Any] | None] | None = None
 ) -> None:
-    """Note what networks and functions are, or refuse to go on with others than a run began with.
-
-    Args:
-        run: open.
-        models: by the name that they have in the run.
-        functions: of the run, by setting; None where there is none.
-
-    Raises:
-        InputError: weights, or the code of a function, are other ones now.
-    """
+    """Note what networks and functions are, or refuse to go on with others than a run began with."""
     several = [one.module.models if isinstance(one.module, Ensemble) else (one,) for one in models]
     networks = [one for some in several for one in some]
     now: dict[str, Any] = {f"model {one.name}": {"weights": weights_digest(one)} for one in networks}
@@ -156,12 +223,7 @@ MACHINES = "machines"
 
 @dataclass
 class Machines:
-    """The other machines of a run.
-
-    Attributes:
-        run: keeps what they are; None keeps it in memory.
-        known: by the name that rows have, what each is.
-    """
+    """The other machines of a run: what each is, by the name that rows have. Without a run it is kept in memory."""
 
     run: RunDirectory | None
     known: dict[str, dict[str, str]] = field(init=False)
@@ -198,9 +260,7 @@ class Journal:
     """What a run has asked and was answered. Without a run directory it is kept in memory.
 
     Attributes:
-        run: the open run directory, or None.
         traced: answers what nothing predicts.
-        problem: whose questions they are; it describes configurations.
         rows: what was written, where there is no run directory.
         lost: queries that nobody could answer.
         machines: on which answers were made that are not like this one.
@@ -228,16 +288,8 @@ class Journal:
         evaluate: Evaluate | None = None,
         passed: Callable[[Query], None] = lambda query: None,
     ) -> Iterator[Evaluation]:
-        """Answer queries in their order: from the journal, or else by asking, and then they are in it.
-
-        Args:
-            queries: of one kind.
-            evaluate: answers what is not in the journal; None for `traced`.
-            passed: told of every query of a search that is read back.
-
-        Raises:
-            InputError: an evaluation of a search is another one than it was.
-        """
+        """Answer queries in their order: from the journal, or else by `evaluate` (None for `traced`), and then they are
+        in it. `passed` is told of every query of a search that is read back."""
         stored = [self._read(query) for query in queries]
         evaluate = self.traced if evaluate is None else evaluate
         asked = iter(evaluate([query for query, known in zip(queries, stored, strict=True) if known is None]))
@@ -293,15 +345,8 @@ class Journal:
         )
 
     def keep(self, answered: Sequence[tuple[Query, Evaluation]], *, numbered: bool = False) -> list[Row]:
-        """Write answers in one transaction, a row each; what a search was told goes beside it.
-
-        Args:
-            answered: queries with their answers; of a search one at a time.
-            numbered: whether the place of a row in the store is the query's number, in whatever order they come.
-
-        Returns:
-            The rows.
-        """
+        """Write answers in one transaction, a row each; what a search was told goes beside it. If `numbered`, the place
+        of a row in the store is the query's number, in whatever order they come."""
         rows, told = list[Row](), None
         for query, answer in answered:
             self.lost += answer.lost
@@ -362,10 +407,6 @@ class Journal:
 
         An evaluation that is read back never ends the search before the one after which it was ended; if the store has
         renders of the ranking, that is the last one before these.
-
-        Args:
-            kind: of search.
-            seconds: allowed; None for no limit.
         """
         if seconds is None:
             return None
@@ -386,11 +427,9 @@ class Journal:
     # ---- notes ------------------------------------------------------------------------------------------------------
 
     def note(self, key: str) -> Any:
-        """Return the JSON value that was noted, or None."""
         return None if self.run is None else self.run.store.noted(key)
 
     def set_note(self, key: str, value: Any) -> None:
-        """Keep a JSON value."""
         if self.run is not None:
             self.run.store.set_note(key, json.dumps(value))
 

@@ -19,8 +19,9 @@ from advsearch.errors import InputError
 from advsearch.models.guards import plainly
 from advsearch.options import told
 from advsearch.scene import settings
+from advsearch.scene.assembly import Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
-from advsearch.scene.cameras.model import bundled
+from advsearch.scene.camera_model import bundled
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -31,13 +32,11 @@ from advsearch.scene.description import (
     check_one_environment,
     describe,
 )
-from advsearch.scene.formation import SAMPLER, ImageFormation
-from advsearch.scene.importing.images import read_picture
-from advsearch.scene.leaving_out import EVERYTHING
+from advsearch.scene.formation import EVERYTHING, SAMPLER, ImageFormation
+from advsearch.scene.grounds import on_its_ground
+from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.motion import Motion
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.road import on_its_ground
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 
@@ -273,9 +272,6 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
     """Return settings by name, as a file holds them, for controls in whatever form they were given.
 
     Of a control that was given by its name it is what was said about it; of an instance, all of it.
-
-    Raises:
-        InputError: not controls at all, or two of one name.
     """
     asked = controls_by_name(controls)
     if not isinstance(controls, Mapping):
@@ -284,12 +280,7 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
 
 
 def as_controls(controls: Controls) -> tuple[Control, ...]:
-    """Return control instances for whatever form they were given in, in the order in which they were given.
-
-    Raises:
-        UnknownNameError: a name is not a control.
-        InputError: not controls at all, or two of one name.
-    """
+    """Return control instances for whatever form they were given in, in the order in which they were given."""
     asked = controls_by_name(controls)
     ready = {name: one for name, one in asked.items() if isinstance(one, Control)}
     named = gathered({name: {} if isinstance(one, Control) else one for name, one in asked.items()})
@@ -300,11 +291,7 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
 
 
 def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
-    """Return instances and settings by name, in the order in which they were given.
-
-    Raises:
-        InputError: not controls at all, two of one name, or an instance under another name than its own.
-    """
+    """Return instances and settings by name, in the order in which they were given."""
     if isinstance(controls, Mapping):
         asked = dict(controls)
         for name, one in asked.items():
@@ -351,12 +338,7 @@ _LENT: ContextVar[Mapping[tuple[str, str], Any]] = ContextVar("lent", default=Ma
 
 
 def lent(kind: str, name: str) -> Any:
-    """Return what stands for a name where only names are told; None if nothing does.
-
-    Args:
-        kind: `CONTROL`, `SCENE` or `MODEL`.
-        name: as settings have it.
-    """
+    """Return what stands for a name where only names are told; None if nothing does."""
     return _LENT.get().get((kind, name))
 
 

@@ -1,9 +1,11 @@
-"""From what a configuration names to things, as every command that loads a scene and a model does it."""
+"""From what a configuration names to things, and what it says for all of its controls; one question at a time."""
 
 from __future__ import annotations
 
+import threading
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,12 @@ from torch import nn
 
 from advsearch import threads
 from advsearch.config import SceneConfig
-from advsearch.controls import CONTROLS
-from advsearch.engine.loading import MODEL, Scene, lent, load_scene
-from advsearch.errors import InputError
+from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
+from advsearch.controls.values import is_number
+from advsearch.engine.loading import CONTROL, MODEL, Controls, Scene, as_controls, controls_by_name, lent, load_scene
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
+from advsearch.models.guards import plainly
 from advsearch.models.loading import named_code
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
@@ -23,24 +27,14 @@ from advsearch.tasks.together import Together, together
 
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:
-    """Load the scene that a configuration describes.
-
-    Args:
-        config: what.
-        name: of one of its objects; None for the only one, in the configuration's environment.
-        environment: of that object; None for the default.
-    """
+    """Load the scene that a configuration describes: its only object in its environment, or a named one."""
     if name is None:
         name, environment = config.object, config.environment
     return load_scene(name, environment, up=config.up, settings=scene_settings(config), camera=config.camera)
 
 
 def scene_settings(config: SceneConfig) -> Given:
-    """Return the parameters that a scene is loaded with: those of `set`, and the exposure.
-
-    Raises:
-        InputError: both say what the exposure is.
-    """
+    """Return the parameters that a scene is loaded with: those of `set`, and the exposure."""
     given: dict[str, Any] = dict(config.set_)
     if config.exposure:
         if "camera.exposure" in given:
@@ -50,27 +44,16 @@ def scene_settings(config: SceneConfig) -> Given:
 
 
 def code_of(models: Iterable[str], kinds: Iterable[str], metrics: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the Python code that is imported for what is named: "package.module:attribute".
-
-    Args:
-        models: as `load_model` takes them.
-        kinds: of the controls.
-        metrics: as settings name them.
-    """
+    """Return the Python code that is imported for what is named: "package.module:attribute"."""
     code = [*(named_code(name) for name in models), *metrics]
     code += [name for name in kinds if CONTROLS.names_class(name)]
     return tuple(dict.fromkeys(name for name in code if name))
 
 
 def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple[tuple[Model, ...], list[str]]:
-    """Load models; their warnings become sentences of the run.
-
-    Args:
-        models: as `load_model` takes them.
-        task: what their outputs are for; several tasks are for one model each, which are put together as one.
-        config: has the names of their classes, the texts that these are put into, and the processor threads that
-            everything takes from here on.
-    """
+    """Load models; their warnings become sentences of the run. Several tasks are for one model each, and these are put
+    together as one. The configuration has the names of their classes, the texts that these are put into, and the
+    processor threads that everything takes from here on."""
     threads.configure(config.used_threads)
     parts = task.parts if isinstance(task, Together) else (task,) * len(models)
     asked = several(models) if isinstance(task, Together) else models
@@ -117,11 +100,7 @@ def exists_here(model: AnyModel) -> bool:
 
 
 def different(names: Sequence[str], setting: str) -> Sequence[str]:
-    """Return the names.
-
-    Raises:
-        InputError: there are none, or one comes twice.
-    """
+    """Return the names; an InputError says if there are none, or one comes twice."""
     twice = [name for name in names if names.count(name) > 1]
     if twice or not names:
         raise InputError(
@@ -135,25 +114,142 @@ OF_SCENE = ("set", "environment", "up", "camera", "exposure", "object")
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:
-    """Refuse settings of a scene that is loaded already.
-
-    Raises:
-        InputError: there are some.
-    """
+    """Refuse settings of a scene that is loaded already."""
     clash = [name for name in OF_SCENE if settings.get(name) is not None]
     if clash:
         raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
 
 
 def check_not_spread(settings: Mapping[str, object]) -> None:
-    """Refuse to share work on what is loaded already.
-
-    Raises:
-        InputError: `workers` or `cluster` is among the settings.
-    """
+    """Refuse to share work on what is loaded already."""
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
             raise InputError(
                 f"{name}: expected names of objects, models, controls and an objective beside it, which other "
                 "processes can load, got some that are loaded; give their names or files"
             )
+
+
+RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path")
+"""What a configuration says for all of its controls; each control declares what it takes of it (`Choice.run_setting`).
+A configuration without such a setting counts as one that does not say it."""
+
+
+def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
+    """Return control instances, with what they take of the configuration where they say nothing themselves."""
+    asked = controls_by_name(controls)
+    as_controls(controls)  # refuses what is none
+    for one in (one if isinstance(one, Control) else lent(CONTROL, name) for name, one in asked.items()):
+        for choice in _counting(type(one), one.settings()) if one is not None else ():
+            if getattr(config, choice.run_setting, None) is not None:
+                raise InputError(
+                    f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
+                    f"{type(one).__name__}({choice.name}=...)"
+                )
+    return as_controls(
+        {name: one if isinstance(one, Control) else {**_taken(config, name, one), **one} for name, one in asked.items()}
+    )
+
+
+def settings_alone(config: SceneConfig, asked: str, given: Mapping[str, object]) -> dict[str, Any]:
+    """Return what a run over one of the controls says: None for what that does not take."""
+    _, name = names_of(asked, given)
+    kept = {}
+    for setting in RUN_SETTINGS:
+        value = getattr(config, setting, None)
+        if isinstance(value, Mapping):
+            value = {own: number for own, number in value.items() if own == name} or None
+        kept[setting] = value if takes(asked, given, setting) else None
+    return kept
+
+
+def check_run_settings(config: SceneConfig) -> None:
+    """Refuse a setting that none of the controls takes; those that vary by chance have no epsilon."""
+    for setting in RUN_SETTINGS:
+        value = getattr(config, setting, None)
+        if value is None:
+            continue
+        drawn = {} if setting == "epsilon" else getattr(config, "over", {})
+        asked = gathered({**config.controls, **drawn})
+        if isinstance(value, Mapping):
+            known = {names_of(one, given)[1]: one for one, given in asked.items()}
+            for name in value:
+                if name not in known:
+                    raise UnknownNameError(f"control in `{setting}`", name, known)
+                if not takes(known[name], asked[known[name]], setting):
+                    raise _not_taken(setting, name, names_of(known[name], asked[known[name]])[0])
+            continue
+        without = [one for one, given in asked.items() if not takes(one, given, setting)]
+        if without and (isinstance(value, tuple) or len(without) == len(asked)):
+            raise _not_taken(setting, without[0], names_of(without[0], asked[without[0]])[0])
+
+
+def _taken(config: SceneConfig, asked: str, given: Mapping[str, object]) -> dict[str, object]:
+    """What one control takes, by the names of its own settings."""
+    _, name = names_of(asked, given)
+    taken = {}
+    for choice in _choices(asked, given):
+        value = getattr(config, choice.run_setting, None)
+        value = value.get(name) if isinstance(value, Mapping) else value
+        if value is not None and not isinstance(value, tuple):  # the several epsilons of a curve: each run has its own
+            taken[choice.name] = value
+    return taken
+
+
+def takes(asked: str, given: Mapping[str, object], setting: str) -> bool:
+    """Whether a control takes one of the run's settings; one that is not known counts as one that does."""
+    kind, _ = names_of(asked, given)
+    return kind not in CONTROLS or setting in {choice.run_setting for choice in _choices(asked, given)}
+
+
+def _choices(asked: str, given: Mapping[str, object]) -> list[Choice]:
+    """The choices of a control, as it is asked for, that count."""
+    ((name, settings),) = gathered({asked: given}).items()
+    kind, _ = names_of(name, settings)
+    return _counting(CONTROLS[kind], settings) if kind in CONTROLS else []
+
+
+def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
+    """The choices that count beside the settings that are given: what they are about is searched."""
+    return [choice for choice in kind.choices if not choice.bounds or _is_searched(kind, choice.bounds, given)]
+
+
+def _is_searched(kind: type[Control], parameter: str, given: Mapping[str, object]) -> bool:
+    """Whether a parameter of a control is searched beside the settings that are given."""
+    if any(choice.fixes == parameter and given.get(choice.name) is not None for choice in kind.choices):
+        return False
+    if given.get(parameter) is not None:
+        return not is_number(given[parameter])
+    return any(one.name == parameter and one.search is not None for one in kind.parameters)
+
+
+def _not_taken(setting: str, name: str, kind: str) -> InputError:
+    if setting == "epsilon":
+        return InputError(
+            f"`epsilon` {name}: the control has ranges and no epsilon; give its ranges, as in "
+            f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{_bounded(kind)}"
+        )
+    if setting == "path":
+        return InputError(f"path: {name} does not travel; add `over=path` beside it, or `controls=path`")
+    return InputError(f"{setting}: {name} has none, and no other control is there that has one; leave it out")
+
+
+def _bounded(kind: str) -> str:
+    choices = CONTROLS[kind].choices if kind in CONTROLS else ()
+    bounded = [choice.bounds for choice in choices if choice.run_setting == "epsilon" and choice.bounds]
+    return f", or search {bounded[0]} with it" if bounded else ""
+
+
+_TURN = threading.RLock()
+"""Held by the question at work: the threads of torch and Dr.Jit, and warnings that are caught, are the process's."""
+
+
+@contextmanager
+def in_turn() -> Iterator[None]:
+    """Do what a question does inside the block, after those of other threads.
+
+    Derivatives are on in it, whatever the caller has switched off (`torch.no_grad`, `torch.inference_mode`). torch and
+    Dr.Jit have their threads again after it.
+    """
+    with _TURN, threads.given_back(), plainly():
+        yield

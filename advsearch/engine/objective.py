@@ -1,13 +1,7 @@
-"""What a search maximises, over which domain, and what `printable` takes from it.
-
-An objective may ask for more than a model's output, the pictures and the truth (docs/objectives.md). As the terms of
-`printable` this depends on u alone, so that it is the same for rendered and for predicted pictures.
-
-The terms of `printable` are how rough the colours to be printed are, and how far from ink. Sharif et al. 2016,
-*Accessorize to a Crime*, sections 5.2.2 (total variation) and 5.2.3 (the non-printability score). Theirs are sums over
-pixels; these are means, so that a weight means the same at every resolution. Their score is a product of distances to
-all printable colours; here it is the distance to the nearest, which is zero at the same colours.
-"""
+"""What a search maximises, over which domain, and what `printable` takes from it: how rough colours are, and how far
+from ink (Sharif et al. 2016, *Accessorize to a Crime*, sections 5.2.2 and 5.2.3). Theirs are sums over pixels, and a
+product of distances to all printable colours; these are means, and the distance to the nearest, which is zero at the
+same colours."""
 
 from __future__ import annotations
 
@@ -20,8 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Objective, get_objective
-from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.attacks.own_objective import More, nothing_more
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, More, nothing_more
 from advsearch.controls import Space
 from advsearch.controls.base import BoundControl
 from advsearch.errors import InputError, UnknownNameError
@@ -34,13 +27,8 @@ from advsearch.tasks.together import Ensemble, Outputs, Together, of_each
 
 
 def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **more: Any) -> Domain:
-    """Return where a search over some controls may look: the budgets of all their groups, in the order of u.
-
-    Args:
-        controls: of a space, or some of them.
-        start: (d,) float32; by default the controls' own, which leaves the scene as it is.
-        **more: other fields of `Domain`: `gradient_cost`, `partial_gradients`.
-    """
+    """Return where a search over some controls may look: the budgets of all their groups, in the order of u, from
+    `start` (d,) or the controls' own, which leaves the scene as it is; with `more` fields of `Domain`."""
     blocks = tuple(
         Block(
             group.size,
@@ -59,12 +47,7 @@ def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **m
 
 
 class Named(Mapping[str, Tensor]):
-    """Tensors by name, of N configurations: each (N, ...).
-
-    Args:
-        what: a name stands for, for messages.
-        each: of each configuration.
-    """
+    """Tensors by name, of N configurations: each (N, ...)."""
 
     def __init__(self, what: str, each: Sequence[Mapping[str, Tensor]]) -> None:
         self._what, self._each = what, each
@@ -85,16 +68,8 @@ class Named(Mapping[str, Tensor]):
 
 
 class Asked:
-    """Gives what is asked for at N configurations, which differ in nothing that is searched.
-
-    Args:
-        space: the controls behind the whole of u.
-        searched: the controls that are searched, which come first there.
-        wholes: the configurations, (d,) each, of the whole space.
-
-    Attributes:
-        used: whether anything was asked for.
-    """
+    """Gives what is asked for at N configurations (d,) of the whole space, which differ in nothing that is searched;
+    `used` says whether anything was. The searched controls come first there."""
 
     def __init__(self, space: Space, searched: Space, wholes: Sequence[Tensor]) -> None:
         self._space, self._searched, self._wholes = space, searched, wholes
@@ -108,9 +83,6 @@ class Asked:
                 searched colours of the control that has some, or (N, h, w, 4) with 1 where they are searched and 0
                 elsewhere; "textures", the same by control, where several have some; "inputs", the scene inputs by
                 name; "configuration", the numbers by parameter.
-
-        Raises:
-            InputError: there is not exactly one texture.
         """
         self.used = True
         if name == "inputs":
@@ -170,7 +142,6 @@ def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
 
 
 def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Both terms, summed over what is to be printed."""
     found = list(space.printed(u).values())
     if not found:
         raise InputError(
@@ -181,11 +152,7 @@ def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def print_terms(space: Space, u: Tensor) -> PrintTerms:
-    """Return both terms of a configuration (d,), without their weight.
-
-    Raises:
-        InputError: nothing that can be printed is searched.
-    """
+    """Return both terms of a configuration (d,), without their weight."""
     with torch.no_grad():
         rough, off = _terms(space, u)
     return PrintTerms(variation=float(rough), off_print=float(off))
@@ -219,27 +186,11 @@ def task_for(task: Task, model: Model) -> Task:
 
 
 def objective_for(
-    wanted: AnyObjective,
-    task: Task,
-    model: Model,
-    renderer: Renderer,
-    seed: int,
-    ensemble: Way | None = None,
+    wanted: AnyObjective, task: Task, model: Model, renderer: Renderer, seed: int, ensemble: Way | None = None
 ) -> tuple[Objective, str]:
     """Return what is maximised, and what there is to say about it; one of features is shown the clean picture first.
-
-    Args:
-        wanted: its name, or the user's own function.
-        task: on the model.
-        model: that is attacked.
-        renderer: of the whole space.
-        seed: of the clean picture.
-        ensemble: how the objectives of several models are put together; None for the mean, or the least of those of
-            several tasks, whose units differ.
-
-    Raises:
-        InputError: an objective of features, of several models.
-    """
+    The objectives of several models are put together as `ensemble` says; without, their mean, or of several tasks,
+    whose units differ, the least."""
     kind = OBJECTIVE_KINDS.get(wanted) if isinstance(wanted, str) else None
     of_features = kind is not None and kind.needs_features
     if isinstance(task, Together):
@@ -262,10 +213,6 @@ def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
 
     With "worst" the model that is hardest to mislead is the one that counts, so that the maximum is over 0 only where
     every model is misled. The mean may be large because of one model; its gradient reaches all of them.
-
-    Args:
-        objectives: of each model, with its own truth.
-        way: "mean" or "worst".
     """
 
     def objective(

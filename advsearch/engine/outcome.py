@@ -10,48 +10,29 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
+from advsearch.attacks.candidates import Bracket
 from advsearch.attacks.domain import Distribution
-from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
-from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.driving import answer_along
-from advsearch.engine.failures import described_failures, write_failures
+from advsearch.engine.attack_result import (
+    AttackResult,
+    KeptPicture,
+    answer_along,
+    trial_to_show,
+    write_artifacts,
+    write_object,
+    write_pictures,
+)
 from advsearch.engine.journal import Journal
 from advsearch.engine.objective import domain_of, print_terms
-from advsearch.engine.pictures import KeptPicture, trial_to_show, write_artifacts, write_object, write_pictures
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages
-from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
-from advsearch.engine.searches import UNPRINTED
+from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
+from advsearch.engine.stages import UNPRINTED
 from advsearch.engine.transport import remark
+from advsearch.engine.verifier import described_failures, write_failures
 from advsearch.report.wording import number_text
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.attack import (
-    AnswerDistribution,
-    AttackSummary,
-    AverageCase,
-    BankOfConditions,
-    BaselineSearch,
-    CleanAnswer,
-    ControlGroup,
-    DescribedValue,
-    FoundValue,
-    LinearTransport,
-    NotFinite,
-    ObjectiveValues,
-    PathSegments,
-    PicturedAnswer,
-    PredictionError,
-    Printability,
-    PrintCost,
-    SearchClaim,
-    SearchGradients,
-    SharedWork,
-    SmallestEpsilon,
-    TriedObjective,
-    VerificationSamples,
-    VerifiedRate,
-)
+from advsearch.runs.results import attack as results
+from advsearch.runs.results.attack import AttackSummary, DescribedValue, VerifiedRate
 from advsearch.runs.results.base import Formation, MovedValue, VariedValue
 from advsearch.runs.summary import write_answer
 from advsearch.tasks import Judgement
@@ -72,16 +53,7 @@ def summarise(
     stages: Stages,
     warnings: Sequence[str],
 ) -> AttackResult:
-    """Put the result together and, if there is a run directory, write its files.
-
-    Args:
-        config: the settings.
-        objective: its name; None for the task's own.
-        findings: of the attack.
-        journal: of the run.
-        stages: how long each took.
-        warnings: on the way.
-    """
+    """Put the result together and, if there is a run directory, write its files."""
     problem, search = journal.problem, findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
@@ -103,7 +75,7 @@ def summarise(
     summary = _summary(config, objective, problem, findings, clean, adversarial)
     drive = None if findings.interrupted else answer_along(problem, None if search is None else u, findings.spp, run)
     kept = {"run": None if run is None else str(run.path), "warnings": warnings, "drive": drive}
-    shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
+    shared = results.SharedWork.of_facts(journal.traced.facts, journal.machines.known)
     summary = summary.model_copy(
         update={**kept, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
     )
@@ -160,22 +132,22 @@ def _summary(
         ending=_ending(findings, problem).value,
         image_formation=Formation.of(problem.renderer.formation),
         gradient_plan=problem.plan_summary(problem.plan),
-        light_path_segments=PathSegments(search=problem.search_depth or depth, verification=depth),
-        clean=CleanAnswer(
+        light_path_segments=results.PathSegments(search=problem.search_depth or depth, verification=depth),
+        clean=results.CleanAnswer(
             **_answer(clean),
             correct=clean.judgement.right,
             moved=[MovedValue.of(one) for one in problem.space.moved],
-            control=_control(findings),
+            control=control_group(findings.clean, findings.spp) if findings.clean else None,
         ),
-        adversarial=None if search is None else PicturedAnswer(**_answer(adversarial)),
+        adversarial=None if search is None else results.PicturedAnswer(**_answer(adversarial)),
         verified=_verified(findings.verification),
-        tried_objective=TriedObjective(
+        tried_objective=results.TriedObjective(
             clean=_objective_over(findings.clean),
             answer=_objective_over(findings.verification.adversarial_trials if findings.verification else ()),
         ),
         baseline=None
         if baseline is None
-        else BaselineSearch(
+        else results.BaselineSearch(
             policy="random",
             renders=baseline.renders * problem.draws,
             verified=_verified(findings.baseline_verification),
@@ -188,17 +160,17 @@ def _summary(
         distribution=_distribution(search.distribution, problem) if search and search.distribution else None,
         failures=described_failures(problem, findings),
         transport=transport_of(findings),
-        sample_count=None if count is None else VerificationSamples(spp=count.spp, converged=count.converged),
+        sample_count=None if count is None else results.VerificationSamples(spp=count.spp, converged=count.converged),
         claimed=None
         if search is None
-        else SearchClaim(
+        else results.SearchClaim(
             objective=search.claimed_objective, re_evaluated=search.best_objective, success_rate=search.success_rate
         ),
         gradients=None if search is None else _gradients(search),
         configuration=None if search is None else _found_values(problem, search.best_u),
         renders=_renders(findings, problem),
         steps=len(search.history) if search else 0,
-        non_finite=NotFinite(
+        non_finite=results.NotFinite(
             objectives=search.non_finite_objectives if search else 0,
             gradient_elements=search.non_finite_elements if search else 0,
         ),
@@ -209,29 +181,30 @@ def _summary(
     )
 
 
-def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
+def _objective_over(trials: Sequence[Judgement]) -> results.ObjectiveValues | None:
     """The objective over trials; None where it was not asked for, as in those of an older run."""
     values = [one.objective for one in trials if one.objective is not None]
     if not values:
         return None
     spread = statistics.pstdev(values) if all(map(math.isfinite, values)) else math.nan
-    return ObjectiveValues(mean=mean(values), deviation=spread, low=min(values), high=max(values))
+    return results.ObjectiveValues(mean=mean(values), deviation=spread, low=min(values), high=max(values))
 
 
-def _printability(problem: Problem, findings: Findings) -> Printability:
-    """The terms of the clean scene and of the answer."""
+def _printability(problem: Problem, findings: Findings) -> results.Printability:
     space, domain, search = problem.searched_space, problem.domain, findings.search
     answer = None if search is None else print_terms(space, domain.project(search.best_u))
-    return Printability(clean=print_terms(space, domain.start), answer=answer, cost=_print_cost(problem, findings))
+    return results.Printability(
+        clean=print_terms(space, domain.start), answer=answer, cost=_print_cost(problem, findings)
+    )
 
 
-def _print_cost(problem: Problem, findings: Findings) -> PrintCost | None:
+def _print_cost(problem: Problem, findings: Findings) -> results.PrintCost | None:
     """The margin of the answer beside that of the search without terms; None where either was not verified."""
     verified, other, search = findings.verification, findings.unprinted_verification, findings.unprinted
     if verified is None or other is None or search is None:
         return None
     ours, theirs = (verified_rate(one) for one in (verified, other))
-    return PrintCost(
+    return results.PrintCost(
         steps=len(search.history),
         margin_with=ours.margin,
         margin_without=theirs.margin,
@@ -242,19 +215,11 @@ def _print_cost(problem: Problem, findings: Findings) -> PrintCost | None:
 
 
 def _alone(values: dict[str, T]) -> T | dict[str, T]:
-    """What holds of the only control; by control where there are several."""
     return next(iter(values.values())) if len(values) == 1 else values
 
 
 def _answer(shown: KeptPicture) -> dict[str, Any]:
-    """What the model says of a picture that is kept."""
     return {**vars(shown.judgement.answer), "payload": shown.judgement.payload, "trial": shown.trial}
-
-
-def _control(findings: Findings) -> ControlGroup | None:
-    if not findings.clean:
-        return None
-    return control_group(findings.clean, findings.spp)
 
 
 def _described(problem: Problem, u: Tensor) -> dict[str, DescribedValue]:
@@ -262,7 +227,7 @@ def _described(problem: Problem, u: Tensor) -> dict[str, DescribedValue]:
     return {name: DescribedValue.of(value) for name, value in values.items()}
 
 
-def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
+def _found_values(problem: Problem, u: Tensor) -> dict[str, results.FoundValue]:
     """The answer in a few values, each beside the clean scene's and, of a single number, both ends of its range."""
     start = problem.domain.start
     single = [group for group in problem.space.groups if group.size == 1 and group.begin < len(start)]
@@ -279,7 +244,7 @@ def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
         low, high = (described[name]["value"] if name in described else None for described in ends)
         if name in names and isinstance(low, float) and isinstance(high, float) and low < high:
             given |= {"low": low, "high": high}
-        found[name] = FoundValue.of(given)
+        found[name] = results.FoundValue.of(given)
     return found
 
 
@@ -307,21 +272,21 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
     return found
 
 
-def transport_of(findings: Findings) -> LinearTransport:
+def transport_of(findings: Findings) -> results.LinearTransport:
     """Return what predicted the pictures of the searches, and how far it was off; or why nothing did."""
     transport = findings.transport
     if transport is None:
-        return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
-    return LinearTransport(
+        return results.LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
+    return results.LinearTransport(
         used=True,
         way=transport.way,
         reason=transport.given_up or findings.surface_refused or None,
-        conditions=None if transport.conditions is None else BankOfConditions.of(transport.conditions),
+        conditions=None if transport.conditions is None else results.BankOfConditions.of(transport.conditions),
         entries=transport.size()[0],
         bytes=transport.size()[1],
         seconds=transport.seconds,
         renewed=transport.renewed,
-        error=PredictionError.of(transport.deviations[-1]) if transport.deviations else None,
+        error=results.PredictionError.of(transport.deviations[-1]) if transport.deviations else None,
     )
 
 
@@ -345,14 +310,13 @@ def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
 
 
 def _without_terms(search: SearchResult, problem: Problem, predicted: int) -> int:
-    """Pictures and gradients that a search took beside what was predicted."""
     return search.renders * problem.draws - predicted + max(0, search.gradients - predicted)
 
 
-def _gradients(search: SearchResult) -> SearchGradients:
+def _gradients(search: SearchResult) -> results.SearchGradients:
     """What the search saw of its gradients, and what its policy did about them and about steps that failed."""
     norms = [record.gradient_norm for record in search.history if record.objective == record.objective]
-    return SearchGradients(
+    return results.SearchGradients(
         count=search.gradients,
         cosine_with_the_one_before=statistics.median(search.agreement) if search.agreement else None,
         zero=sum(norm == 0.0 for norm in norms),
@@ -360,11 +324,10 @@ def _gradients(search: SearchResult) -> SearchGradients:
     )
 
 
-def _average(findings: Findings) -> AverageCase:
-    """How often the model is right over configurations drawn from the whole space."""
+def _average(findings: Findings) -> results.AverageCase:
     counted = count_right(findings.average, findings.spp)
     scores = [trial.score for trial in findings.average]
-    return AverageCase(
+    return results.AverageCase(
         configurations=counted.trials,
         correct=counted.successes,
         accuracy=counted.rate,
@@ -374,11 +337,10 @@ def _average(findings: Findings) -> AverageCase:
     )
 
 
-def _smallest(bracket: Bracket, problem: Problem) -> SmallestEpsilon:
-    """The bracket of the smallest epsilon, in the unit of each control."""
+def _smallest(bracket: Bracket, problem: Problem) -> results.SmallestEpsilon:
     budgets = {bound.name: float(bound.budget.epsilon or 0.0) for bound in problem.searched_space.controls}
     flips = bracket.u is not None
-    return SmallestEpsilon(
+    return results.SmallestEpsilon(
         epsilon={name: bracket.high * epsilon for name, epsilon in budgets.items()} if flips else None,
         not_found_at={name: bracket.low * epsilon for name, epsilon in budgets.items()} if bracket.low else None,
         closed=bracket.closed,
@@ -388,11 +350,12 @@ def _smallest(bracket: Bracket, problem: Problem) -> SmallestEpsilon:
     )
 
 
-def _distribution(distribution: Distribution, problem: Problem) -> AnswerDistribution | None:
-    """Mean and spread of a distribution of configurations, where there are few numbers."""
+def _distribution(distribution: Distribution, problem: Problem) -> results.AnswerDistribution | None:
     if distribution.mean.numel() > MOST_NUMBERS:
         return None
-    return AnswerDistribution(mean=_described(problem, distribution.mean), deviation=distribution.deviation.tolist())
+    return results.AnswerDistribution(
+        mean=_described(problem, distribution.mean), deviation=distribution.deviation.tolist()
+    )
 
 
 def _ending(findings: Findings, problem: Problem) -> Ending:
@@ -406,14 +369,10 @@ def _ending(findings: Findings, problem: Problem) -> Ending:
 
 
 def _verified(verification: Verification | None) -> VerifiedRate | None:
-    """Rates, and what the model answered in the trials that it got wrong."""
-    if verification is None:
-        return None
-    return verified_rate(verification)
+    return None if verification is None else verified_rate(verification)
 
 
 def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str]:
-    """What a reader has to know beside the numbers."""
     remarks = [told] if (told := remark(findings.rendered_because)) else []
     count = findings.sample_count
     if count is not None and count.table and not count.converged:

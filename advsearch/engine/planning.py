@@ -1,14 +1,6 @@
-"""Chooses estimators, steps, sample counts and bounces of light by measurement on the scene and the loss at hand.
-
-Which estimator: the one with the least (squared error) x time, error against differences of the same loss. Which step
-and sample count: the cheapest whose gradient has a cosine of at least `GOAL` with the converged one, of the model's
-own loss (docs/gradients.md, "The model's own loss": over poses that loss is rough at the scale of a pixel and sensitive
-to noise).
-
-How many bounces: as many as change the picture. Renders of other path lengths with the same seed draw the same paths,
-cut off earlier, so that their difference is the light of the bounces left out, almost without noise. A search may leave
-out what the eye could not see; a verification leaves out nothing, so that no answer rests on it.
-"""
+"""Chooses estimators (least squared error x time), steps and sample counts (the cheapest with a cosine of `GOAL` with
+the converged gradient of the model's own loss, docs/gradients.md) and bounces of light (as many as change the picture:
+paths of other lengths with one seed are the same, cut off earlier) by measurement on the scene."""
 
 from __future__ import annotations
 
@@ -59,13 +51,9 @@ def status_of(cosine: float, converged: float) -> GradientStatus:
 
 
 def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
-    """Return groups of one control with the estimators to compare on them, where there is more than one.
-
-    Args:
-        plan: the plan so far. What was forced is not contested.
-        every: compare wherever several are valid; otherwise only where the interior adjoint is preferred so far: over
-            poses, the model's loss is so rough that none has won, and over shapes the material form is the quietest.
-    """
+    """Return groups of one control with the estimators to compare on them, where there is more than one and none was
+    forced: wherever several are valid (`every`), or only where the interior adjoint is preferred so far: over poses,
+    the model's loss is so rough that none has won, and over shapes the material form is the quietest."""
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in plan.groups:
         if "forced" in group.reason or not group.valid:
@@ -101,21 +89,9 @@ def measured_plan(
     tick: Callable[[], None] = lambda: None,
     keep: Keep = measured_now,
 ) -> GradientPlan:
-    """Return the renderer's plan with every contested choice made by measurement at u.
-
-    Args:
-        renderer: its plan is the one to improve; it is not changed.
-        loss: what will be differentiated.
-        u: (d,) where.
-        seed: root of the noise.
-        spp: samples a pixel.
-        repeats: gradients of each estimator, at least 2.
-        every: see `contested`.
-        counted: take the renders that an estimator needs for its time (an adjoint for `ADJOINT_RENDERS`), so that the
-            choice is the same on a busy machine.
-        tick: called after each gradient.
-        keep: asked for each gradient, by a name.
-    """
+    """Return the renderer's plan, which is not changed, with every contested choice made by measurement at u. If
+    `counted`, the renders that an estimator needs stand for its time (`ADJOINT_RENDERS` for an adjoint), so that the
+    choice is the same on a busy machine."""
     plan = renderer.plan
     taken = partial(gradients, renderer, loss, u, seed=seed, spp=spp, keep=keep, tick=tick)
     for groups, candidates in contested(plan, every=every):
@@ -314,19 +290,8 @@ def measured_bounces(
     bound: float = BOUND,
     tick: Callable[[], None] = lambda: None,
 ) -> PathLength:
-    """Return the shortest paths whose pictures agree with those of the full length to within a bound.
-
-    Args:
-        renderer: at the full length.
-        configurations: where to look, each (d,).
-        seed: root of the noise, which is the same for all lengths.
-        spp: samples a pixel of each of two halves; few are enough.
-        bound: in 8-bit levels, see `PathCut.levels`.
-        tick: called after each picture.
-
-    Returns:
-        The depth, with what was measured: from the full length downwards, to the first that misses the bound.
-    """
+    """Return the shortest paths whose pictures agree with those of the full length to within a bound, all with the same
+    noise; and what was measured, from the full length downwards to the first that misses the bound."""
     raw = renderer.like(denoiser="none")  # a denoiser would spread a change over its neighbours
     full = raw.scene.max_depth
     noises = [seeds.stream(seed, "half", half) for half in range(2)]
@@ -370,7 +335,6 @@ def _reason(depth: int, full: int, cuts: Mapping[int, PathCut]) -> str:
 
 
 def _missing(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:
-    """The share of the radiance that is missing."""
     full = sum(float(radiance.mean()) for radiance, _ in whole)
     return 1.0 - sum(float(radiance.mean()) for radiance, _ in cut) / full if full > 0.0 else 0.0
 
@@ -382,7 +346,6 @@ def _bias(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Te
 
 
 def _pictures(renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int) -> tuple[Tensor, Tensor]:
-    """Radiance and displayed picture."""
     with torch.no_grad(), renderer.scene.shorter(depth):
         radiance = renderer.radiance(u, seed, spp)
         return radiance, renderer.space.picture(u, renderer.formation.display(radiance))
@@ -402,13 +365,7 @@ def most_pictures(problem: Problem) -> int:
 
 
 def bounces_of(problem: Problem, seed: int, tick: Callable[[], None] = lambda: None) -> PathLength:
-    """Measure the bounces that a problem's search needs, over its clean configuration and random ones of its space.
-
-    Args:
-        problem: whose scene and space.
-        seed: root of the noise and of the draws.
-        tick: called after each picture.
-    """
+    """Measure the bounces that a problem's search needs, over its clean configuration and random ones of its space."""
     drawn = [
         problem.domain.sample(torch.Generator().manual_seed(seeds.stream(seed, "bounces", number)))[0]
         for number in range(DRAWS)

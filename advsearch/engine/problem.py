@@ -18,8 +18,7 @@ from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.described import Value
-from advsearch.engine.answers import Described, KnownTruths, Looked
-from advsearch.engine.metrics import Metrics, judgements, mean_metrics
+from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics
 from advsearch.engine.objective import Asked, domain_of
 from advsearch.models import Model
 from advsearch.runs.results.base import GroupDerivative, PlannedGradient
@@ -27,19 +26,14 @@ from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients import GradientPlan, Group
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.renderer import Linearised, LinearRenderer, linear_inputs
+from advsearch.scene.transport.matrix import Linearised, LinearRenderer, linear_inputs
 from advsearch.tasks import Facts, Judgement, Mark, Task
 from advsearch.tasks.base import Output, Truth, mean, typical
 
 
 class Prepared(NamedTuple):
-    """What is measured before a search, and holds for its queries.
-
-    Attributes:
-        spp: samples a pixel.
-        search_depth: longest light path in segments; None for the scene's.
-        plan: how derivatives are obtained.
-    """
+    """What is measured before a search, and holds for its queries; the longest light path is in segments, None for the
+    scene's."""
 
     spp: int
     search_depth: int | None
@@ -60,12 +54,10 @@ class Problem:
     Attributes:
         renderer: `render(u, seed, spp)` of the whole space.
         space: the controls behind the whole of u: those that are searched, then those that vary by chance.
-        model: the network under test.
         task: judges the model's output; says what counts as success.
         facts: what the scene gives it to judge by, from what describes the configuration and what looks at it.
         objective: what is maximised.
         spp: samples a pixel while searching.
-        seed: root of every stream.
         searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
             their whole range for every picture.
         steps: renders of a search.
@@ -102,7 +94,6 @@ class Problem:
 
     @property
     def plan(self) -> GradientPlan:
-        """How derivatives are obtained."""
         return self.renderer.plan
 
     @plan.setter
@@ -118,7 +109,6 @@ class Problem:
 
     @property
     def prepared(self) -> Prepared:
-        """What was measured before the search."""
         return Prepared(self.spp, self.search_depth, self.plan)
 
     @prepared.setter
@@ -140,13 +130,11 @@ class Problem:
 
     @property
     def environment(self) -> str:
-        """What lights the clean scene, by name."""
         scene = self.space.scene
         return self.space.environment or (NO_MAP if scene is None else scene.environment_name)
 
     @property
     def rule(self) -> Rule:
-        """When an answer counts as verified."""
         if self.task.minimise:
             return EASIER
         return WORST_CASE if self.conditions is None else OVER_CONDITIONS
@@ -154,12 +142,8 @@ class Problem:
     # ---- pictures ---------------------------------------------------------------------------------------------------
 
     def whole(self, u: Tensor, draw: int | None = None) -> Tensor:
-        """Return the configuration of the whole space: u, and the conditions of one draw.
-
-        Args:
-            u: (d,) of the searched controls.
-            draw: seed of the conditions; None for those that leave the scene as it is.
-        """
+        """Return the configuration of the whole space: u, and the conditions of one draw, by its seed; without, those
+        that leave the scene as it is."""
         if self.conditions is None:
             return u
         if draw is None:
@@ -168,14 +152,8 @@ class Problem:
         return torch.cat([u, self.conditions.sample(generator)[0]])
 
     def picture(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Tensor:
-        """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
-
-        Args:
-            u: (d,) of the searched controls.
-            seed: of the noise, and of the conditions where there are any.
-            spp: samples a pixel.
-            drawn: whether the conditions are drawn; otherwise the scene has those it comes with.
-        """
+        """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits. The seed is that
+        of the noise and, if they are `drawn`, of the conditions; otherwise the scene has those it comes with."""
         with torch.no_grad():
             return to_8_bit(self.renderer(self.whole(u, seed if drawn else None), seed=seed, spp=spp))
 
@@ -208,12 +186,8 @@ class Problem:
         return Asked(self.space, self.searched_space, wholes)
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
-        """Say a configuration of the searched controls in named values with units, under the conditions of a draw.
-
-        Args:
-            u: (d,) of the searched controls.
-            draw: seed of the conditions; None for those that the scene comes with.
-        """
+        """Say a configuration of the searched controls in named values with units, under the conditions of a draw, by
+        its seed; without, those that the scene comes with."""
         return self.space.describe(self.whole(u, draw), self.space.controls[: self.searched])
 
     def plan_summary(self, plan: GradientPlan) -> PlannedGradient:
@@ -330,18 +304,9 @@ class Problem:
     def judged(
         self, render: Callable[[Tensor], Tensor], wholes: Sequence[Tensor], u: Tensor, gradient: WhichGradient
     ) -> tuple[list[tuple[Evaluation, Output]], Tensor | None]:
-        """Ask the model about several pictures at once.
-
-        Args:
-            render: from u to the pictures (N, H, W, 3), with a graph.
-            wholes: the configuration of the whole space of each.
-            u: (d,) of the searched controls.
-            gradient: whether the derivative is wanted.
-
-        Returns:
-            An evaluation without derivative and the model's output for each picture, and the derivative (d,) of the sum
-            of their objectives, weighted by `hard_first`.
-        """
+        """Ask the model about several pictures at once: those that `render` makes of u, (N, H, W, 3) with a graph, each
+        of a configuration of the whole space. Returns an evaluation without derivative and the model's output for each,
+        and the derivative (d,) of the sum of their objectives, weighted by `hard_first`."""
         at = u.detach().clone().requires_grad_(bool(gradient))
         with torch.set_grad_enabled(bool(gradient)):
             pictures = render(at)
@@ -374,15 +339,8 @@ class Problem:
         gradient: WhichGradient,
         at_once: int,
     ) -> Evaluation:
-        """Return the mean over conditions whose pictures are predicted.
-
-        Args:
-            render: from some of the conditions and u to their pictures (N, H, W, 3), with a graph.
-            wholes: the configuration of the whole space under each.
-            u: (d,) of the searched controls.
-            gradient: whether the derivative is wanted.
-            at_once: pictures that the model is asked about at once.
-        """
+        """Return the mean over conditions whose pictures are predicted: `render` goes from some of them and u to
+        pictures (N, H, W, 3), with a graph. The model is asked about `at_once` of them at once."""
         found, total = [], None
         for begin in range(0, len(wholes), at_once):
             some = slice(begin, begin + at_once)
@@ -393,13 +351,8 @@ class Problem:
         return self.mean(found, u, None if total is None else total / len(wholes))
 
     def mean(self, found: Sequence[tuple[Evaluation, Output]], u: Tensor, gradient: Tensor | None = None) -> Evaluation:
-        """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw.
-
-        Args:
-            found: evaluations under each, and the model's outputs.
-            u: (d,) of the searched controls.
-            gradient: of the mean, where the evaluations have none.
-        """
+        """Return the mean over conditions, from evaluations with the model's outputs, and the gradient of the mean
+        where these have none. Its cost is counted in evaluations, each of which takes a picture a draw."""
         each, count = [one for one, _ in found], len(found)
         gradients = [one.gradient[: u.numel()] for one in each if one.gradient is not None]
         if self.task.varies:  # each condition has a truth of its own
@@ -420,7 +373,6 @@ class Problem:
 
     @staticmethod
     def _usual(each: Sequence[Judgement]) -> Judgement:
-        """The most frequent answer, with the means over all."""
         score, margin = (mean(values) for values in ([one.score for one in each], [one.margin for one in each]))
         usual = typical(each)
         return Judgement.of(score, margin, usual.answer, usual.payload)

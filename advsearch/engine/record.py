@@ -1,18 +1,33 @@
-"""What an attack knows so far, and how long each stage took."""
+"""What is known of a run so far, and kept of it: findings and stages of an attack, judgements as rows, measurements."""
 
 from __future__ import annotations
 
+import json
+import math
 import time
-from dataclasses import dataclass, field
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
+from pydantic import TypeAdapter
 from torch import Tensor
 
-from advsearch.attacks import SampleCount, SearchResult, Verification
-from advsearch.attacks.smallest import Bracket
+from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, count_right
+from advsearch.attacks.candidates import Bracket
+from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.engine.transport import Predictor
+from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
-from advsearch.tasks import Judgement
+from advsearch.report.wording import count
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.attack import ControlGroup, VerifiedRate
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Fields, Result
+from advsearch.runs.store import Row
+from advsearch.runs.summary import NAME, read_result
+from advsearch.tasks import Answer, Judgement
+from advsearch.tasks.base import mean
+from advsearch.viewer.pages import keep_answer
 
 KEPT = 4
 """Pictures of each group of trials that are kept."""
@@ -36,11 +51,9 @@ class Findings:
             the run's answer instead.
         failures: verification of the first of the different failures that the policy answers with.
         average: trials of configurations drawn from the whole space.
-        smallest: the least epsilon, where it was asked for.
         pictures: of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on
             only those that it made itself.
         frames: some pictures of the search, (H, W, 3) 8-bit values in [0, 1], numpy, for the animation.
-        interrupted: somebody pressed Ctrl-C.
         transport: what predicted the pictures of the searches, if anything did.
         rendered_because: why nothing did, in words.
         surface_refused: why matrices did and not light on surfaces, where that was tried.
@@ -72,24 +85,14 @@ class Findings:
 
     @property
     def spp(self) -> int:
-        """Samples a pixel of the verification.
-
-        Raises:
-            RuntimeError: it has not been chosen yet.
-        """
         if self.sample_count is None:
             raise RuntimeError("the sample count of the verification has not been chosen yet")
         return self.sample_count.spp
 
 
 class Stages:
-    """Tells a watcher which stage runs, and keeps the time of each.
-
-    Attributes:
-        progress: the watcher.
-        seconds: time of each stage by name, in seconds.
-        started: when the first began, by `time.perf_counter`.
-    """
+    """Tells a watcher which stage runs, and keeps the seconds of each by name. The first began at `started`, by
+    `time.perf_counter`."""
 
     def __init__(self, progress: Progress, started: float | None = None) -> None:
         self.progress = progress
@@ -105,12 +108,206 @@ class Stages:
         self.progress.stage(title, total, hint=hint, at_most=at_most)
 
     def end(self) -> None:
-        """End the stage that runs, if one does."""
         if self._name:
             self.seconds[self._name] = self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
             self._name = ""
 
     @property
     def total(self) -> float:
-        """Seconds since the first stage began."""
         return time.perf_counter() - self.started
+
+
+LOST = "(no answer)"
+"""The answer to a picture that nobody could make; what the row keeps beside it says why."""
+
+
+def no_answer(why: str) -> Judgement:
+    """Return what stands for the answer to a picture that nobody could make: neither right nor a success, and why."""
+    return Judgement(math.nan, math.nan, right=False, answer=Answer(LOST, None, None), payload={"lost": why})
+
+
+def lost_remarks(lost: int) -> list[str]:
+    """Return what a reader has to know of so many pictures that nobody could make."""
+    if not lost:
+        return []
+    has, it = ("has", "it") if lost == 1 else ("have", "them")
+    return [f"{count(lost, 'picture')} {has} no answer, which counts as not right: every worker that took {it} died."]
+
+
+def trial_row(
+    kind: str,
+    number: int,
+    seed: int | None,
+    spp: int,
+    trial: Judgement,
+    values: Mapping[str, Value] | None = None,
+    *,
+    sought: bool = True,
+    **more: Any,
+) -> Row:
+    """Return what the store keeps of a trial; the seed is None of a picture that was predicted. There is a success only
+    where a search sought some answer."""
+    return Row(
+        kind=kind,
+        step=number,
+        seed=seed,
+        spp=spp,
+        objective=_number(trial.objective),
+        success=trial.success if sought else None,
+        values=values or {},
+        **{"renders": 1, **_said(trial), **more},
+    )
+
+
+def judged(row: Row, judgement: Judgement) -> Row:
+    """Return the row with what a task said of its picture."""
+    return replace(row, **_said(judgement))
+
+
+def _said(judgement: Judgement) -> dict[str, Any]:
+    answer = judgement.answer
+    return {
+        "score": _number(judgement.score),
+        "correct": judgement.right,
+        "margin": _number(judgement.margin),
+        "label": None if judgement.not_a_number else answer.label,
+        "label_index": answer.index,
+        "probability": answer.probability,
+        "payload": judgement.payload,
+        "metrics": judgement.metrics or {},
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
+
+
+def judgement_of(row: Row) -> Judgement:
+    """Return what was said of a trial from its row: nothing where it has no label, for the answer was not a number.
+
+    In an old row, only the score says whether it was right.
+    """
+    score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
+    right = score <= 0.0 if row.correct is None else row.correct
+    answer = Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability)
+    return Judgement(score, margin, right, answer, row.payload, row.objective, row.metrics or None)
+
+
+def verified_rate(checked: Verification) -> VerifiedRate:
+    """Return the rate of a success, with how often each such answer was given and the mean score of the trials."""
+    rated = rate_of(checked.adversarial, checked.counting, checked.successes)
+    return rated.model_copy(update={"stopped": checked.stopped})
+
+
+def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:
+    """Return a rate with the answers of its successes and the mean score of those that are a number."""
+    labels = Counter(trial.answer.label for trial in successes)
+    return VerifiedRate(
+        successes=rate.successes,
+        trials=rate.trials,
+        rate=rate.rate,
+        interval=rate.interval,
+        spp=rate.spp,
+        labels=dict(labels.most_common()),
+        margin=mean_number(trial.score for trial in trials),
+        not_a_number=sum(trial.not_a_number for trial in trials),
+    )
+
+
+def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
+    """Return how many trials of the clean scene are right."""
+    counted, nothing = count_right(trials, spp), sum(trial.not_a_number for trial in trials)
+    rate, interval = counted.rate, counted.interval
+    return ControlGroup(
+        correct=counted.successes, trials=counted.trials, rate=rate, interval=interval, not_a_number=nothing
+    )
+
+
+def mean_number(values: Iterable[float]) -> float:
+    """Return the mean of those that are numbers; NaN where none is."""
+    numbers = [value for value in values if not math.isnan(value)]
+    return mean(numbers) if numbers else math.nan
+
+
+Kept = TypeVar("Kept")
+Ending = TypeVar("Ending", bound=Result)
+Kind = TypeVar("Kind", bound=Fields)
+Measured = TypeVar("Measured")
+
+
+class OutOfTime(Exception):
+    """The time that a measurement was given is over."""
+
+
+class Results:
+    """What a run has measured, in its store; measures what is not there, until the time is up: one measurement is
+    always made, so that it gets on. `made` counts them; what is stored is read back before the first."""
+
+    def __init__(self, run: RunDirectory | None, seconds: float | None = None) -> None:
+        self._run = run
+        self._end = math.inf if seconds is None else time.monotonic() + seconds
+        self.made = 0
+
+    def get(self, key: str, measure: Callable[[], Any]) -> Any:
+        """Return the JSON value that is stored under a key, or what `measure` returns in time, and store it."""
+        stored = self.stored(key)
+        if stored is None:
+            self.check_time()
+            self.made += 1
+            stored = json.loads(json.dumps(measure()))
+            self.put(key, stored)
+        return stored
+
+    def check_time(self) -> None:
+        """Raise `OutOfTime` where there is no time for another measurement."""
+        if self.made and time.monotonic() >= self._end:
+            raise OutOfTime
+
+    def value(self, key: str, kind: type[Measured], measure: Callable[[], Measured]) -> Measured:
+        """Return what `measure` returns, or what is stored of this kind (a dataclass, or a list of some); as `get`."""
+        adapter = TypeAdapter(kind)
+        return adapter.validate_python(self.get(key, lambda: adapter.dump_python(measure(), mode="json")))
+
+    def row(self, key: str, kind: type[Kind], measure: Callable[[], Kind]) -> Kind:
+        """Return the fields that `measure` returns, or those of this kind that are stored; otherwise as `get`."""
+        return kind.of(self.get(key, lambda: measure().to_dict()))
+
+    def rows(self, key: str, kind: type[Kind], measure: Callable[[], Sequence[Kind]]) -> list[Kind]:
+        return [kind.of(one) for one in self.get(key, lambda: [one.to_dict() for one in measure()])]
+
+    def put(self, key: str, value: Any) -> None:
+        if self._run is not None:
+            self._run.store.set_note(key, json.dumps(value))
+
+    def stored(self, key: str) -> Any:
+        return None if self._run is None else self._run.store.noted(key)
+
+
+def kept_rows(
+    run: RunDirectory | None, results: Results, rows: Iterable[Kept], result: Callable[[Sequence[Kept], str], Ending]
+) -> Ending:
+    """Take rows until they end, the time is up or there is an interrupt, and keep what they come to after each.
+
+    The summary never has fewer rows than an earlier sitting left in it: those are read back before anything is
+    measured.
+    """
+    taken: list[Kept] = []
+    ending = INTERRUPTED
+    try:
+        with interruptible():
+            for row in rows:
+                taken.append(row)
+                if results.made and run is not None:
+                    run.write_summary(result(taken, ending))  # what a kill leaves
+            ending = "done"
+    except KeyboardInterrupt:
+        pass
+    except OutOfTime:
+        ending = OUT_OF_TIME
+    answer = result(taken, ending)
+    if run is None:
+        return answer
+    if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
+        before = read_result(run.path)
+        return before if isinstance(before, type(answer)) else answer
+    return keep_answer(run, answer)

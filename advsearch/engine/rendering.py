@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from advsearch import seeds
 from advsearch.config import SceneConfig
 from advsearch.config.scene import PICTURE_SPP, PICTURES
-from advsearch.controls import Control, Space, compose
+from advsearch.controls import Space, compose
 from advsearch.controls.values import sentences
 from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
@@ -26,8 +26,7 @@ from advsearch.report.marks import contact_sheet, marked
 from advsearch.report.phrases import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
-from advsearch.runs.results.base import Formation
-from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
+from advsearch.runs.results.base import Formation, MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
 from advsearch.scene.surfaces import Surfaces
@@ -247,7 +246,7 @@ def render(
     model = load_model(model, task=made)
     asked = made.on(model)
     instances = as_controls(controls)
-    if around is not None and any(_turns(one) for one in instances):
+    if around is not None and any(one.kind == "camera" and "azimuth" in one.settings() for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
     size = as_python(resolution) or model.input_size
     progress = watcher(progress)
@@ -288,7 +287,6 @@ def render(
 
 
 def _configuration(at: Tensor, space: Space) -> Tensor:
-    """A configuration that was given for a space."""
     u = torch.as_tensor(at, dtype=torch.float32)
     if u.shape != space.start.shape:
         raise InputError(
@@ -300,7 +298,6 @@ def _configuration(at: Tensor, space: Space) -> Tensor:
 def _facts(
     description: SceneDescription, label: str | None, look: Callable[[], Surfaces], values: Mapping[str, Value]
 ) -> Facts:
-    """What a view gives a task to judge by."""
     said = {**description.values, **{name: one["value"] for name, one in values.items()}}
     numbers = {name: float(one) for name, one in said.items() if isinstance(one, (int, float))}
     return Facts(description.object_name, label, description.object.label, lambda: numbers, lambda: sight_of(look()))
@@ -335,7 +332,6 @@ def writable(path: str | Path, views: int) -> Path:
 
 
 def _turned(description: SceneDescription, around: int | None) -> Iterator[SceneDescription]:
-    """The scene, or the scene from azimuths all around it."""
     if around is None:
         yield description
         return
@@ -346,8 +342,3 @@ def _turned(description: SceneDescription, around: int | None) -> Iterator[Scene
     first = description.number("camera.azimuth")
     for number in range(around):
         yield description.with_values(camera__azimuth=(first + 360.0 * number / around) % 360.0)
-
-
-def _turns(control: Control) -> bool:
-    """Whether a control says where the camera stands around the object."""
-    return control.kind == "camera" and "azimuth" in control.settings()

@@ -1,11 +1,10 @@
-"""The stages of an attack, one after the other: first look, search, random search beside it, verification.
-
-For the smallest change that flips the answer, searches and trials take turns, within ever smaller budgets.
-"""
+"""The stages of an attack, one after the other: first look, search, random search beside it, verification. For the
+smallest change that flips the answer, searches and trials take turns, within ever smaller budgets."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -13,14 +12,29 @@ from typing import Any
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Domain, Ending, Evaluation, Policy, SearchResult, Verification, count_right, run_trials
+from advsearch.attacks import (
+    Domain,
+    Ending,
+    Evaluation,
+    Policy,
+    SearchResult,
+    StepRecord,
+    Verification,
+    count_right,
+    make_policy,
+    planned_renders,
+    run_trials,
+    search,
+)
+from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
 from advsearch.attacks.evaluation import Query
-from advsearch.attacks.smallest import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
 from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
 from advsearch.config import AttackConfig
-from advsearch.engine.failures import check_failures
+from advsearch.engine import surface_light
+from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import inside
 from advsearch.engine.journal import PLAN, Journal, finite, other_answers, same
+from advsearch.engine.objective import penalised
 from advsearch.engine.planning import (
     WORTH_BOUNCES,
     bounces_of,
@@ -31,67 +45,21 @@ from advsearch.engine.planning import (
     plan_gradients,
     tuned,
 )
+from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.searches import Searches
-from advsearch.engine.transport import CleanMatrix, Transport, reason_against
-from advsearch.engine.verifier import Verifier, ladder_of
+from advsearch.engine.surface_light import SurfaceLight
+from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason_against, remark
+from advsearch.engine.verifier import Verifier, check_failures, ladder_of
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
+from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
-CONFIRMED = 40
-"""Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them."""
+MOST_FRAMES = 60
+"""Pictures of a search that its animation has, at most."""
 
-
-def find_smallest(searches: Searches, verifier: Verifier) -> None:
-    """Bracket the smallest epsilon; every claim on the way goes through trials with seeds of its own.
-
-    On the way the fewest trials that can verify anything are enough where none fails. The upper end is tried again in
-    full, and what is verified at the end is the configuration there.
-    """
-    problem, findings, trials = searches.problem, searches.findings, verifier.count
-    results: list[SearchResult] = []
-    transport = findings.transport if isinstance(findings.transport, Transport) else None
-
-    def found(inside: Domain, number: int) -> Tensor:
-        searches.begin(
-            "search", f"search {number + 1} of at most {ROUNDS}", problem.steps, "`steps` shortens each search"
-        )
-        kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
-        ranked = transport is None  # what is predicted has no noise
-        results.append(searches.search(kind, searches.policy, problem.steps, seed, domain=inside, ranked=ranked))
-        findings.search = findings.search or results[0]  # the answer if this is interrupted
-        verifier.begin("trying smaller changes", MOST_CHECKS * trials, at_most=True)
-        return results[-1].best_u
-
-    def passes(u: Tensor, check: int, few: int = trials) -> bool:
-        """Whether all trials together pass; so `few` do without a failure."""
-        allowed, scores, failures = problem.rule.allowed(trials), list[float](), 0
-        while len(scores) < trials and failures <= allowed and (failures or len(scores) < few):
-            (trial,) = verifier.trials(f"check {check}", {len(scores): u})
-            scores.append(trial.score)
-            failures += not trial.success
-        if transport is not None:
-            transport.correct(u, scores)
-        if failures <= allowed:
-            findings.search = replace(results[-1], best_u=u)
-        return failures <= allowed
-
-    def seems(u: Tensor, check: int) -> bool:
-        return passes(u, check, problem.rule.fewest)
-
-    times = -(-CONFIRMED // trials)
-    bracket = smallest(found, seems, problem.domain, likely=None if transport is None else transport.likely)
-    if bracket.u is not None:
-        most = ATTEMPTS * times * trials
-        verifier.begin("checking the smallest change", most, at_most=True)
-    bracket = confirmed(bracket, passes, problem.domain, times=times)
-    renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
-    answer = results[0].best_u if bracket.u is None else bracket.u
-    ending = results[0].ending if bracket.u is None else Ending.FOUND
-    findings.smallest = bracket
-    own = results[0 if bracket.u is None else bracket.found_by]
-    findings.search = replace(own, best_u=answer, ending=ending, renders=renders, gradients=gradients)
+UNPRINTED = "search without print terms"
+"""The kind of the search beside one with print terms: what these cost is told by its answer."""
 
 
 LOOK, LOOKED_AT = "first look", ("score", "margin", "objective")
@@ -103,16 +71,8 @@ FIRST_LOOK = 4
 
 @dataclass
 class Attack:
-    """One search on one problem with its verification; what is known so far is in `findings`.
-
-    Attributes:
-        journal: of the run; its problem is what is attacked.
-        config: its settings.
-        policy: what proposes.
-        stages: told which stage runs.
-        findings: filled by `carry_out`.
-        clean: the matrix of light transport that attacks with other budgets share.
-    """
+    """One search on one problem with its verification; what is known so far is in `findings`. Attacks with other
+    budgets share the matrix `clean`."""
 
     journal: Journal
     config: AttackConfig
@@ -122,29 +82,26 @@ class Attack:
     clean: CleanMatrix = field(default_factory=CleanMatrix)
 
     def __post_init__(self) -> None:
-        self.problem = self.journal.problem
+        self.problem: Problem = self.journal.problem
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
         ladder = ladder_of(self.config)
         asked = self.config.trials is not None or self.config.smallest
         unasked = TRIAL_LOOKS if self.problem.conditions is None else OVER_LOOKS
         looks = (self.config.trial_count,) if asked else unasked
         self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, looks)
-        kept = (self.stages, self.findings, self.clean)
-        self._searches = Searches(self.journal, self.config, self.policy, *kept)
 
     def carry_out(self) -> Findings:
-        """Do everything; what an interrupt leaves undone is missing from the findings."""
         if self.config.smallest:
             scaled(self.problem.domain, 1.0)  # refuses what has no budget before anything is rendered
         try:
             with interruptible():
                 self.plan()
                 if self.worth_attacking():
-                    self._searches.collect_transport()
+                    self.collect_transport()
                     if self.config.smallest:
-                        find_smallest(self._searches, self._verifier)
+                        find_smallest(self, self._verifier)
                     else:
-                        self._searches.run()
+                        self.search_all()
                     self.verify()
                 if self.config.average:
                     self._verifier.average(self.config.average)
@@ -171,7 +128,7 @@ class Attack:
         """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
         problem, config = self.problem, self.config
         worth = config.specialise and (config.measure == "full" or problem.steps >= WORTH_BOUNCES)
-        if worth and self._searches.against_surface_light() is not None:  # else no step will be rendered
+        if worth and self.against_surface_light() is not None:  # else no step will be rendered
             self.stages.begin(
                 "setup",
                 "finding how many bounces of light the search needs",
@@ -249,11 +206,7 @@ class Attack:
 
     def _check_look(self, start: Tensor) -> None:
         """Note what was seen, or refuse to go on with a model or an objective that says something else of the same
-        pictures than it did. One that says something else each time can't be told by it.
-
-        Raises:
-            InputError: it does.
-        """
+        pictures than it did. One that says something else each time can't be told by it."""
         now = [_values(one) for one in self.findings.first_look]
         before = self.journal.note(LOOK)
         if before is None:
@@ -318,6 +271,191 @@ class Attack:
             success_rate=baseline.success_rate,
             distribution=None,
         )
+
+    # ---- searches ---------------------------------------------------------------------------------------------------
+
+    def collect_transport(self) -> None:
+        """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
+        problem, steps, findings = self.problem, self.problem.steps, self.findings
+        matrix, surface = reason_against(problem, steps, self.config.specialise), self.against_surface_light()
+        if matrix is None and problem.conditions is None:
+            self._prepare(Transport(problem, steps, clean=self.clean), "collecting light transport")
+            return
+        if surface is None:
+            light = SurfaceLight(problem, steps)
+            self._prepare(light, "finding the light on surfaces")
+            surface = light.too_far_off
+            if surface is None:
+                return
+            findings.transport, findings.surface_refused = None, surface
+            others = "rendered" if matrix else "predicted by matrices"
+            self.stages.progress.message(f"Pictures are {others}: {surface}.")
+        if matrix is None:
+            self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
+            return
+        self._renders_because(matrix if surface == surface_light.NO_CAMERA else surface)
+
+    def against_surface_light(self) -> str | None:
+        """Why light on surfaces does not predict the search, in words; None if it may."""
+        return surface_light.reason_against(self.problem, self.problem.steps, self.policy, self.config.specialise)
+
+    def _prepare(self, predictor: Predictor, title: str) -> None:
+        """Make what predicts pictures; where its matrix would be too large, pictures are rendered."""
+        hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
+        self.stages.begin("transport", title, predictor.samples, hint=hint)
+        self.findings.transport = predictor
+        try:
+            predictor.prepare(self.stages.progress.advance)
+        except TransportTooLargeError as error:
+            self.findings.transport = None
+            self._renders_because(str(error))
+
+    def _renders_because(self, reason: str) -> None:
+        """Keep why the search renders, and say so where that needn't be."""
+        self.findings.rendered_because = reason
+        if told := remark(reason):
+            self.stages.progress.message(told)
+
+    def search_all(self) -> None:
+        """The search, the same without print terms where it has them, and the random one, each with as many renders."""
+        config, findings, steps = self.config, self.findings, self.problem.steps
+        self.begin("search", f"searching with {self.policy.name}", steps, "`steps` or `seconds` shorten it")
+        seed, frames = self.problem.seed, findings.frames
+        findings.search = self.search("search", self.policy, steps, seed, frames, config.seconds)
+        if config.seconds is not None:  # renders of the search itself, without those of the ranking
+            steps = max(1, findings.search.history[-1].renders) if findings.search.history else 1
+        if config.printable:
+            title = "searching without print terms, to see what they cost"
+            self.begin("without print terms", title, steps, "`printable=false` leaves both out")
+            findings.unprinted = self.search(UNPRINTED, self.policy, steps, seed)
+        if not config.baseline or self.policy.name == "random":
+            return
+        self.begin("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
+        findings.baseline = self.search("baseline", make_policy("random"), steps, seeds.stream(seed, "baseline"))
+
+    def search(
+        self,
+        kind: str,
+        policy: Policy[Any],
+        steps: int,
+        seed: int,
+        frames: list[Any] | None = None,
+        seconds: float | None = None,
+        domain: Domain | None = None,
+        ranked: bool = True,
+    ) -> SearchResult:
+        """Search, reading back what is stored already; `ranked` renders the best configurations again.
+
+        Raises:
+            KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
+        """
+
+        before, every = 0, max(1, -(-steps // MOST_FRAMES))
+
+        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            nonlocal before
+            if evaluation.picture is not None and frames is not None:
+                frames.append(evaluation.picture.numpy())
+            self.stages.progress.advance(record.renders - before, best=record.best, **self.journal.traced.told)
+            before = record.renders
+
+        def answers(queries: Sequence[Query]) -> Iterator[Evaluation]:
+            if frames is not None:
+                queries = [replace(one, keep=one.phase == "search" and one.number % every == 0) for one in queries]
+            passed = (lambda query: None) if self.findings.transport is None else self.findings.transport.passed
+            return self.journal.answers(queries, self._evaluated, passed)
+
+        domain = self.problem.domain if domain is None else domain
+        transport = self.findings.transport
+        exact, drawn = (transport.exact, transport.drawn) if transport is not None else (False, False)
+        found = search(
+            answers,
+            replace(domain, exact=exact, drawn=drawn and policy.uses_gradient),
+            policy,
+            steps=steps,
+            seed=seed,
+            candidates=4 if ranked else 0,
+            close=self.config.close_looks,
+            late=self.journal.clock(kind, seconds),
+            on_step=on_step,
+            kind=kind,
+            noise=self.problem.seed,
+        )
+        if found.ending is Ending.INTERRUPTED:
+            self.findings.search = self.findings.search or found
+            raise KeyboardInterrupt
+        return found
+
+    def _evaluated(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Have queries of one search answered: predicted where something predicts, and traced otherwise."""
+        transport, traced = self.findings.transport, self.journal.traced
+        predicted = transport is not None and bool(queries) and queries[0].phase == "search"
+        answers = transport.answered(queries, traced) if transport is not None and predicted else traced(queries)
+        for query, answer in zip(queries, answers, strict=True):
+            printed = self.config.printable and query.kind != UNPRINTED
+            yield penalised(answer, self.problem.searched_space, query.u) if printed else answer
+
+    def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
+        renders = planned_renders(steps, close=self.config.close_looks)
+        hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
+        if self.findings.transport is not None:
+            hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
+        self.stages.begin(name, title, renders, hint=hint, at_most=True)
+
+
+CONFIRMED = 40
+"""Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them."""
+
+
+def find_smallest(attack: Attack, verifier: Verifier) -> None:
+    """Bracket the smallest epsilon; every claim on the way goes through trials with seeds of its own.
+
+    On the way the fewest trials that can verify anything are enough where none fails. The upper end is tried again in
+    full, and what is verified at the end is the configuration there.
+    """
+    problem, findings, trials = attack.problem, attack.findings, verifier.count
+    results: list[SearchResult] = []
+    transport = findings.transport if isinstance(findings.transport, Transport) else None
+
+    def found(inside: Domain, number: int) -> Tensor:
+        attack.begin(
+            "search", f"search {number + 1} of at most {ROUNDS}", problem.steps, "`steps` shortens each search"
+        )
+        kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
+        ranked = transport is None  # what is predicted has no noise
+        results.append(attack.search(kind, attack.policy, problem.steps, seed, domain=inside, ranked=ranked))
+        findings.search = findings.search or results[0]  # the answer if this is interrupted
+        verifier.begin("trying smaller changes", MOST_CHECKS * trials, at_most=True)
+        return results[-1].best_u
+
+    def passes(u: Tensor, check: int, few: int = trials) -> bool:
+        """Whether all trials together pass; so `few` do without a failure."""
+        allowed, scores, failures = problem.rule.allowed(trials), list[float](), 0
+        while len(scores) < trials and failures <= allowed and (failures or len(scores) < few):
+            (trial,) = verifier.trials(f"check {check}", {len(scores): u})
+            scores.append(trial.score)
+            failures += not trial.success
+        if transport is not None:
+            transport.correct(u, scores)
+        if failures <= allowed:
+            findings.search = replace(results[-1], best_u=u)
+        return failures <= allowed
+
+    def seems(u: Tensor, check: int) -> bool:
+        return passes(u, check, problem.rule.fewest)
+
+    times = -(-CONFIRMED // trials)
+    bracket = smallest(found, seems, problem.domain, likely=None if transport is None else transport.likely)
+    if bracket.u is not None:
+        most = ATTEMPTS * times * trials
+        verifier.begin("checking the smallest change", most, at_most=True)
+    bracket = confirmed(bracket, passes, problem.domain, times=times)
+    renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
+    answer = results[0].best_u if bracket.u is None else bracket.u
+    ending = results[0].ending if bracket.u is None else Ending.FOUND
+    findings.smallest = bracket
+    own = results[0 if bracket.u is None else bracket.found_by]
+    findings.search = replace(own, best_u=answer, ending=ending, renders=renders, gradients=gradients)
 
 
 def _values(trial: Judgement) -> list[float | None]:

@@ -1,10 +1,6 @@
-"""Searches in which cameras move, by light kept on surfaces: cameras are searched, or vary by chance.
-
-Where environments vary by chance, too, they are those of a bank. Before the search, and within it,
-pictures are traced beside predicted ones. Where these are further off than two levels, and than a rendered evaluation's
-own noise, the light is found anew for the present base colours, if these are searched; where that was so the time
-before, too, or before the search, pictures are traced from there on, or predicted by matrices instead.
-"""
+"""Searches in which cameras move, by light kept on surfaces (docs/surface-light.md). Pictures are traced beside
+predicted ones: where these are too far off, the light is found anew for the present base colours, if they are searched;
+the second time in a row pictures are traced from there on, or predicted by matrices."""
 
 from __future__ import annotations
 
@@ -29,7 +25,7 @@ from advsearch.engine.transport import BOUND, Conditions, Deviation, Predictor, 
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface import plan
+from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
 from advsearch.scene.surface.renderer import Look, Sketch, SurfaceRenderer
 
@@ -56,7 +52,7 @@ def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise
     if not specialise:
         return "nothing is left out"
     names = [one.name for one in problem.space.controls]
-    if not plan.varied(problem.renderer, names) & CAMERAS:
+    if not surface_renderer.varied(problem.renderer, names) & CAMERAS:
         return NO_CAMERA
     if steps * problem.draws < WORTH:
         return f"light on surfaces pays from {WORTH} pictures on"
@@ -65,21 +61,15 @@ def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise
     for group in problem.plan.groups:
         if "forced" in group.reason and group.estimator not in ("none", "image"):
             return f"the estimator of {group.name} is forced"
-    return plan.why_not(problem.renderer, names)
+    return surface_renderer.why_not(problem.renderer, names)
 
 
 @dataclass
 class SurfaceLight(Predictor):
-    """The light on surfaces of a run whose searches look through many cameras.
-
-    Attributes:
-        problem: what is searched.
-        steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        at: (d,) the configuration whose light is found; None for the start.
-        places: which numbers of u move; None for those of cameras and environments.
-        renewals: the evaluations at which light was found anew.
-        ended: the evaluation from which on pictures are traced; None where they never are.
-    """
+    """The light on surfaces of a run whose searches look through many cameras, found `at` (d,), or at the start. What
+    comes after `steps` evaluations of a search belongs to the ranking, and is traced. The numbers of u at `places`
+    move, without these those of cameras and environments. Light was found anew at the evaluations `renewals`; from
+    `ended` on pictures are traced."""
 
     way: ClassVar[str] = "surface light"
     problem: Problem
@@ -163,7 +153,6 @@ class SurfaceLight(Predictor):
 
     @cached_property
     def _colored(self) -> bool:
-        """Whether the object's base colour is searched."""
         return bool(self._changing(frozenset({COLOR}))[: self.problem.domain.dim].any())
 
     @cached_property
@@ -183,14 +172,14 @@ class SurfaceLight(Predictor):
         """Which numbers of the whole space belong to controls that change some inputs of the scene."""
         space = self.problem.space
         found = torch.zeros(len(space.start), dtype=torch.bool)
-        names = {one.name for one in space.controls if inputs & plan.varied(self.problem.renderer, [one.name])}
+        renderer = self.problem.renderer
+        names = {one.name for one in space.controls if inputs & surface_renderer.varied(renderer, [one.name])}
         for group in space.groups:
             found[group.coordinates] = group.control in names
         return found
 
     @property
     def renderer(self) -> SurfaceRenderer:
-        """What predicts pictures."""
         if self._renderer is None:
             self.prepare()
         assert self._renderer is not None
@@ -222,7 +211,6 @@ class SurfaceLight(Predictor):
             yield self.evaluate(query, ahead.get(place))
 
     def _ahead(self, queries: Sequence[Query], place: int) -> dict[int, Tensor]:
-        """The pictures of the next queries, made at once; by the places of these."""
         some = [one.u for one in queries[place : place + self.renderer.at_once]]
         with torch.no_grad():
             pictures = self.renderer.pictures([self._inputs(u) for u in some], self.renderer.there, some)
@@ -287,7 +275,6 @@ class SurfaceLight(Predictor):
 
     @cached_property
     def _moves(self) -> bool:
-        """Whether any number of u moves something."""
         return bool(self._moving.any())
 
     def _pictures(self, wholes: Sequence[Tensor], u: Tensor, key: tuple[int, int] | None = None) -> Tensor:
@@ -352,13 +339,6 @@ def levels_off(renderer: Renderer, pictures: Sequence[Tensor], u: Tensor, seed: 
 
     They are compared with two that are traced without the denoiser, which leaves its own marks in all that it is given.
     The mean product of the differences to both is the squared error without their noise, which a square would count.
-
-    Args:
-        renderer: the one that traces.
-        pictures: to be compared.
-        u: (d,) the configuration.
-        seed: of the noise.
-        spp: samples a pixel of each of the two.
     """
     undenoised = renderer.like(denoiser="none")
     with torch.no_grad():

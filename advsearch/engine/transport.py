@@ -1,9 +1,6 @@
-"""Searches over base colours and light by light transport, and how far its pictures are from traced ones.
-
-The evaluations of the search itself are predicted; the renders of the ranking after it and all trials trace paths.
-Every `EVERY` evaluations the present configuration and that of the matrix are traced with one seed: where the change
-between them is predicted wrongly by more than `BOUND`, the matrix is made anew at the present one.
-"""
+"""Searches over base colours and light by light transport, and how far its pictures are from traced ones. Every `EVERY`
+evaluations the change since the matrix was made is traced: where it is predicted wrongly by more than `BOUND`, the
+matrix is made anew. The ranking and all trials trace paths."""
 
 from __future__ import annotations
 
@@ -33,7 +30,7 @@ from advsearch.scene.transport.lights import (
     samples_to_collect,
     why_not,
 )
-from advsearch.scene.transport.renderer import TOO_LARGE, PredictingRenderer
+from advsearch.scene.transport.matrix import TOO_LARGE, PredictingRenderer
 
 WORTH = 16
 """Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
@@ -88,14 +85,9 @@ class Deviation:
 
 @dataclass(frozen=True)
 class Conditions:
-    """The conditions that matrices were made for.
-
-    Attributes:
-        made: how many.
-        dropped: how many of them made room for newer ones.
-        grown: comparisons after which there had to be more.
-        gap: by how much the objective was larger under them than under unseen ones, at the last comparison.
-    """
+    """The conditions that matrices were made for: how many, how many of them were dropped for newer ones, comparisons
+    after which there had to be more, and by how much the objective was larger under them than under unseen ones, at the
+    last."""
 
     made: int
     dropped: int
@@ -129,13 +121,8 @@ def varying(problem: Problem) -> list[str]:
 
 
 class Predictor(ABC):
-    """What predicts the pictures of a run's searches.
-
-    Attributes:
-        way: by what, in words.
-        deviations: what the comparisons with traced pictures found, in order.
-        seconds: spent on making matrices and on comparing.
-    """
+    """What predicts the pictures of a run's searches, in what way; its `deviations` from traced pictures, in order, and
+    the seconds spent on making matrices and comparing."""
 
     way: ClassVar[str] = "matrix"
     deviations: list[Deviation]
@@ -201,12 +188,7 @@ class Predictor(ABC):
 
 @dataclass(frozen=True, eq=False)
 class ExpansionPoint:
-    """Where a picture was linearised, and the matrix that was made there.
-
-    Attributes:
-        u: the configuration.
-        renderer: the matrix.
-    """
+    """Where a picture was linearised, and the matrix that was made there."""
 
     u: Tensor
     renderer: PredictingRenderer
@@ -214,27 +196,16 @@ class ExpansionPoint:
 
 @dataclass
 class CleanMatrix:
-    """The matrix of the clean configuration, for attacks that differ in nothing but their budget of change.
-
-    Attributes:
-        made: None until the first of them needs it.
-    """
+    """The matrix of the clean configuration, for attacks that differ in nothing but their budget of change."""
 
     made: ExpansionPoint | None = None
 
 
 @dataclass
 class Transport(Predictor):
-    """The matrices of a run's searches where nothing varies by chance.
-
-    Attributes:
-        problem: what is searched.
-        steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        renewals: by kind of search, the evaluations at which the matrix was made anew, or, where there is none that
-            could be, from which on pictures are traced.
-        deviations: what the comparisons found, in order.
-        clean: where every search begins; made here if it is not there yet.
-        seconds: spent on making matrices and on comparing.
+    """The matrices of a run's searches where nothing varies by chance. What comes after `steps` evaluations of a search
+    belongs to the ranking, and is traced. `renewals` are, by kind of search, the evaluations at which the matrix was
+    made anew, or, where there is none that could be, from which on pictures are traced. Every search begins at `clean`.
     """
 
     exact: ClassVar[bool] = True
@@ -292,12 +263,10 @@ class Transport(Predictor):
 
     @property
     def _pictures(self) -> int:
-        """Pictures that are traced to make a matrix."""
         return self.start.lights if isinstance(self.start, BasisRenderer) else 1
 
     @property
     def start(self) -> PredictingRenderer:
-        """Where every search begins."""
         return self._begin.renderer
 
     @property

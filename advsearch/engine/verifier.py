@@ -1,26 +1,51 @@
-"""Trials of configurations: at a sample count that is chosen first, with seeds of their own, kept as rows."""
+"""Trials of configurations, kept as rows: of answers, of different failures, of answers on other models or pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluation, SearchResult, Verification, choose_spp, run_trials, verify
+from advsearch.attacks import (
+    Ending,
+    Evaluation,
+    SearchResult,
+    Verification,
+    choose_spp,
+    count_right,
+    run_trials,
+    verify,
+)
+from advsearch.attacks.candidates import FoundFailure
 from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import Query, most_at_once
-from advsearch.attacks.sample_count import LADDER, margins_of, most_samples
+from advsearch.attacks.trials import LADDER, margins_of, most_samples
+from advsearch.cluster import Executor
 from advsearch.config.scene import SceneConfig
-from advsearch.engine.journal import Journal, digest
+from advsearch.engine.attack_result import save_marked
+from advsearch.engine.journal import Journal, Shared, digest
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import KEPT, Findings, Stages
+from advsearch.engine.record import KEPT, Findings, Stages, verified_rate
 from advsearch.engine.transport import Predictor
+from advsearch.errors import InputError
+from advsearch.progress import Progress
 from advsearch.report.wording import count as plural
-from advsearch.scene.formation import next_count
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.attack import (
+    DescribedValue,
+    DifferentFailure,
+    DifferentFailures,
+    FailingShare,
+    PicturedAnswer,
+)
+from advsearch.runs.summary import read_answer
+from advsearch.scene.formation import next_count, to_8_bit
 from advsearch.tasks import Judgement
 
 MANY = 64
@@ -36,15 +61,9 @@ def ladder_of(config: SceneConfig) -> Sequence[int]:
 
 @dataclass
 class Verifier:
-    """Makes the trials of one run: sample count, control group, answers, and configurations one at a time.
-
-    Attributes:
-        journal: of the run.
-        ladder: samples a pixel to choose from; a single count is taken as it is.
-        stages: told which stage runs.
-        findings: gets the sample count, the control group's trials, pictures and the count of renders.
-        looks: trials of each group; of several numbers, those after which the verdict may stand.
-    """
+    """Makes the trials of one run: sample count (of a ladder; a single one is taken as it is), control group, answers,
+    and configurations one at a time. Each group has as many trials as the last of `looks`; after those before, the
+    verdict may stand. What comes of them, pictures and the count of renders are in `findings`."""
 
     journal: Journal
     ladder: Sequence[int]
@@ -61,7 +80,6 @@ class Verifier:
 
     @property
     def count(self) -> int:
-        """Trials of each group, at most."""
         return self.looks[-1]
 
     def answers(
@@ -196,7 +214,6 @@ class Verifier:
         flags: str = "`trials` or `verify_spp`",
         at_most: bool = False,
     ) -> None:
-        """Begin a stage of so many trials."""
         most = "at most " if at_most else ""
         hint = f"{most}{trials} pictures of {plural(self.findings.spp, 'sample')} a pixel; {flags} shorten it"
         self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
@@ -205,3 +222,241 @@ class Verifier:
 def _asked(query: Query) -> tuple[bytes, int, int]:
     """What tells the picture of a trial from others, where no conditions are drawn."""
     return digest(query.u), query.seed, query.spp
+
+
+TRIED = 8
+"""Different failures that are tried, at most: the first of the list."""
+
+
+def check_failures(verifier: Verifier, found: SearchResult) -> None:
+    """Verify the first of the different failures that a search answers with, each for itself.
+
+    Each has the fewest trials that can verify anything, with the seeds that the control group had, up to the first that
+    decides against it. Where the clean scene was not right in all of these, it has as many as the answer. Over
+    conditions that vary one answer takes hundreds of trials, and nothing is tried here.
+    """
+    problem, findings = verifier.problem, verifier.findings
+    known, rule = found.failures, problem.rule
+    if known is None or not known.listed or rule.conditional or rule.already_wrong(count_right(findings.clean, 1)):
+        return
+    fewest = rule.fewest
+    whole = rule.control and not all(trial.right for trial in findings.clean[:fewest])
+    trials = None if whole else fewest
+    tried = known.listed[:TRIED]
+    verifier.begin(
+        "checking different failures with fresh renders", len(tried) * (trials or verifier.count), at_most=True
+    )
+    checked = []
+    for number, failure in enumerate(tried):
+        claim = replace(found, best_u=failure.u)
+        checked.append(verifier.verified(f"failure {number}", claim, trials=trials, curtailed=True))
+    findings.failures = tuple(checked)
+
+
+def write_failures(run: RunDirectory, problem: Problem, findings: Findings) -> None:
+    """Write a picture of each failure that was tried, as the model saw it in its first trial."""
+    for number, checked in enumerate(findings.failures):
+        seed, name = seeds.stream(problem.seed, "verification", 0), _picture(number)
+        seen = findings.pictures.get((f"failure {number}", 0))
+        seen = problem.picture(checked.u, seed, findings.spp) if seen is None else seen
+        run.save_image(name, seen)
+        save_marked(run, name, seen, problem.marks(seen, problem.whole(checked.u, seed)))
+
+
+def described_failures(problem: Problem, findings: Findings) -> DifferentFailures | None:
+    """Return what a summary says of the different failures; None of a policy that looks for one."""
+    known = findings.search.failures if findings.search else None
+    if known is None:
+        return None
+    listed = [_described(problem, findings, number, failure) for number, failure in enumerate(known.listed)]
+    return DifferentFailures(
+        over=[problem.domain.names[place] for place in known.over],
+        found=known.found,
+        seen=known.seen,
+        places=known.places,
+        share=None if known.share is None else FailingShare.of(known.share),
+        tried=len(findings.failures),
+        held=sum(one.ending is Ending.FOUND for one in findings.failures),
+        listed=listed,
+    )
+
+
+def _described(problem: Problem, findings: Findings, number: int, failure: FoundFailure) -> DifferentFailure:
+    checked = findings.failures[number] if number < len(findings.failures) else None
+    names, ranges = problem.domain.names, failure.ranges
+    return DifferentFailure(
+        ranges={names[place]: _range(problem, failure.u, place, ends) for place, ends in ranges.items()},
+        configuration={name: DescribedValue.of(value) for name, value in problem.describe(failure.u).items()},
+        objective=failure.objective,
+        holds=None if checked is None else checked.ending is Ending.FOUND,
+        verified=None if checked is None else verified_rate(checked),
+        picture=None if checked is None else f"images/{_picture(number)}.png",
+        pictured=None if checked is None else _pictured(checked.adversarial_trials[0]),
+    )
+
+
+def _pictured(first: Judgement) -> PicturedAnswer:
+    return PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0)
+
+
+def _picture(number: int) -> str:
+    return f"failure-{number:02d}"
+
+
+def _range(problem: Problem, u: Tensor, place: int, ends: tuple[float, float]) -> tuple[float, float] | str:
+    """Return both ends of one element of u in its parameter's unit, the option of a choice; in u where it is not told
+    by itself."""
+    block, said = problem.domain.block_of(place), list[float]()
+    for end in ends:
+        moved = u.clone()
+        moved[place] = u[place] if block.options else end
+        value = problem.describe(moved).get(block.name, {"value": end, "unit": "1"})["value"]
+        if isinstance(value, str):
+            return value
+        said.append(float(value) if block.size == 1 else end)
+    return min(said), max(said)
+
+
+def unchanged(picture: Tensor, seed: int) -> Tensor:
+    """Return a picture as it is."""
+    return picture
+
+
+@dataclass(frozen=True, eq=False)
+class RetrialCondition:
+    """What an answer is tried under.
+
+    Attributes:
+        name: in tables and in the kinds of rows.
+        source: conditions with equal sources are shown the same picture before it is changed.
+        change: what happens to a picture (H, W, 3) sRGB in [0, 1] before the model sees it, by the seed of its trial.
+        light: conditions with equal lights get their pictures from one linear radiance: their scenes are the same, only
+            tone curves or models differ. None: this one renders by itself.
+    """
+
+    name: str
+    problem: Problem
+    spp: int
+    source: Hashable
+    change: Callable[[Tensor, int], Tensor] = unchanged
+    light: Hashable = None
+
+
+class Retrials:
+    """Tries the clean scene and answers under conditions; what the run has stored already is read back.
+
+    Trial k has the same seed for the clean scene, for every answer and under every condition.
+
+    Args:
+        trials: of each answer under each condition.
+        seed: root of these trials, which nothing else uses.
+        executor: of workers that hold the problems by the names of their conditions; None makes pictures here.
+    """
+
+    def __init__(
+        self,
+        conditions: Sequence[RetrialCondition],
+        run: RunDirectory,
+        progress: Progress,
+        *,
+        trials: int,
+        seed: int,
+        executor: Executor | None = None,
+    ) -> None:
+        self._conditions, self._progress, self._count, self._seed = conditions, progress, trials, seed
+        first = Journal(run, Shared(conditions[0].problem))
+        self._journals = {
+            one.name: replace(first, traced=Shared(one.problem, executor, one.name)) for one in conditions
+        }
+        self._clean: dict[str, tuple[Judgement, ...]] = {}
+        self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
+        self._lights: dict[tuple[Hashable, int, int], Tensor] = {}
+        self._sharing = Counter(one.light for one in conditions if one.light is not None)
+        self._pictured = ""
+
+    def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
+        if condition.name not in self._clean:
+            self._clean[condition.name] = run_trials(
+                partial(self._answers, "clean", condition),
+                condition.problem.domain.start,
+                spp=condition.spp,
+                seed=self._seed,
+                trials=self._count,
+                kind=f"clean under {condition.name}",
+            )
+        return self._clean[condition.name]
+
+    def answer(self, kind: str, u: Tensor, condition: RetrialCondition) -> Verification:
+        """Try an answer (d,) under one condition, beside the clean scene; a claim of nothing is never confirmed. Its
+        rows are called "KIND under CONDITION"."""
+        return verify(
+            partial(self._answers, kind, condition),
+            condition.problem.domain,
+            u,
+            claim=Ending.NOT_VERIFIED,
+            spp=condition.spp,
+            seed=self._seed,
+            trials=self._count,
+            clean=self.clean(condition),
+            rule=condition.problem.rule,
+            kind=f"{kind} under {condition.name}",
+        )
+
+    def _answers(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        changed = partial(self._changed, kind, condition)
+        for answer in self._journals[condition.name].answers(queries, changed):
+            self._progress.advance(1)
+            yield answer
+
+    def _changed(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Judge pictures as the condition changes them; those of the configuration that is tried now are kept for other
+        conditions."""
+        if kind != self._pictured:
+            self._pictures.clear()
+            self._lights.clear()
+            self._pictured = kind
+        keys = [(condition.source, one.seed, condition.spp) for one in queries]
+        new = [
+            replace(one, wanted="picture") for one, key in zip(queries, keys, strict=True) if key not in self._pictures
+        ]
+        made = self._made(condition, new)
+        for query, key in zip(queries, keys, strict=True):
+            machine = None
+            if key not in self._pictures:
+                self._pictures[key], machine = next(made)
+            picture = condition.change(self._pictures[key], query.seed)
+            said = condition.problem.judge(to_8_bit(picture), condition.problem.whole(query.u, query.seed))
+            yield Evaluation.of(said, machine=machine)
+
+    def _made(self, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[tuple[Tensor, str | None]]:
+        """Pictures of a condition's problem, by workers where there are some, and on which machine."""
+        shared = self._journals[condition.name].traced
+        if shared.executor is None or len(queries) < 2:
+            for query in queries:
+                yield self._rendered(condition, query.u, query.seed), None
+            return
+        for answer in shared(queries):
+            assert answer.picture is not None
+            yield answer.picture, answer.machine
+
+    def _rendered(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
+        """As `Problem.picture`, from the radiance of other conditions with the same light where there are any."""
+        problem, key = condition.problem, (condition.light, seed, condition.spp)
+        if self._sharing[condition.light] < 2:
+            return problem.picture(u, seed, condition.spp)
+        renderer, whole = problem.renderer, problem.whole(u, seed)
+        with torch.no_grad():
+            if key not in self._lights:
+                self._lights[key] = renderer.radiance(whole, seed, condition.spp)
+            return to_8_bit(renderer.space.picture(whole, renderer.formation.display(self._lights[key])))
+
+
+def kept_answer(folder: Path, problem: Problem) -> torch.Tensor:
+    """Return the configuration (d,) that a run answers with, of its problem loaded again."""
+    u = torch.from_numpy(read_answer(folder))
+    if u.shape != problem.domain.start.shape:
+        raise InputError(
+            f"{folder}: its answer has {len(u)} numbers, and its scene has {problem.domain.dim} now: the object or "
+            "advsearch has changed since; do the run again"
+        )
+    return u

@@ -1,4 +1,4 @@
-"""Questions that are rooms: each folder holds the settings, what carries it out, the answer, words, page and command.
+"""Questions that are rooms: each folder is the command, and holds the settings, what carries it out, and the answer.
 
 `advsearch.rooms` finds them; a folder that is deleted is a question that nobody can ask.
 """

@@ -85,6 +85,14 @@ def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
     return f"under {least:.{decimals}f}" if text == "0" else f"over {100.0 - least:.{decimals}f}"
 
 
+def share_of_text(count: int, total: int, interval: tuple[float, float]) -> str:
+    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+    if not total:
+        return "none of 0"
+    low, high = map(percent_number, interval)
+    return f"{percent(count / total)} ({low} to {high}) of {total:,}"
+
+
 def with_article(name: str) -> str:
     """Return ``a mug``, ``an iron``."""
     return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"

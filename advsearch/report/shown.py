@@ -1,6 +1,6 @@
 """What a person is shown of an answer: said once, and set as text, as a page and in a notebook by whoever shows it.
 
-A question has `shown(result)` in its `words`; of one that has not, the fields of its result are shown as they are
+A question has `shown(result)` in its `answer`; of one that has not, the fields of its result are shown as they are
 called and described. All rules of wording claims are here too: sentences that a run stands for, and no more than that.
 A claim is one of four kinds:
 
@@ -110,7 +110,7 @@ class ShownAnswer:
 
 def shown(result: Result) -> ShownAnswer:
     """Return what a person is shown of the result of any question."""
-    own = rooms.in_room(result.command, "words", "shown")
+    own = rooms.in_room(result.command, "answer", "shown")
     made: ShownAnswer = own(result) if own else fields_shown(result)
     return made
 

@@ -163,7 +163,8 @@ def distance_sentence(found: SeenFrom) -> str:
     if found.distance is not None:
         return f"Seen from {_text(found.distance)} {unit} in half of the pictures, {what}."
     if found.shares[0] >= HALF:
-        return f"Seen as far as the sweep goes, {_text(found.distances[-1])} {unit}, in half of the pictures; {what}."
+        farthest = f"{_text(found.distances[-1])} {unit}"
+        return f"Seen in at least half of the pictures up to the farthest distance, {farthest}; {what}."
     return f"Not seen in half of the pictures, even from {_text(found.distances[0])} {unit}; {what}."
 
 

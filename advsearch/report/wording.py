@@ -1,4 +1,4 @@
-"""A summary (docs/design.md, "summary.json") in plain words, for the final table and the report alike."""
+"""A summary (docs/answers.md) in plain words, for the final table and the report alike."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
-from advsearch.runs import database, files, images, made_with, store, summary, tracking
-from advsearch.runs.files import PART, replacing, storage_errors, write_text
+from advsearch.runs import files, images, store, summary, tracking
+from advsearch.runs.files import PART, replacing, storage_errors, write_bytes, write_text
 from advsearch.settings import HEADER
 from advsearch.yaml_text import LARGEST
 
@@ -77,10 +77,6 @@ class RunDirectory:
 
     Used in a `with` block it is closed at the end; when the block raises before there is any result, the directory of a
     new run is removed again, so that bad input leaves nothing behind.
-
-    Attributes:
-        path: the directory.
-        store: its open results.
     """
 
     def __init__(self, path: Path, held: files.RunLock) -> None:
@@ -103,7 +99,6 @@ class RunDirectory:
         Raises:
             RunExistsError: there is something already.
             InputError: another process works on this run.
-            StorageError: the directory cannot be made or written.
         """
         path = _numbered(default) if run is None else run_path(run)
         check_free(path, overwrite=overwrite)
@@ -137,15 +132,8 @@ class RunDirectory:
 
     @classmethod
     def of(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
-        """Open the directory of the run that `config` describes: a new one, or the one to go on with.
-
-        Args:
-            config: what the run is carried out with.
-            resumed: the run to go on with, as for `find_run`; None for a new one.
-
-        Raises:
-            InputError: as for `create`, and for `resume`.
-        """
+        """Open the directory of the run that `config` describes: a new one, or the one to go on with, as for
+        `find_run`."""
         log: str | None = getattr(config, "log", None)
         tracking.check_tracker(log)
         run = cls.create_for(config) if resumed is None else cls.resume(resumed, config)
@@ -167,17 +155,8 @@ class RunDirectory:
 
     @classmethod
     def resume(cls, run: str | Path, config: Config | None = None) -> RunDirectory:
-        """Open and lock the directory of a run that is there, to go on with it.
-
-        Args:
-            run: its name or path, as for `find_run`.
-            config: what the rest of the run will be carried out with; None if nothing will be.
-
-        Raises:
-            UnknownNameError: there is no such run.
-            InputError: another process works on it, or `config` would give other numbers than the run began with.
-            FileFormatError: its results cannot be read.
-        """
+        """Open and lock the directory of a run, to go on with it by `config`, if anything goes on; an InputError says
+        if another process works on it, or it would give other numbers than the run began with."""
         path = find_run(run)
         _check_links(path)
         held = files.RunLock(path)
@@ -190,7 +169,8 @@ class RunDirectory:
         try:
             if config is not None:
                 opened._check_same(config)
-                opened._check_goes_on()
+                if (path / OLD_LOG).exists():  # it kept what searches were told elsewhere
+                    raise InputError(f"{path}: cannot go on: it was begun by an older advsearch; {opened.again}")
                 opened._note_sitting(config)
         except BaseException:
             opened.close()
@@ -203,11 +183,6 @@ class RunDirectory:
         if self.store.note(ONLY_HERE) is not None:
             return "start again where it was asked, in Python"
         return f"start again with advsearch run {self.path / CONFIG}"
-
-    def _check_goes_on(self) -> None:
-        """Refuse a search that an older advsearch has begun: it kept what searches were told elsewhere."""
-        if (self.path / OLD_LOG).exists():
-            raise InputError(f"{self.path}: cannot go on: it was begun by an older advsearch; {self.again}")
 
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
@@ -250,69 +225,41 @@ class RunDirectory:
 
     def _note_sitting(self, config: Config) -> None:
         """Note what this sitting is made with, after those before it; refuse files that are other ones now."""
-        noted = self.store.noted(made_with.NOTE)
+        noted = self.store.noted(summary.MADE_WITH)
         before = noted if isinstance(noted, list) else []
-        now = made_with.made_with(config.plain())
-        if changed := made_with.changed_file([one for one in before if isinstance(one, dict)], config.plain()):
+        now = summary.made_with(config.plain())
+        if changed := summary.changed_file([one for one in before if isinstance(one, dict)], config.plain()):
             raise InputError(
                 f"{self.path}: cannot go on: {changed} is another file now than it was; put that back, or {self.again}"
             )
         if now not in before:
-            self.store.set_note(made_with.NOTE, json.dumps([*before, now]))
+            self.store.set_note(summary.MADE_WITH, json.dumps([*before, now]))
 
     def record(self, *rows: store.Row, told: store.Told | None = None) -> None:
-        """Add evaluated configurations to the results; they survive a kill when this returns (see `store`).
-
-        Args:
-            rows: of them.
-            told: what the last of them told its search beside its row.
-
-        Raises:
-            StorageError: the disk is full or cannot be written; none of these rows is kept.
-        """
+        """Add evaluated configurations to the results, and what the last of them told its search; they survive a kill
+        when this returns (see `store`)."""
         self.store.append(rows, told)
         if self._tracker is not None:
             self._tracker.rows(rows)
 
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
-        """Write ``<folder>/<name>.png`` and return its path.
-
-        Args:
-            name: without suffix.
-            image: (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch.
-            folder: ``"images"`` or ``"artifacts"``.
-
-        Raises:
-            StorageError: it could not be written.
-        """
+        """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch; return
+        its path."""
         return images.write_png(self.path / folder / f"{name}.png", image)
 
     def save_exr(self, name: str, image: Any, folder: str = IMAGES) -> Path:
-        """Write ``<folder>/<name>.exr`` with the float32 values as given (linear, by convention) and return its path.
-
-        Raises:
-            StorageError: it could not be written.
-        """
+        """Write ``<folder>/<name>.exr`` with float32 values as given (linear, by convention) and return its path."""
         return images.write_exr(self.path / folder / f"{name}.exr", image)
 
     def save_animation(self, name: str, frames: Sequence[Any]) -> Path:
-        """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path.
-
-        Raises:
-            StorageError: it could not be written.
-        """
-        return images.write_animation(self.path / IMAGES / f"{name}.gif", frames)
+        """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path."""
+        return write_bytes(self.path / IMAGES / f"{name}.gif", images.animation_bytes(frames))
 
     def replacing(self, name: str) -> AbstractContextManager[Path]:
         """Return `files.replacing` of a file of this run: ``with run.replacing("artifacts/mesh.obj") as path: ...``."""
         return replacing(self.path / name)
 
     def write_summary(self, result: Result) -> Path:
-        """Write `summary.json` and return its path.
-
-        Raises:
-            StorageError: it could not be written.
-        """
         return summary.write_summary(self.path, result)
 
     def close(self) -> None:
@@ -322,7 +269,6 @@ class RunDirectory:
         self._lock.release()
 
     def _told(self) -> None:
-        """Let what is told of the run end."""
         if self._tracker is not None:
             self._tracker.close()
             self._tracker = None
@@ -355,12 +301,6 @@ def begun(config: Config) -> Iterator[Path | None]:
 
     Yields its path, closed again: what the block does goes on with it. Where the block raises before anything was
     evaluated, nothing is left of it. It is None for a run that takes the place of another one, which stays until then.
-
-    Args:
-        config: what the run is carried out with.
-
-    Raises:
-        InputError: as for `RunDirectory.create`.
     """
     place, overwrite = config.place
     if overwrite and place is not None and is_run(run_path(place)):
@@ -391,11 +331,7 @@ def default_name(object_name: str, controls: Iterable[str]) -> str:
 
 
 def _check_links(path: Path) -> None:
-    """Check that what a run writes to is its own: a folder that somebody else made may link to any file.
-
-    Raises:
-        FileFormatError: there is a link.
-    """
+    """Check that what a run writes to is its own: a folder that somebody else made may link to any file."""
     links = [name for name in (*CONTENTS, files.NAME) if name != CONFIG and (path / name).is_symlink()]
     if links:
         raise FileFormatError(f"{path / links[0]}: expected a file or a folder of this run, got a link; remove it")
@@ -415,11 +351,7 @@ def typed_name(path: str | Path) -> str:
 
 
 def find_run(run: str | Path) -> Path:
-    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml).
-
-    Raises:
-        UnknownNameError: there is none; the message lists the runs here.
-    """
+    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml)."""
     for path in (Path(run).expanduser(), run_path(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):
@@ -439,7 +371,7 @@ def only_here(path: Path) -> list[str]:
 
 def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
-    if database.is_results_database(path / store.NAME):
+    if files.is_results_database(path / store.NAME):
         return True
 
     try:
@@ -450,11 +382,7 @@ def is_run(path: Path) -> bool:
 
 
 def check_free(run: str | Path, *, overwrite: bool = False) -> None:
-    """Check that a run may be put at `run`; call it before any long work.
-
-    Raises:
-        RunExistsError: there is something, and `overwrite` is not given or does not apply.
-    """
+    """Check that a run may be put at `run`, or raise RunExistsError; call it before any long work."""
     path = run_path(run)
     if "\0" in str(path):
         raise InputError(f"expected a name or a folder for the run, got {str(path)!r} with a zero byte in it")
@@ -487,7 +415,6 @@ def _numbered(default: str) -> Path:
 
 
 def _clear(path: Path) -> None:
-    """Remove what a run writes from the directory, and nothing else."""
     for found in list(path.iterdir()):
         if found.name in CONTENTS or found.name.startswith(PART):
             if found.is_dir() and not found.is_symlink():
@@ -498,12 +425,12 @@ def _clear(path: Path) -> None:
 
 def _never_began(path: Path) -> bool:
     """Whether a run was killed before its settings were written: there is nothing in it to lose."""
-    if (path / CONFIG).exists() or not database.is_results_database(path / store.NAME):
+    if (path / CONFIG).exists() or not files.is_results_database(path / store.NAME):
         return False
     with suppress(AdvsearchError):
         if (path / summary.NAME).exists():
             return False
-        if database.is_bare(path / store.NAME):
+        if files.is_bare(path / store.NAME):
             return True
         with store.Store(path / store.NAME, read_only=True) as results:
             return results.count() == 0

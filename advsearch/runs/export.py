@@ -1,10 +1,6 @@
-"""A run's rows as a table for other programs: CSV, JSON or Parquet.
-
-One line for each evaluated configuration, in the order in which they were evaluated. The columns of the store come
-first; then one for each of the run's metrics; then one for each value, with its unit in its name: ``pose.yaw
-[degrees]``. A value of several numbers has a column for each: ``camera.target[0]``. What a task keeps of an answer
-(``payload``) is nested in JSON and a JSON text in the others. What a row has not is empty.
-"""
+"""A run's rows for other programs: as a table (CSV, JSON, Parquet), a line for each, with a column for each metric and
+each value, its unit in the name: ``pose.yaw [degrees]``, ``camera.target[0]`` (docs/runs.md); and as folders of 3DB
+(Leclerc et al. 2021): `details.log`, a JSON object a line, `class_maps.json`, and ``images/<id>_rgb.png``."""
 
 from __future__ import annotations
 
@@ -13,15 +9,16 @@ import importlib
 import io
 import itertools
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import IO, Any
 
-from advsearch.described import Value
-from advsearch.errors import InputError, UnknownNameError
-from advsearch.files import JsonObject, JsonValue
-from advsearch.runs.files import placed_by, replacing
+from advsearch.described import NOT_A_NUMBER, Value
+from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.files import JsonObject, JsonValue, open_regular, parse_json, read_text
+from advsearch.runs.files import placed_by, replacing, write_bytes, write_text
 from advsearch.runs.store import Row, Store
 
 FORMATS = ("csv", "json", "parquet")
@@ -39,20 +36,8 @@ GROUP = 8192
 
 
 def write_rows(store: Store, format: str, out: Path | None, stream: IO[bytes], kind: str | None = None) -> int:
-    """Write the rows and return how many there were.
-
-    Args:
-        store: of the run.
-        format: one of `FORMATS`.
-        out: the file, written whole or not at all; None writes to the stream.
-        stream: standard output, say.
-        kind: only rows of this kind.
-
-    Raises:
-        UnknownNameError: the format or the kind is unknown.
-        InputError: Parquet is asked for and pyarrow is not installed.
-        StorageError: the file cannot be written.
-    """
+    """Write the rows, or those of one kind, whole or not at all to a file, or to a stream, and return how many there
+    were."""
     if format not in FORMATS:
         raise UnknownNameError("format", format, FORMATS)
     counts = store.counts()
@@ -102,11 +87,7 @@ def to_pandas(rows: Iterable[Row]) -> Any:
 
 
 def table_to_pandas(rows: Sequence[JsonObject]) -> Any:
-    """Return a table of a result as a `pandas.DataFrame`: a column for each value, named ``average.accuracy``.
-
-    Raises:
-        InputError: pandas is not installed.
-    """
+    """Return a table of a result as a `pandas.DataFrame`: a column for each value, named ``average.accuracy``."""
     pandas, flat = _pandas(), [dict(_leaves(row)) for row in rows]
     return pandas.DataFrame(flat, columns=list(dict.fromkeys(name for row in flat for name in row)))
 
@@ -152,7 +133,6 @@ def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> 
 
 
 def _flat(record: JsonObject) -> JsonObject:
-    """The record with its payload as a text."""
     payload = record[PAYLOAD]
     return record if payload is None else {**record, PAYLOAD: json.dumps(payload, allow_nan=False, ensure_ascii=False)}
 
@@ -202,3 +182,180 @@ def _as(value: Any, wanted: Any, pyarrow: Any) -> Any:
     if value is None:
         return None
     return str(value) if wanted == pyarrow.string() else float(value) if wanted == pyarrow.float64() else value
+
+
+DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
+
+LARGEST = 4 << 30
+"""Most bytes of a `details.log`."""
+
+LONGEST = 1 << 20
+"""Most bytes of one of its lines."""
+
+MOST_CLASSES = 16 << 20
+"""Most bytes of a `class_maps.json`."""
+
+_PLACED = ("environment", "object")
+"""Values that have a place of their own in a line."""
+
+
+def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callable[[int], bytes | None]) -> int:
+    """Write the rows of a sweep as such a folder, and return how many there were.
+
+    ``loss`` holds the margin: how wrong an answer is, over 0 where it is not right. The parameter ``network`` tells
+    what several networks answer apart.
+
+    Args:
+        rows: yields the rows from the first, as often as it is called.
+        out: the folder; made, or empty.
+        picture: the PNG of a row by its number, None where none was kept.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"out: {out} is there already and not empty; name another folder")
+    names, classes = dict[str, None](), _Classes()
+    for row in rows():
+        names |= dict.fromkeys(name for name in row.values if name not in _PLACED)
+        classes.add(row)
+    if not classes.seen:
+        raise InputError("format 3db: needs the rows of a sweep, and this run has none")
+    with placed_by("out"):
+        count = 0
+        with replacing(out / DETAILS) as part, part.open("w", encoding="utf-8") as file:
+            for row in rows():
+                line = _line(row, names, classes.number(row))
+                file.write(json.dumps(line, allow_nan=False) + "\n")
+                data = picture(row.step)
+                if data is not None:
+                    write_bytes(out / IMAGES / f"{line['id']}_rgb.png", data, durable=False)
+                count += 1
+        write_text(out / CLASSES, json.dumps(classes.names()))
+    return count
+
+
+class _Classes:
+    """The classes that were answered; those without a number get one behind the others."""
+
+    def __init__(self) -> None:
+        self.seen: dict[str, int | None] = {}
+
+    def add(self, row: Row) -> None:
+        self.seen.setdefault(row.label or NOT_A_NUMBER, row.label_index)
+
+    def names(self) -> list[str]:
+        numbers = self._numbers()
+        found = [f"class {number}" for number in range(max(numbers.values()) + 1)]
+        for name, number in numbers.items():
+            found[number] = name
+        return found
+
+    def number(self, row: Row) -> int:
+        return self._numbers()[row.label or NOT_A_NUMBER]
+
+    def _numbers(self) -> dict[str, int]:
+        given = {name: number for name, number in self.seen.items() if number is not None}
+        free = max(given.values(), default=-1) + 1
+        others = [name for name, number in self.seen.items() if number is None]
+        return given | {name: free + place for place, name in enumerate(others)}
+
+
+def _line(row: Row, names: Iterable[str], prediction: int) -> JsonObject:
+    parameters: JsonObject = {}
+    for name in names:
+        value = row.values.get(name)
+        parameters["network" if name == "model" else name] = "none" if value is None else value["value"]
+    own = {name: str(row.values[name]["value"]) if name in row.values else "none" for name in _PLACED}
+    return {
+        "id": f"{row.step}",
+        "environment": own["environment"],
+        "model": own["object"],
+        "is_correct": str(bool(row.correct)),
+        "loss": row.margin,
+        "prediction": [prediction],
+        "output_type": "classes",
+        "render_args": parameters,
+    }
+
+
+@dataclass(frozen=True)
+class Imported:
+    """One line of such a folder, as a sweep stores it, and the file of its picture, if there is one."""
+
+    row: Row
+    picture: Path | None
+
+
+def read_threedb(folder: Path) -> Iterator[Imported]:
+    """Yield the rows of such a folder; a FileFormatError names the line that is not what it should be."""
+    classes = _read_classes(folder / CLASSES)
+    try:
+        file = open_regular(folder / DETAILS, "the log of 3DB", LARGEST)
+    except OSError as error:
+        raise FileFormatError(f"{folder / DETAILS}: expected the log of 3DB, got {error.strerror}") from None
+    with file:
+        for number in range(1 << 62):
+            line = file.readline(LONGEST + 1)
+            if not line:
+                return
+            if len(line) > LONGEST:
+                raise _wrong(folder, number, f"more than {LONGEST} bytes")
+            if line.strip():
+                yield _imported(folder, number, line, classes)
+
+
+def _read_classes(path: Path) -> Sequence[str]:
+    try:
+        names = parse_json(read_text(path, "the classes of 3DB", MOST_CLASSES))
+    except FileNotFoundError:
+        return ()
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f"{path}: expected a list of names, got {error}") from None
+    if not isinstance(names, list):
+        raise FileFormatError(f"{path}: expected a list of names, got {type(names).__name__}")
+    return [str(name) for name in names]
+
+
+def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) -> Imported:
+    try:
+        told = parse_json(line.decode())
+    except ValueError as error:
+        raise _wrong(folder, number, str(error)) from None
+    if not isinstance(told, dict) or not isinstance(told.get("render_args"), dict):
+        raise _wrong(folder, number, "a line without render_args")
+    values: dict[str, Value] = {"object": _value(told.get("model")), "environment": _value(told.get("environment"))}
+    for name, value in told["render_args"].items():
+        if isinstance(value, list):
+            values |= {f"{name}[{place}]": _value(one) for place, one in enumerate(value)}
+        else:
+            values["model" if name == "network" else name] = _value(value)
+    index = _first(told.get("prediction"))
+    label = classes[index] if index is not None and 0 <= index < len(classes) else "" if index is None else str(index)
+    loss = told.get("loss")
+    name = str(told.get("id"))
+    safe = re.fullmatch(r"[A-Za-z0-9_-]{1,100}", name)
+    picture = folder / IMAGES / f"{name}_rgb.png" if safe else None
+    return Imported(
+        Row(
+            kind="sweep",
+            step=number,
+            correct=str(told.get("is_correct")) == "True",
+            margin=float(loss) if isinstance(loss, (int, float)) else None,
+            label=label,
+            label_index=index,
+            values=values,
+        ),
+        picture if picture is not None and picture.is_file() and not picture.is_symlink() else None,
+    )
+
+
+def _first(prediction: JsonValue) -> int | None:
+    found = prediction[0] if isinstance(prediction, list) and prediction else prediction
+    return int(found) if isinstance(found, (int, float)) and not isinstance(found, bool) else None
+
+
+def _value(value: JsonValue) -> Value:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return {"value": value if number else str(value), "unit": ""}  # type: ignore[typeddict-item]
+
+
+def _wrong(folder: Path, number: int, got: str) -> FileFormatError:
+    return FileFormatError(f"{folder / DETAILS}: line {number + 1}: expected a line of 3DB's log, got {got[:120]}")

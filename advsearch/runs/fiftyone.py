@@ -1,10 +1,6 @@
-"""Datasets as FiftyOne stores them, so that `fiftyone.Dataset.from_dir` imports them as they are.
-
-A folder of its type `FiftyOneDataset` (fiftyone/utils/data/importers.py): `metadata.json` describes the fields,
-`samples.json` holds the samples with the paths of their media, `data/` the media, and `fields/NAME/` the files of a
-field. All of it is JSON with MongoDB's words for identities (``{"$oid": ...}``). A version is part of it, from which a
-newer FiftyOne migrates; an older one than that refuses it.
-"""
+"""Datasets as FiftyOne stores them (its `FiftyOneDataset`, fiftyone/utils/data/importers.py), so that
+`fiftyone.Dataset.from_dir` imports them as they are: JSON with MongoDB's words for identities, and a version from which
+a newer FiftyOne migrates."""
 
 from __future__ import annotations
 
@@ -46,15 +42,8 @@ _FIELDS, _LABELS = "fiftyone.core.fields.", "fiftyone.core.labels."
 
 @dataclass(frozen=True)
 class Pictured:
-    """A row that has a picture.
-
-    Attributes:
-        name: of the sample's files; what has the same picture has the same name.
-        row: what is known of it.
-        picture: its file.
-        layers: the EXR with ground truth beside it; None where there is none.
-        size: (height, width) of the picture that the model saw, pixels, in which boxes are told; None if not known.
-    """
+    """A row that has a picture: the name of the sample's files, the same for the same picture; the EXR with ground
+    truth beside it; and the (height, width) of what the model saw, in which boxes are told, if known."""
 
     name: str
     row: Row
@@ -74,12 +63,6 @@ def write_fiftyone(samples: Callable[[], Iterable[Pictured]], out: Path, name: s
     Args:
         samples: yields them from the first, as often as it is called.
         out: the folder; made, or empty.
-        name: of the dataset.
-        label: of the object.
-
-    Raises:
-        InputError: the folder is there and not empty, or there are no samples.
-        StorageError: it cannot be written.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")

@@ -1,8 +1,5 @@
-"""Pictures of a run as files: 8-bit PNG, linear EXR, an animation of the search.
-
-Pictures come as (H, W, 3) or (H, W) arrays, of numpy or torch. A PNG holds display-referred (sRGB) values in [0, 1],
-rounded as verification rounds them, so that the file is exactly what was classified. An EXR holds the values it is
-given as float32.
+"""Pictures of a run, (H, W, 3) or (H, W), of numpy or torch, as files: 8-bit PNG of sRGB values, rounded as
+verification rounds them, so that the file is exactly what was classified; EXR in float32; an animation of the search.
 """
 
 from __future__ import annotations
@@ -42,23 +39,13 @@ FRAME_MS, LAST_FRAME_MS = 100, 2500
 
 
 def to_8bit(image: Any) -> Bytes:
-    """Return ``round(255 clip(image, 0, 1))`` in float32 with halves to even; NaN becomes 0.
-
-    Args:
-        image: display-referred values, any shape.
-    """
+    """Return ``round(255 clip(image, 0, 1))`` in float32 with halves to even; NaN becomes 0."""
     scaled: Floats = np.clip(np.nan_to_num(_floats(image), nan=0.0), 0.0, 1.0) * np.float32(255.0)
     return np.rint(scaled).astype(np.uint8)
 
 
 def difference(before: Any, after: Any, gain: float = DIFFERENCE_GAIN) -> Floats:
-    """Return ``0.5 + gain (after - before)`` clipped to [0, 1]: mid grey where nothing changed.
-
-    Args:
-        before: display-referred picture in [0, 1].
-        after: the same, of the same shape.
-        gain: magnification.
-    """
+    """Return ``0.5 + gain (after - before)`` clipped to [0, 1]: mid grey where nothing changed."""
     moved: Floats = np.float32(0.5) + np.float32(gain) * (_floats(after) - _floats(before))
     return np.clip(moved, 0.0, 1.0)
 
@@ -80,20 +67,12 @@ def smaller_png(data: bytes, side: int) -> bytes:
 
 
 def write_png(path: Path, image: Any) -> Path:
-    """Write the display-referred picture as an 8-bit PNG, whole or not at all, and return the path.
-
-    Raises:
-        StorageError: the file could not be written.
-    """
+    """Write the display-referred picture as an 8-bit PNG, whole or not at all, and return the path."""
     return write_bytes(path, png_bytes(image))
 
 
 def read_png(path: Path) -> Floats:
-    """Return the display-referred picture, (H, W, 3) in [0, 1], in a PNG.
-
-    Raises:
-        FileFormatError: it is missing or not a picture.
-    """
+    """Return the display-referred picture, (H, W, 3) in [0, 1], in a PNG."""
     try:
         with Image.open(path) as image:
             values: Floats = np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
@@ -103,26 +82,14 @@ def read_png(path: Path) -> Floats:
 
 
 def write_exr(path: Path, image: Any) -> Path:
-    """Write float32 values as an EXR (scan lines, ZIP), whole or not at all, and return the path.
-
-    Raises:
-        StorageError: the file could not be written.
-    """
+    """Write float32 values as an EXR (scan lines, ZIP), whole or not at all, and return the path."""
     values = np.ascontiguousarray(_picture(_floats(image)))
     return _write_exr(path, {"Y" if values.ndim == 2 else "RGB": values}, {})
 
 
 def write_layers(path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]) -> Path:
-    """Write several layers as one EXR, whole or not at all, and return the path.
-
-    Args:
-        path: the file.
-        layers: channels (H, W) by name, such as ``normal.X``: numbers in float32, whole numbers as 32 bits.
-        notes: what the values mean, by layer: attributes of the file.
-
-    Raises:
-        StorageError: the file could not be written.
-    """
+    """Write channels (H, W) by name, such as ``normal.X``, as one EXR, whole or not at all, and return the path:
+    numbers in float32, whole numbers as 32 bits, and notes on what they mean as attributes of the file."""
     channels = {}
     for name, layer in layers.items():
         values = layer.numpy() if hasattr(layer, "numpy") else np.asarray(layer)
@@ -147,11 +114,7 @@ def _write_exr(path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]
 
 
 def animation_bytes(frames: Sequence[Any]) -> bytes:
-    """Return the display-referred pictures as a GIF that repeats, holds its last frame and is at most 3 MB.
-
-    Args:
-        frames: at least one picture, (H, W, 3), all of one size.
-    """
+    """Return the display-referred pictures as a GIF that repeats, holds its last frame and is at most 3 MB."""
     chosen, shrink = _spread(frames, ANIMATION_FRAMES), 1
     while True:
         pictures = [_shrunk(to_8bit(frame), shrink) for frame in chosen]
@@ -162,15 +125,6 @@ def animation_bytes(frames: Sequence[Any]) -> bytes:
             chosen = _spread(chosen, min(len(chosen) * 9 // 10, len(chosen) * ANIMATION_BYTES // len(data)))
         else:
             shrink *= 2
-
-
-def write_animation(path: Path, frames: Sequence[Any]) -> Path:
-    """Write `animation_bytes` to `path`, whole or not at all, and return the path.
-
-    Raises:
-        StorageError: the file could not be written.
-    """
-    return write_bytes(path, animation_bytes(frames))
 
 
 def _gif(pictures: Sequence[Bytes]) -> bytes:
@@ -211,11 +165,7 @@ def _shrunk(picture: Bytes, least: int) -> Bytes:
 
 
 def _picture(array: Any) -> Any:
-    """Return (H, W, 3) or (H, W); one channel loses its axis.
-
-    Raises:
-        ValueError: it is something else.
-    """
+    """Return (H, W, 3) or (H, W); one channel loses its axis."""
     squeezed = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if squeezed.ndim != 2 and not (squeezed.ndim == 3 and squeezed.shape[2] == 3):
         raise ValueError(f"expected a picture of shape (H, W, 3) or (H, W), got {tuple(array.shape)}")
@@ -223,5 +173,4 @@ def _picture(array: Any) -> Any:
 
 
 def _floats(image: Any) -> Floats:
-    """Return an array of numpy or torch as float32."""
     return np.asarray(image.detach().cpu() if hasattr(image, "detach") else image, dtype=np.float32)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
-from advsearch.runs import database, files, store, summary
+from advsearch.runs import files, store, summary
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.runs.results.base import Result
 from advsearch.settings import read_yaml
@@ -19,12 +19,9 @@ class Listed:
     """One run.
 
     Attributes:
-        name: of its folder.
-        path: of its folder.
         command: that made it.
         object: what the model should recognise; empty where a command has none.
         controls: what could change.
-        rows: evaluated configurations in its store.
         state: ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending.
         answer: what came out, in a few words.
         kinds: how many rows there are of each kind.
@@ -56,7 +53,7 @@ def finished(path: Path) -> bool:
     """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
     if not (path / summary.NAME).is_file() or summary.read_result(path).goes_on:
         return False
-    return not database.is_results_database(path / store.NAME) or not can_resume(path)
+    return not files.is_results_database(path / store.NAME) or not can_resume(path)
 
 
 def can_resume(path: Path) -> bool:
@@ -66,12 +63,8 @@ def can_resume(path: Path) -> bool:
 
 
 def listed_run(path: Path, *, counts: bool = True) -> Listed:
-    """Return the run in a folder; what cannot be read is shown as far as it can.
-
-    Args:
-        path: of the folder.
-        counts: whether rows are counted, which takes a second for a million.
-    """
+    """Return the run in a folder; what cannot be read is shown as far as it can. To count rows takes a second for a
+    million."""
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
@@ -84,6 +77,7 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
             kinds = results.counts()
     object_name = getattr(result, "object", None) or ",".join(getattr(result, "objects", ()))
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
+    ending = "stopped" if result is None or result.goes_on else str(getattr(result, "ending", "done"))
     return Listed(
         name=path.name,
         path=str(path),
@@ -91,7 +85,7 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
         object=str(config.get("object") or object_name or ("" if config else "?")),
         controls=tuple(map(str, controls)) if isinstance(controls, (list, tuple, dict)) else ("?",),
         rows=sum(kinds.values()),
-        state=_state(path, result),
+        state="running" if files.is_held(path) else ending,
         answer=result.brief if result else "",
         kinds=kinds,
         begun=bool(config),
@@ -104,9 +98,3 @@ def _when(path: Path) -> float | None:
         with suppress(OSError):
             return (path / name).stat().st_mtime
     return None
-
-
-def _state(path: Path, result: Result | None) -> str:
-    if files.is_held(path):
-        return "running"
-    return "stopped" if result is None or result.goes_on else str(getattr(result, "ending", "done"))

@@ -1,10 +1,6 @@
-"""`results.sqlite`: every evaluated configuration of a run.
-
-What survives: when `Store.append` returns, its rows are handed to the operating system (write-ahead log), so that
-killing the process loses nothing. A power cut loses at most the rows written within a second after the last one known
-to be on the disk, and never damages the file: `append` forces the log to the disk when the last time is a second ago
-(on a slow disk, so long ago that this takes 2 % of the time).
-"""
+"""`results.sqlite`: every evaluated configuration of a run. Rows survive a kill when `Store.append` returns
+(write-ahead log); a power cut loses at most those of a second (on a slow disk more, so that forcing takes 2 % of the
+time)."""
 
 from __future__ import annotations
 
@@ -24,8 +20,15 @@ from numpy.typing import NDArray
 from advsearch.described import Value
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue, parse_json
-from advsearch.runs.database import DAMAGED, check_schema, check_version, connect_to_read, connect_to_write, readable
-from advsearch.runs.files import storage_errors
+from advsearch.runs.files import (
+    DAMAGED,
+    check_schema,
+    check_version,
+    connect_to_read,
+    connect_to_write,
+    readable,
+    storage_errors,
+)
 from advsearch.runs.results.base import plain
 
 NAME = "results.sqlite"
@@ -126,16 +129,8 @@ _INSERT_TOLD = "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations
 
 @final
 class Store:
-    """The open `results.sqlite` of a run. Close it, or use it in a `with` block.
-
-    Args:
-        path: the file; made when it is not there, unless `read_only`.
-        read_only: open for reading beside a process that writes.
-
-    Raises:
-        FileFormatError: the file is missing (`read_only`), is not a results.sqlite, or is of a newer advsearch.
-        StorageError: it cannot be written.
-    """
+    """The open `results.sqlite` of a run; `read_only` beside a process that writes. Close it, or use it in a `with`
+    block."""
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
@@ -166,12 +161,7 @@ class Store:
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
 
     def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
-        """Yield the rows, or those of one kind, in the order in which they were written.
-
-        Args:
-            kind: of the rows; None for all.
-            after: the id behind which to begin.
-        """
+        """Yield the rows, or those of one kind, in the order in which they were written, behind the id `after`."""
         where, given = ("id > ?", (after,)) if kind is None else ("id > ? AND kind = ?", (after, kind))
         with readable(self.path):
             cursor = self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", given)
@@ -195,13 +185,7 @@ class Store:
         return (row, _told(found, self.path)) if row and found else None
 
     def pictures(self, kind: str, after: int, until: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield the number and the picture of what the rows of a kind with these ids have told, while the run goes on.
-
-        Args:
-            kind: of search.
-            after: the id behind which to begin.
-            until: the last id.
-        """
+        """Yield number and picture of what rows of a kind with ids over `after` have told, while the run goes on."""
         with readable(self.path):
             cursor = self._db.execute(
                 "SELECT number, u, non_finite, cost, NULL, picture, height FROM told JOIN evaluations ON row = id "
@@ -234,7 +218,6 @@ class Store:
         return -1 if found is None else int(found)
 
     def count(self, kind: str | None = None) -> int:
-        """Return how many rows there are, or how many of one kind."""
         where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
         with readable(self.path):
             return int(self._db.execute(f"SELECT count(*) FROM evaluations{where}", given).fetchone()[0])
@@ -260,23 +243,17 @@ class Store:
             return cursor.fetchone()
 
     def counts(self) -> dict[str, int]:
-        """Return how many rows there are of each kind."""
         with readable(self.path):
             found = self._db.execute("SELECT kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind").fetchall()
         return {str(kind): count for kind, count in found}
 
     def note(self, key: str) -> str | None:
-        """Return what was noted under `key`, or None."""
         with readable(self.path):
             found = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
         return None if found is None else str(found[0])
 
     def noted(self, key: str) -> Any:
-        """Return the JSON value that was noted under `key`, or None.
-
-        Raises:
-            FileFormatError: what was noted is no JSON.
-        """
+        """Return the JSON value that was noted under `key`, or None."""
         text = self.note(key)
         try:
             return None if text is None else parse_json(text)
@@ -284,11 +261,7 @@ class Store:
             raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {DAMAGED}") from None
 
     def set_note(self, key: str, value: str) -> None:
-        """Keep a text under `key`, in place of what was there.
-
-        Raises:
-            StorageError: the disk is full or can't be written.
-        """
+        """Keep a text under `key`, in place of what was there."""
         with storage_errors(self.path), self._db:
             self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
 

@@ -1,13 +1,18 @@
-"""The answer of a run: `summary.json` as plain JSON (docs/design.md, "summary.json"), and `artifacts/answer.npy`.
-
-The latter is the configuration that a run answers with, so that it can be rendered again elsewhere.
-"""
+"""The answer of a run: `summary.json` (docs/answers.md), and `artifacts/answer.npy`, the configuration, so that it can
+be rendered again elsewhere. And what a run is made with: versions, and digests of the files that its settings name."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
+import os
+import platform
 import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from importlib import metadata
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +20,12 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError
-from advsearch.files import parse_json, read_bytes, read_text
+from advsearch.files import opened_for, parse_json, read_bytes, read_text
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results import kind_of
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
+from advsearch.settings.configuration import FILES
 
 NAME = "summary.json"
 
@@ -33,20 +39,13 @@ def to_json(result: Result) -> str:
 
 
 def write_summary(folder: Path, result: Result) -> Path:
-    """Write ``summary.json`` into the run directory, whole or not at all, and return its path.
-
-    Raises:
-        StorageError: it could not be written.
-    """
+    """Write ``summary.json`` into the run directory, whole or not at all, and return its path."""
     return write_text(folder / NAME, to_json(result) + "\n")
 
 
 def read_result(folder: Path) -> Result:
-    """Return the result of the run in `folder`.
-
-    Raises:
-        FileFormatError: there is none (the run did not end yet), it is not JSON, or not what this version writes.
-    """
+    """Return the result of the run in `folder`; a FileFormatError says if there is none, or not what this version
+    writes."""
     path = folder / NAME
     try:
         values = parse_json(read_text(path, "the summary of a run", LARGEST))
@@ -97,22 +96,14 @@ Python, which ends in errors of any kind."""
 
 
 def write_answer(run: Path, u: NDArray[np.float32]) -> Path:
-    """Keep a configuration (d,) of the unit box, whole or not at all, and return where.
-
-    Raises:
-        StorageError: it could not be written.
-    """
+    """Keep a configuration (d,) of the unit box, whole or not at all, and return where."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(u, dtype=np.float32), allow_pickle=False)
     return write_bytes(run / FOLDER / ANSWER, buffer.getvalue())
 
 
 def read_answer(run: Path) -> NDArray[np.float32]:
-    """Return the configuration (d,) float32 in [0, 1] that a run answers with.
-
-    Raises:
-        FileFormatError: there is none (the run did not end, or is of an older version), or it is something else.
-    """
+    """Return the configuration (d,) float32 in [0, 1] that a run answers with, or raise a FileFormatError."""
     path = run / FOLDER / ANSWER
     try:
         data = read_bytes(path, "the answer of a run", LARGEST_ANSWER)
@@ -137,3 +128,93 @@ def read_answer(run: Path) -> NDArray[np.float32]:
 
 def _no_point(path: Path) -> FileFormatError:
     return FileFormatError(f"{path}: expected numbers (d,) float32 in [0, 1], got something else")
+
+
+MADE_WITH = "made with"
+"""The note: a list, with an entry for each sitting."""
+
+MOST_FILES = 20_000
+"""Files of a folder that a digest is taken of, at most."""
+FOLDERS = {"task": "*/*", "model": "*"}
+"""Settings that may name a folder, and which files in it decide: a task's pictures, or what `hf:FOLDER` consists of."""
+
+PACKAGES = ("advsearch", "mitsuba", "drjit", "torch", "numpy")
+
+NOT_READ_AGAIN = ("recipe", "suite")
+"""Settings whose file a run keeps in its store and goes on with, whatever became of the file."""
+
+
+def made_with(settings: Mapping[str, object]) -> dict[str, str]:
+    """Return versions by package, and the SHA-256 of each file that settings name, by its name in them."""
+    facts = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            facts[name] = metadata.version(name)
+    return {**facts, **file_digests(settings)}
+
+
+def changed_file(before: Sequence[Mapping[str, object]], settings: Mapping[str, object]) -> str | None:
+    """Return the name of a file that is another one now than in every sitting before; None where all are the same.
+
+    A file may have been moved, so that its name alone tells it.
+    """
+    again = {name: value for name, value in settings.items() if name not in NOT_READ_AGAIN}
+    for path, digest in file_digests(again).items():
+        known = {one[old] for one in before for old in one if Path(old).name == Path(path).name}
+        if known and digest not in known:
+            return Path(path).name
+    return None
+
+
+def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
+    """Return the SHA-256 of each file that settings name, in hexadecimal, and of each that was read for it: materials,
+    pictures and buffers that a mesh or a scene names. A folder has one for all. What is bundled or gone has none."""
+    found: dict[str, str] = {}
+    for name, value in settings.items():
+        for path in _paths(value):
+            with suppress(OSError, ValueError):
+                own = os.path.abspath(path)
+                parts = opened_for(own)
+                folder = path if os.path.isabs(path) else path.removeprefix("hf:") if path.startswith("hf:") else ""
+                if folder and name in FOLDERS and Path(folder).is_dir():
+                    found[folder] = _digest_of_folder(Path(folder), FOLDERS[name])
+                if (parts or name in FILES) and Path(path).is_file():
+                    found[path] = _digest(Path(path))
+                for part in parts:
+                    if part != own and Path(part).is_file():
+                        found[os.path.join(os.path.dirname(path), os.path.relpath(part, os.path.dirname(own)))] = (
+                            _digest(Path(part))
+                        )
+    return found
+
+
+def _paths(value: object) -> Iterator[str]:
+    """What may be a file in ``a.pt2,reference@weights.safetensors`` or ``scene.glb#NODE``, in lists and mappings."""
+    if isinstance(value, Mapping):
+        for one in value.values():
+            yield from _paths(one)
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _paths(one)
+    elif isinstance(value, str):
+        for name in value.split(","):
+            yield from dict.fromkeys(
+                one.strip() for one in (name, name.rpartition("@")[2], name.partition("#")[0]) if one.strip()
+            )
+
+
+def _digest_of_folder(folder: Path, which: str) -> str:
+    """Return the SHA-256 of the names and contents of files in a folder that a pattern names."""
+    digest = hashlib.sha256()
+    for path in sorted(islice(folder.glob(which), MOST_FILES)):
+        if path.is_file():
+            digest.update(f"{path.relative_to(folder).as_posix()}\n{_digest(path)}".encode())
+    return digest.hexdigest()
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while part := file.read(1 << 20):
+            digest.update(part)
+    return digest.hexdigest()

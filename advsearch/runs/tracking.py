@@ -1,10 +1,5 @@
-"""What is evaluated, told to MLflow, TensorBoard or Weights & Biases through their own packages, when asked.
-
-Each of them gets the settings of the run and, whenever rows are kept, the mean of their numbers by kind: exact for a
-search, which keeps its rows one by one; of a batch for a sweep, with the accuracy so far. A thread of its own tells it,
-so that neither a slow network nor one that fails holds up the run: after the first failure nothing more is told, and a
-line of the log `advsearch` says so.
-"""
+"""What is evaluated, told to MLflow, TensorBoard or Weights & Biases: settings, and the mean numbers of rows by kind. A
+thread of its own tells it, so that neither a slow network nor one that fails holds up the run."""
 
 from __future__ import annotations
 
@@ -54,12 +49,7 @@ class Backend(Protocol):
 
 
 def check_tracker(name: str | None) -> None:
-    """Check that a tracker can be told, before anything is done.
-
-    Raises:
-        UnknownNameError: there is none of that name.
-        InputError: its package is not installed.
-    """
+    """Check that a tracker can be told, before anything is done."""
     if name is None:
         return
     if name not in PACKAGES:
@@ -75,13 +65,7 @@ def _package(name: str) -> Any:
 
 
 class Tracker:
-    """Tells rows to a tracker from a thread of its own.
-
-    Args:
-        name: of the tracker.
-        folder: of the run.
-        settings: of the run, by name.
-    """
+    """Tells rows to a tracker from a thread of its own."""
 
     def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
         self._name = name

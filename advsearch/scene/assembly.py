@@ -2,11 +2,16 @@
 
 Controls speak of an object's pose (`NAME.to_world`) and shape (`NAME.offsets`) separately, so that they compose;
 Mitsuba takes world-space vertices and normals. Everything here is torch, so gradients of vertices reach both.
+
+And how fast each coordinate of u moves points in the picture (`Motion`), with derivatives by differences of a width
+that fits. A smooth loss is best differenced over about one pixel of motion of the fastest outline, never over a fixed
+length in the world (docs/gradients.md, "The estimators"): narrower and noise wins, wider and the loss bends. For a
+classifier's see `gradients.SEARCH_STEP`. The renders of a difference share their random numbers, and have no graph.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +20,8 @@ from torch import Tensor
 
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.gradients import DEFAULT_PIXELS, DEFAULT_STEP, STEP_RANGE, Group
 
 ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
 """Inputs that Mitsuba never sees: the renderer applies them to radiance."""
@@ -117,3 +124,153 @@ class Assembly:
                 found["ground.reflectance"] = self._photograph.reflectance(data)
             found["environment.padded"] = torch.cat([data[:, -1:], data, data[:, :1]], dim=1)
         return found
+
+
+Value = Callable[[Tensor], Tensor]
+"""From a configuration (d,) to one number, at one seed."""
+
+
+def central(value: Value, group: Group, u: Tensor, found: Tensor) -> None:
+    """Two values for each coordinate of a group, `group.step` to either side."""
+    for number in range(group.begin, group.begin + group.size):
+        step = torch.zeros_like(u)
+        step[number] = group.step
+        (above, up), (below, down) = moved(u, step, group.periodic), moved(u, -step, group.periodic)
+        rise = value(above) - value(below)
+        found[number] = float(rise) / float((up - down)[number])
+
+
+def moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Tensor]:
+    """Return u + step brought back into the box, and the step that was really taken.
+
+    Periodic coordinates wrap around, so that they can go the whole step.
+    """
+    there = u + step
+    wrapped = torch.remainder(there, 1.0)
+    clipped = there.clamp(0.0, 1.0)
+    cyclic = torch.as_tensor(periodic).expand(u.shape)
+    return torch.where(cyclic, wrapped, clipped), torch.where(cyclic, step, clipped - u)
+
+
+POINTS = 400
+"""Vertices of a mesh that are followed."""
+NUDGES = (2e-3, 2e-4, 2e-5, 2e-6)
+"""Changes of u that the speed is measured over: the largest that leaves something in the frame."""
+DIRECTIONS = 4000
+"""Directions in which the environment is followed: some hundred of them lie in a frame."""
+EDGE = 25
+"""Points that are followed along each side of the ground plane."""
+FAR = 1e4
+"""How far away its points are taken to be, in scene units."""
+
+
+class Motion:
+    """Projects a scene's vertices, the table's edge or the floor, and what is seen of the environment into the picture.
+
+    A camera that goes around an object hardly moves the object's outline, but all that lies behind it.
+
+    Args:
+        description: the scene with all its parts.
+        resolution: (height, width) in pixels.
+        assembly: makes vertices from poses.
+    """
+
+    def __init__(self, description: SceneDescription, resolution: tuple[int, int], assembly: Assembly) -> None:
+        height, width = resolution
+        self._size = max(height, width)
+        self._frame = torch.tensor([width, height]) / 2.0
+        self._assembly = assembly
+        self._camera = torch.from_numpy(camera_to_world(description, width / height)).to(torch.float64)
+        self._fov = description.number("camera.fov")
+        self._model = description.camera_model
+        floor = None if description.photograph is None else description.photograph.mesh.vertices
+        self._ground = description.number("ground.size") / 2.0 if floor is None else float(floor.max())
+        self._edge = _edge_points(self._ground) if floor is None else torch.from_numpy(floor).double()
+        self._far = _far_points(description.backdrop or description.environment is None)
+        self._picks = {
+            name: torch.from_numpy(np.linspace(0, len(mesh.vertices) - 1, min(POINTS, len(mesh.vertices))).astype(int))
+            for name, mesh in assembly.meshes.items()
+        }
+
+    def pixels(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return where the followed vertices lie, (N, 2) pixels from the middle, and which are in or near the frame."""
+        camera = inputs["camera.to_world"].double() if "camera.to_world" in inputs else self._camera
+        found = []
+        for name, mesh in self._assembly.meshes.items():
+            vertices = inputs.get(f"{name}.vertices")
+            if vertices is None:
+                vertices = mesh.place(None, None)[0]
+            found.append(vertices[self._picks[name]].double())
+        found += [self._edge, self._far]
+        relative = (torch.cat(found) - camera[:3, 3]) @ camera[:3, :3]
+        projected, seen = self._projected(relative, inputs)
+        seen[len(seen) - len(self._far) :] &= ~self._behind_ground(camera[:3, 3])
+        for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
+            if name in inputs:
+                projected[:, axis] += 2.0 * self._frame[axis] * inputs[name].double().reshape(())
+        return projected, seen & (projected.abs() <= 1.2 * self._frame.double()).all(dim=1)
+
+    def _projected(self, points: Tensor, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Where points (N, 3) in camera coordinates are seen, in pixels from the middle, and which are before it."""
+        if self._model is not None:
+            model = self._model.with_numbers(inputs["camera.lens"]) if "camera.lens" in inputs else self._model
+            places, seen = model.project(points * torch.tensor([-1.0, -1.0, 1.0]).to(points))
+            return (places - 0.5) * 2.0 * self._frame.double(), seen
+        fov = inputs["camera.fov"].double().reshape(()) if "camera.fov" in inputs else torch.tensor(self._fov)
+        focal = self._size / 2.0 / torch.tan(torch.deg2rad(fov.double()) / 2.0)
+        depth = points[:, 2]
+        return focal * points[:, :2] / depth.clamp_min(1e-3)[:, None], depth > 1e-3
+
+    def _behind_ground(self, eye: Tensor) -> Tensor:
+        """Which of the far points the ground plane hides from a camera at `eye`."""
+        downwards = (self._far - eye)[:, 2]
+        reach = -eye[2] / downwards.clamp_max(-1e-9)
+        hit = eye + reach[:, None] * (self._far - eye)
+        on_it = (hit[:, :2].abs() <= self._ground).all(dim=1)
+        return (downwards < 0.0) & bool(eye[2] > 0.0) & on_it
+
+    def speeds(self, inputs: Callable[[Tensor], Mapping[str, Tensor]], u: Tensor, coordinates: list[int]) -> Tensor:
+        """Return the speed of the fastest point in the frame for each coordinate, in pixels per unit of u.
+
+        Args:
+            inputs: from u to assembled inputs.
+            u: (d,) where.
+            coordinates: which; the others get 0.
+        """
+        speeds = torch.zeros(len(u))
+        with torch.no_grad():
+            here, seen = self.pixels(inputs(u))
+            for number in coordinates:
+                for size in NUDGES:
+                    there = u.clone()
+                    there[number] += size if float(u[number]) + size <= 1.0 else -size
+                    moved, still = self.pixels(inputs(there))
+                    distances = (moved - here)[seen & still].norm(dim=1)
+                    if bool((distances > 0.0).any()):  # what stands still says nothing of what has left the frame
+                        speeds[number] = float(distances.max()) / size
+                        break
+        return speeds
+
+
+def _edge_points(half: float) -> Tensor:
+    """(N, 3) points along the edge of the ground plane, a square of half the side `half` at height 0."""
+    along = torch.linspace(-half, half, EDGE if half > 0.0 else 0, dtype=torch.float64)
+    side, zero = torch.full_like(along, half), torch.zeros_like(along)
+    sides = [(along, side), (along, -side), (side, along), (-side, along)]
+    return torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])
+
+
+def _far_points(hidden: bool) -> Tensor:
+    """(N, 3) points of the environment, evenly spread (Fibonacci spiral); none where nothing shows them."""
+    number = torch.arange(0 if hidden else DIRECTIONS, dtype=torch.float64)
+    height = 1.0 - (2.0 * number + 1.0) / DIRECTIONS
+    turn = number * torch.pi * (3.0 - 5.0**0.5)
+    radius = (1.0 - height**2).sqrt()
+    return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=1) * FAR
+
+
+def steps_for(speeds: Tensor, pixels: float = DEFAULT_PIXELS) -> Tensor:
+    """Return half-widths of differences in u: `pixels` of motion, or `DEFAULT_STEP` where nothing moves."""
+    moving = speeds > 1e-3
+    wanted = torch.where(moving, pixels / speeds.clamp_min(1e-3), torch.full_like(speeds, DEFAULT_STEP))
+    return wanted.clamp(*STEP_RANGE)

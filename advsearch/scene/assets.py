@@ -14,6 +14,9 @@ import numpy.typing as npt
 from advsearch.errors import InputError
 
 Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
 
 SLACK = 1e-3
 """How far texture coordinates of a texture that does not repeat may lie beyond its edges."""
@@ -39,7 +42,7 @@ class Mesh:
     normals: Floats
     uvs: Floats
     attributes: Mapping[str, Floats] = field(default_factory=dict)
-    materials: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
+    materials: Mapping[str, Ints] = field(default_factory=dict)
 
     @property
     def repeats(self) -> bool:
@@ -184,3 +187,72 @@ def normalised(mesh: Mesh) -> Mesh:
         raise InputError("mesh has no extent: all its vertices coincide; export the mesh again")
     origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     return replace(mesh, vertices=((vertices - origin) / size).astype(np.float32))
+
+
+GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)
+"""Cells of the grid along the mesh's largest extent, tried one after the other."""
+
+TEXTURE_CELLS = 32
+"""Cells of the texture along each side: vertices of one place that lie in different ones stay apart, as at seams."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simpler:
+    """Which vertices and faces of a mesh are left.
+
+    Attributes:
+        kept: (W,) number of the vertex that each one left has its normal and texture coordinates from.
+        place: (W,) number of the place that each one left stands at.
+        places: (V,) number of the place that each vertex of the mesh goes to.
+        faces: (G, 3) indices of those left.
+    """
+
+    kept: Ints
+    place: Ints
+    places: Ints
+    faces: npt.NDArray[np.uint32]
+
+    def of(self, mesh: Mesh) -> Mesh:
+        """Return what is left of the mesh, or of one that only stands elsewhere.
+
+        Each vertex stands at the mean of those that came together there.
+        """
+        counts = np.bincount(self.places)
+        mean = np.stack([np.bincount(self.places, mesh.vertices[:, axis]) / counts for axis in range(3)], axis=1)
+        places: Floats = mean[self.place].astype(np.float32)
+        return Mesh(places, self.faces, mesh.normals[self.kept], mesh.uvs[self.kept])
+
+
+def simpler(mesh: Mesh, most: int) -> Simpler | None:
+    """Return how a mesh is shown with at most `most` faces, or the fewest of a coarse grid; None: it has no more.
+
+    After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering complex scenes"): vertices are
+    clustered by a grid, and a face of which two corners meet is left out. Both sides of a seam of the texture move
+    together, so that no gap opens.
+    """
+    if len(mesh.faces) <= most:
+        return None
+    low = mesh.vertices.min(axis=0)
+    extent = max(float((mesh.vertices.max(axis=0) - low).max()), 1e-12)
+    chart = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(np.int64)
+    for grid in GRIDS:
+        cells = np.floor((mesh.vertices - low) / extent * (grid - 1) + 0.5).astype(np.int64)
+        places = np.unique(_key(cells), return_inverse=True)[1].reshape(-1)
+        together = _key(np.column_stack([places, chart]))
+        _, kept, left = np.unique(together, return_index=True, return_inverse=True)
+        faces = left.reshape(-1)[mesh.faces]
+        first, second, third = places[kept][faces].T
+        faces = faces[(first != second) & (second != third) & (third != first)]
+        if len(faces) <= most:
+            break
+    return Simpler(kept, places[kept], places, np.unique(faces, axis=0).astype(np.uint32))
+
+
+def _key(rows: Ints) -> Ints:
+    """Return one number for each row of whole numbers, the same for equal rows only."""
+    low = rows.min(axis=0)
+    sizes = rows.max(axis=0) - low + 1
+    key = np.zeros(len(rows), np.int64)
+    for column, size in zip((rows - low).T, sizes, strict=True):
+        key = key * size + column
+    return key

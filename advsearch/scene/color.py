@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import numpy.typing as npt
+
+from advsearch.scene.assets import Floats
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-Values = TypeVar("Values", npt.NDArray[np.float32], "Tensor")
+Values = TypeVar("Values", Floats, "Tensor")
 
 
 def srgb_to_linear(display: Values) -> Values:

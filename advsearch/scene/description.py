@@ -15,21 +15,17 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import reading
 from advsearch.scene import environments, library, settings
-from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
-from advsearch.scene.cameras.files import read_camera
-from advsearch.scene.cameras.model import CameraModel, bundled
+from advsearch.scene.assets import Doubles, EnvironmentAsset, Material, ObjectAsset
+from advsearch.scene.camera_files import read_camera
+from advsearch.scene.camera_model import CameraModel, bundled
+from advsearch.scene.grounds import Photograph, on_its_ground, photograph_of
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
-from advsearch.scene.photograph import Photograph, photograph_of
-from advsearch.scene.road import on_its_ground
-
-Doubles = npt.NDArray[np.float64]
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"
@@ -402,7 +398,7 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
 
 
 def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None) -> ImportedScene:
-    from advsearch.scene.mitsuba_backend.files.scene import import_plugins  # a circle: it takes descriptions
+    from advsearch.scene.mitsuba_backend.scene_files import import_plugins  # a circle: it takes descriptions
 
     if up is not None:
         raise InputError("up: the first camera of a Mitsuba scene says which way is up; leave `up` out")

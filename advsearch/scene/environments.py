@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.assets import Bools, EnvironmentAsset, Floats
 from advsearch.scene.importing.files import read_bytes, safe_name
 from advsearch.scene.importing.hdr import Plane, Planes, linear, read_exr, read_radiance
-from advsearch.scene.importing.images import area_average, banded_average
-
-Floats = npt.NDArray[np.float32]
-Bools = npt.NDArray[np.bool_]
+from advsearch.scene.importing.pictures import area_average, banded_average
 
 SUFFIXES = (".hdr", ".exr")
 """The pictures that can be imported."""
@@ -56,7 +56,11 @@ def read_light(path: Path, what: str = "environment") -> LightPicture:
         return LightPicture(pixels.shape[:2], lambda top, end: linear(pixels[top:end]) * scale, tuple(notes))
     planes, notes = read_exr(path, data)
     _check_values(path, planes)
-    return LightPicture(planes[0].shape, lambda top, end: _stacked(planes, top, end), tuple(notes))
+
+    def stacked(top: int, end: int) -> Floats:
+        return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
+
+    return LightPicture(planes[0].shape, stacked, tuple(notes))
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
@@ -85,11 +89,6 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     return EnvironmentAsset(safe_name(file), radiance, source=str(file), warnings=tuple(notes), photographed=True)
 
 
-def _stacked(planes: Planes, top: int, end: int) -> Floats:
-    """Return some rows of three planes (H, W) as (n, W, 3) float32."""
-    return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
-
-
 def _check_values(file: Path, planes: Planes) -> None:
     """Refuse texels that are not light."""
     kinds: tuple[tuple[str, Callable[[Plane], Bools], str], ...] = (
@@ -109,12 +108,7 @@ def _check_values(file: Path, planes: Planes) -> None:
 
 
 def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
-    """Average a map down to at most `LARGEST`, and repeat its texels up to at least `SMALLEST`.
-
-    Args:
-        band: returns the map's rows from the first to before the second of its arguments, (n, W, 3) float32.
-        size: the map's rows and columns.
-    """
+    """Average a map down to at most `LARGEST`, and repeat its texels up to at least `SMALLEST`; see `LightPicture`."""
     height, width = size
     scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)
     if scale == 1.0:
@@ -127,3 +121,31 @@ def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
         found = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target) / covered
     down, across = (-(-least // extent) for least, extent in zip(SMALLEST, found.shape[:2], strict=True))
     return np.asarray(found.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32)
+
+
+@lru_cache(maxsize=4)
+def real_harmonics(height: int, width: int) -> Tensor:
+    """Return the nine real spherical harmonics of degrees 0 to 2 over a map of equal angles: (height, width, 9).
+
+    Each has root mean square 1 over the sphere (Ramamoorthi and Hanrahan 2001, section 3).
+    """
+    theta = (torch.arange(height) + 0.5) * math.pi / height
+    phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
+    x = theta.sin()[:, None] * phi.cos()[None]
+    y = theta.sin()[:, None] * phi.sin()[None]
+    z = theta.cos()[:, None].expand(height, width)
+    root3, root15, root5 = math.sqrt(3.0), math.sqrt(15.0), math.sqrt(5.0)
+    return torch.stack(
+        [
+            torch.ones_like(z),
+            root3 * y,
+            root3 * z,
+            root3 * x,
+            root15 * x * y,
+            root15 * y * z,
+            root5 / 2.0 * (3.0 * z * z - 1.0),
+            root15 * x * z,
+            root15 / 2.0 * (x * x - y * y),
+        ],
+        dim=-1,
+    )

@@ -18,20 +18,16 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-from advsearch.scene.assets import EnvironmentAsset, Floats
+from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import pixels_in
-from advsearch.scene.road import paved
+from advsearch.scene.raster import looked_up, pixels_in
 from advsearch.scene.settings import resolve
 from advsearch.scene.silhouettes import NEAREST, Frame
-from advsearch.scene.surface_map import looked_up
-
-Doubles = npt.NDArray[np.float64]
 
 RASTER = 32
 """Pixels along the longer side of the picture in which the surface is looked at."""
@@ -169,5 +165,5 @@ def _arriving(environment: EnvironmentAsset | None) -> tuple[Doubles, Doubles, D
     return directions.reshape(-1, 3), summed[:, 3], summed[:, :3]
 
 
-def _edges(size: int, count: int) -> npt.NDArray[np.int64]:
+def _edges(size: int, count: int) -> Ints:
     return np.unique(np.linspace(0, size, min(count, size) + 1).astype(np.int64)[:-1])

@@ -8,23 +8,50 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib import resources
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.errors import FileFormatError, UnknownNameError
 from advsearch.files import MESHES, either
-from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
-from advsearch.scene.finishes import finished
+from advsearch.scene.assets import EnvironmentAsset, Floats, Ints, Material, Mesh, ObjectAsset
+from advsearch.scene.parts import BASE_COLOR
+from advsearch.scene.raster import rasterised
+
+SIDE = 256
+"""Texels along the maps of roughness, metal and clear coat."""
+
+
+def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> dict[str, object]:
+    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it.
+
+    Args:
+        mesh: with texture coordinates and the faces of each material by name.
+        finishes: what each of these materials is like.
+        main: what all other faces are like; its `specular` holds for all.
+    """
+    faces = np.tile([main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1))
+    for name, one in finishes.items():
+        faces[mesh.materials[name]] = one.roughness, one.metallic, one.clearcoat
+    maps = faces[rasterised(mesh, SIDE).face].astype(np.float32)
+    surface: dict[str, object] = {
+        "type": "principled",
+        "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
+        "specular": main.specular,
+        "clearcoat_gloss": 1.0,
+    }
+    for channel, name in enumerate(("roughness", "metallic", "clearcoat")):
+        picture = maps[:, :, channel : channel + 1]
+        surface[name] = {"type": "bitmap", "bitmap": picture, "raw": True, "filter_type": "nearest"}
+    return {"type": "twosided", "bsdf": surface}
+
 
 if TYPE_CHECKING:
     from importlib.abc import Traversable
 
-Floats = npt.NDArray[np.float32]
 BUNDLED_ENVIRONMENT = "bundled environment"
 """Source of an environment that is bundled."""
 _PLY = (
@@ -132,7 +159,7 @@ def _mesh(content: bytes) -> Mesh:
     )
 
 
-def _materials(runs: Iterable[tuple[str, int]]) -> dict[str, npt.NDArray[np.int64]]:
+def _materials(runs: Iterable[tuple[str, int]]) -> dict[str, Ints]:
     """Return the faces of each material, from how many faces in a row have which."""
     names = np.repeat([name for name, _ in runs], [count for _, count in runs])
     return {str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)}

@@ -13,11 +13,9 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
-from advsearch.scene.assets import Floats, Material, Mesh, ObjectAsset
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset
 
-Doubles = npt.NDArray[np.float64]
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"
 """The type that stands for the texture in a surface in Mitsuba's words."""

@@ -1,15 +1,25 @@
 """Triangles to pixels: the one rasteriser, in numpy, for silhouettes, texture charts and baked textures.
 
 Each triangle is cut into the spans of rows that it crosses, and each span into pixels.
+
+And where on a mesh each texel of its texture lies: the UV charts rasterised at the texel centres. Row 0 is at v = 1, as
+in every texture of ours. A texel belongs to the triangle that its centre lies in; one that no chart covers takes over
+what the nearest covered texel has, so that bilinear lookups at a chart's border find values that continue it.
+
+`MeshSurface` finds places on a mesh by rays and the connected region around them, for what is stuck onto it.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
 
-Doubles = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from advsearch.errors import InputError
+from advsearch.scene.assets import Bools, Doubles, Floats, Ints, Mesh
 
 TOLERANCE = 1e-6
 """Barycentric weight by which a pixel's centre may miss a triangle, so that shared edges leave no gaps."""
@@ -52,7 +62,7 @@ def pixels_near(corners: Doubles, shape: tuple[int, int], miss: float = MISS) ->
     return face[span], row[span], column
 
 
-def texels_read(corners: Doubles, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+def texels_read(corners: Doubles, shape: tuple[int, int]) -> Bools:
     """Return the texels (h, w) that bilinear lookups anywhere in some triangles read; lookups repeat at the border.
 
     Args:
@@ -116,3 +126,254 @@ def _crossing(corners: Doubles, row: Ints, miss: float) -> tuple[Doubles, Double
         left, right = np.where(meets, np.minimum(left, x), left), np.where(meets, np.maximum(right, x), right)
     empty = left > right
     return np.where(empty, 0.0, left), np.where(empty, -1.0, right)
+
+
+BORDER = 2.0
+"""Texels around a chart that still belong to it: a bilinear lookup inside a chart reaches one texel beyond it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Charts:
+    """The rasterised charts of a mesh.
+
+    Attributes:
+        mesh: the mesh.
+        face: (h, w) index of the face that each texel lies in; uncovered texels have that of the nearest covered one.
+        weights: (h, w, 3) barycentric weights of the face's three corners, at least 0, adding up to 1.
+        covered: (h, w) the texel's centre lies in a chart.
+        distance: (h, w) texels to the nearest covered texel; 0 where covered.
+    """
+
+    mesh: Mesh
+    face: Ints
+    weights: Doubles
+    covered: Bools
+    distance: Doubles
+
+    @property
+    def touched(self) -> Bools:
+        """(h, w): a lookup on the surface can touch the texel; it is in a chart or `BORDER` texels around one."""
+        return np.asarray(self.distance <= BORDER)
+
+    def positions(self) -> Floats:
+        """Return (h, w, 3) positions in mesh coordinates."""
+        corners = self.mesh.vertices[self.mesh.faces[self.face]]
+        return np.asarray(np.einsum("hwk,hwkc->hwc", self.weights, corners), dtype=np.float32)
+
+    def normals(self) -> Floats:
+        """Return (h, w, 3) unit shading normals."""
+        corners = self.mesh.normals[self.mesh.faces[self.face]]
+        normals = np.einsum("hwk,hwkc->hwc", self.weights, corners)
+        lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+        flat = _face_normals(self.mesh)[self.face]
+        return np.where(lengths > 1e-6, normals / np.maximum(lengths, 1e-6), flat).astype(np.float32)
+
+    def areas(self) -> Floats:
+        """Return the surface area (h, w) that each texel stands for, in squared mesh units; 0 where no chart is."""
+        places = self.mesh.vertices[self.mesh.faces].astype(np.float64)
+        surface = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
+        texels = np.abs(doubled_areas(_in_texels(self.mesh, self.covered.shape)))
+        share = np.where(texels > 0.0, surface / np.maximum(texels, 1e-12), 0.0)
+        return np.where(self.covered, share[self.face], 0.0).astype(np.float32)
+
+
+def texel_positions(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Bools]:
+    """Return where each texel of a square texture lies on a mesh, and the surface's normal there.
+
+    Args:
+        mesh: with texture coordinates.
+        resolution: side of the texture in texels.
+
+    Returns:
+        (h, w, 3) positions in mesh coordinates and (h, w, 3) unit shading normals, row 0 at v = 1, both filled in
+        everywhere from the nearest covered texel; and an (h, w) mask of the texels that a lookup on the surface can
+        touch: those in a chart and `BORDER` texels around it.
+
+    Raises:
+        InputError: the texture coordinates cover no texel.
+    """
+    charts = rasterised(mesh, resolution)
+    return charts.positions(), charts.normals(), charts.touched
+
+
+def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Bools, float]:
+    """Return the texels (h, w) that bilinear lookups on some faces read and lookups on all others do not, and their
+    share of those that lookups on these faces read.
+
+    Args:
+        mesh: with texture coordinates.
+        faces: (N,) numbers of faces.
+        shape: height and width of the texture in texels.
+    """
+    corners, ours = _in_texels(mesh, shape), np.isin(np.arange(len(mesh.faces)), faces)
+    read = texels_read(corners[ours], shape)
+    alone = read & ~texels_read(corners[~ours], shape)
+    return alone, float(alone.sum()) / max(1, int(read.sum()))
+
+
+def texel_area(mesh: Mesh, resolution: int | tuple[int, int]) -> Floats:
+    """Return the surface area that each texel stands for, (h, w) in squared mesh units; 0 where no chart is."""
+    return rasterised(mesh, resolution).areas()
+
+
+def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
+    """Find the face and the barycentric weights behind every texel centre.
+
+    Where charts overlap, one of their faces wins.
+
+    Args:
+        mesh: with texture coordinates.
+        resolution: height and width of the texture in texels; one number for both.
+
+    Raises:
+        InputError: the texture coordinates cover no texel.
+    """
+    shape = (resolution, resolution) if isinstance(resolution, int) else resolution
+    corners = _in_texels(mesh, shape)
+    face, row, column = pixels_near(corners, shape)
+    weights = _barycentric(corners[face], np.stack([column, row], axis=1))
+    if len(face) == 0:
+        raise InputError(
+            f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels lies in a triangle; unwrap the mesh "
+            "again"
+        )
+    face_map = np.zeros(shape, dtype=np.int64)
+    weight_map = np.zeros((*shape, 3))
+    covered = np.zeros(shape, dtype=np.bool_)
+    face_map[row, column], weight_map[row, column], covered[row, column] = face, weights, True
+    distance, nearest = ndimage.distance_transform_edt(~covered, return_indices=True)
+    return Charts(mesh, face_map[tuple(nearest)], weight_map[tuple(nearest)], covered, distance)
+
+
+def looked_up(texels: Floats, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> Floats:
+    """Look a repeating texture up with bilinear interpolation of its values.
+
+    Args:
+        texels: (H, W, C) float32.
+        x, y: (...) column and row, any number of textures away; integers are texel centres.
+
+    Returns:
+        (..., C) float32.
+    """
+    height, width = texels.shape[:2]
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left).astype(np.float32)[..., None], (y - top).astype(np.float32)[..., None]
+    columns = [((left + k) % width).astype(np.int64) for k in (0, 1)]
+    rows = [((top + k) % height).astype(np.int64) for k in (0, 1)]
+    upper = texels[rows[0], columns[0]] * (1 - fx) + texels[rows[0], columns[1]] * fx
+    lower = texels[rows[1], columns[0]] * (1 - fx) + texels[rows[1], columns[1]] * fx
+    return np.asarray(upper * (1 - fy) + lower * fy, dtype=np.float32)
+
+
+class MeshSurface:
+    """The faces of a mesh, ready for rays and for neighbourhoods.
+
+    Args:
+        mesh: the mesh.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._corners = mesh.vertices[mesh.faces].astype(np.float64)
+        self.normals = _face_normals(mesh)
+        self._low, self._high = self._corners.min(axis=1), self._corners.max(axis=1)
+        self._neighbours = _face_neighbours(mesh)
+
+    def hit(self, origin: Doubles, direction: Doubles) -> tuple[int, Doubles]:
+        """Return the first face that a ray meets, from either side, and the point (3,) where it does.
+
+        If it meets none: the face with the corner nearest to the ray's line, and that corner.
+
+        Args:
+            origin: (3,) outside the mesh.
+            direction: (3,) unit vector.
+        """
+        a, b, c = self._corners[:, 0], self._corners[:, 1], self._corners[:, 2]
+        # Moeller and Trumbore 1997, all faces at once
+        across = np.cross(direction, c - a)
+        determinant = ((b - a) * across).sum(axis=1)
+        inverse = np.where(np.abs(determinant) > 1e-15, 1.0 / np.where(determinant == 0.0, 1.0, determinant), 0.0)
+        offset = origin - a
+        first = (offset * across).sum(axis=1) * inverse
+        turned = np.cross(offset, b - a)
+        second = (turned @ direction) * inverse
+        distance = ((c - a) * turned).sum(axis=1) * inverse
+        slack = 1e-9
+        meets = (inverse != 0.0) & (first >= -slack) & (second >= -slack) & (first + second <= 1.0 + slack)
+        meets &= distance > 0.0
+        if meets.any():
+            face = int(np.where(meets, distance, np.inf).argmin())
+            return face, origin + distance[face] * direction
+        aside = np.linalg.norm(np.cross(self._corners - origin, direction), axis=-1)
+        face, corner = np.unravel_index(aside.argmin(), aside.shape)
+        return int(face), self._corners[face, corner]
+
+    def region(self, face: int, point: Doubles, normal: Doubles, radius: float) -> Bools:
+        """Return which faces (F,) lie within a radius of a point, face a direction, and are reached from one face.
+
+        Reached means: over edges between such faces. The other wall of a cup, or the next slat of a chair, are not.
+
+        Args:
+            face: where to begin; always in the region.
+            point: (3,) middle of the ball.
+            normal: (3,) the direction.
+            radius: of the ball.
+        """
+        gap = np.maximum(np.maximum(self._low - point, point - self._high), 0.0)
+        inside = (np.linalg.norm(gap, axis=1) <= radius) & (self.normals @ normal > 0.0)
+        inside[face] = True
+        links = self._neighbours[inside[self._neighbours].all(axis=1)]
+        count = len(inside)
+        graph = sparse.coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(count, count))
+        labels = csgraph.connected_components(graph, directed=False)[1]
+        return np.asarray(inside & (labels == labels[face]))
+
+
+def welded(mesh: Mesh) -> tuple[Ints, int]:
+    """Return the number of the place that each vertex lies at (V,), and how many places there are.
+
+    Vertices that UV seams and creases split share a place: 1e-5 of the mesh's largest extent apart or less.
+    """
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    rounded = np.round(mesh.vertices.astype(np.float64) / max(extent, 1e-12) * 1e5)
+    found = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return found, int(found.max()) + 1
+
+
+def _face_neighbours(mesh: Mesh) -> Ints:
+    """Pairs (E, 2) of faces with an edge in common, across UV seams too."""
+    places = welded(mesh)[0][mesh.faces]
+    edges = np.sort(np.concatenate([places[:, [0, 1]], places[:, [1, 2]], places[:, [2, 0]]]), axis=1)
+    owner = np.tile(np.arange(len(mesh.faces)), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+    return np.stack([owner[order][:-1][same], owner[order][1:][same]], axis=1)
+
+
+def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
+    """Texture coordinates of the faces' corners, (F, 3, 2): column and row, integers at texel centres.
+
+    Where a texture repeats, each face is moved by whole textures, so that its middle lies in the first one.
+    """
+    uvs = mesh.uvs[mesh.faces].astype(np.float64)
+    if mesh.repeats:
+        uvs -= np.floor(uvs.mean(axis=1, keepdims=True))
+    return np.stack([uvs[..., 0] * shape[1] - 0.5, (1.0 - uvs[..., 1]) * shape[0] - 0.5], axis=-1)
+
+
+def _barycentric(corners: Doubles, points: Ints) -> Doubles:
+    """Weights (N, 3) of the corners (N, 3, 2) of flat triangles at points (N, 2), clipped to the triangle."""
+    whole = doubled_areas(corners)
+    parts = []
+    for begin, end in ((1, 2), (2, 0), (0, 1)):
+        a, b = corners[:, begin] - points, corners[:, end] - points
+        parts.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / np.where(whole == 0.0, 1.0, whole))
+    weights = np.maximum(np.stack(parts, axis=1), 0.0)
+    total = weights.sum(axis=1, keepdims=True)
+    return np.where(total > 0.0, weights / np.maximum(total, 1e-12), 1.0 / 3.0)
+
+
+def _face_normals(mesh: Mesh) -> Doubles:
+    """Unit normals (F, 3) of the flat faces; zero for a face without area."""
+    places = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20))

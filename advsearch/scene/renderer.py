@@ -26,13 +26,12 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.errors import InputError
-from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.assembly import ON_PICTURE, Motion, central, steps_for
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import ImageFormation, levels_of
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_plan
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.motion import Motion, central, steps_for
 from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536

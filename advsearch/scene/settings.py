@@ -7,10 +7,49 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.parameters import Parameter
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One coordinate of a search: a named, bounded number, tensor or choice.
+
+    Settings of a scene and parameters of controls are both this, so that what `--set` fixes today a control can search
+    tomorrow under the same name.
+
+    Attributes:
+        name: short name; `control.name` addresses it everywhere.
+        shape: of its value; () for a number, None in a place that depends on the scene or a choice.
+        unit: "degrees", "object sizes", "sRGB", "stops", "name", ..., or "1".
+        low: smallest allowed value (0 for a choice among names).
+        high: largest allowed value (number of names - 1 for a choice among names).
+        default: the value that leaves the scene as it is, in words if it depends on the scene.
+        description: one sentence.
+        periodic: the value and the value plus 360 degrees (`high - low` of a full turn) are the same.
+        moves_silhouettes: changing it can move an outline in the picture, so interior adjoints miss a term.
+        search: the range that is searched when nothing is said about the parameter; None: it stays at its default.
+        log: the unit interval runs over the logarithm of the value (scales, powers, distances).
+        options: the names of a discrete choice, which has no derivative; empty for numbers.
+        estimators: the valid ways to differentiate it, preferred first (keys of `gradients.plan.ESTIMATORS`).
+    """
+
+    name: str
+    shape: tuple[int | None, ...]
+    unit: str
+    low: float
+    high: float
+    default: float | str
+    description: str
+    periodic: bool = False
+    moves_silhouettes: bool = False
+    search: tuple[float, float] | None = None
+    log: bool = False
+    options: tuple[str, ...] = ()
+    estimators: tuple[str, ...] = ("differences",)
+
 
 GEOMETRIC = ("secant", "differences", "material")
 """Valid estimators for what moves a mesh."""
@@ -63,26 +102,8 @@ _pose, _camera = partial(moving, GEOMETRIC), partial(moving, ORBIT)
 
 POSE = (
     _pose("yaw", "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", (0.0, 360.0), periodic=True),
-    _pose(
-        "pitch",
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        "Rotation about the object's y axis.",
-        (-15.0, 15.0),
-        periodic=True,
-    ),
-    _pose(
-        "roll",
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        "Rotation about the object's x axis.",
-        (-15.0, 15.0),
-        periodic=True,
-    ),
+    _pose("pitch", "degrees", -360.0, 360.0, 0.0, "Rotation about the object's y axis.", (-15.0, 15.0), periodic=True),
+    _pose("roll", "degrees", -360.0, 360.0, 0.0, "Rotation about the object's x axis.", (-15.0, 15.0), periodic=True),
     _pose("x", "object sizes", -1e4, 1e4, 0.0, "Shift of the object along x.", (-0.15, 0.15)),
     _pose("y", "object sizes", -1e4, 1e4, 0.0, "Shift of the object along y.", (-0.15, 0.15)),
     _pose("z", "object sizes", -1e4, 1e4, 0.0, "Height of the lowest point above the ground."),
@@ -160,13 +181,7 @@ GROUND = (
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
     *colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
     Parameter(
-        "height",
-        (),
-        "object sizes",
-        0.1,
-        1000.0,
-        3.0,
-        "Height above the floor from which the photograph was taken.",
+        "height", (), "object sizes", 0.1, 1000.0, 3.0, "Height above the floor from which the photograph was taken."
     ),
 )
 MATERIAL = (

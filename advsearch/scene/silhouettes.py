@@ -16,10 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from advsearch.scene.assets import Bools, Doubles
 from advsearch.scene.raster import pixels_in
-
-Doubles = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 RASTER = 128
 """Pixels along the longer side of a silhouette."""
@@ -76,7 +74,7 @@ class Silhouette:
         window: tangents that the mask spans.
     """
 
-    mask: Mask
+    mask: Bools
     window: Frame
 
     def directions(self) -> Doubles:
@@ -95,7 +93,7 @@ class Silhouette:
         y = self.window.low + (row + (0.5 + 0.5698403 * number) % 1.0) * (self.window.high - self.window.low) / height
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
 
-    def contains(self, x: Doubles, y: Doubles, forwards: Doubles) -> Mask:
+    def contains(self, x: Doubles, y: Doubles, forwards: Doubles) -> Bools:
         """Whether directions, any shape and length, lie in the silhouette."""
         height, width = self.mask.shape
         depth = np.maximum(forwards, NEAREST)

@@ -12,15 +12,18 @@ from advsearch.settings.values import (
     as_python,
     as_text,
     check_once,
+    each_once,
     is_shallow,
     number_or_text,
     parse_assignment,
     read_yaml,
     shown,
     split_names,
+    texts,
 )
 
 __all__ = [
-    "FILES", "HEADER", "Clash", "Config", "Setting", "all_finite", "as_python", "as_text", "check_once", "is_shallow",
-    "number_or_text", "parse_assignment", "read_yaml", "setting", "setting_as_in", "settings", "shown", "split_names",
+    "FILES", "HEADER", "Clash", "Config", "Setting", "all_finite", "as_python", "as_text", "check_once", "each_once",
+    "is_shallow", "number_or_text", "parse_assignment", "read_yaml", "setting", "setting_as_in", "settings", "shown",
+    "split_names", "texts",
 ]  # fmt: skip

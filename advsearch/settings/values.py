@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from pydantic import ValidationInfo, field_validator
 
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
@@ -49,6 +51,25 @@ def as_text(value: Any, *, several: bool = False) -> Any:
     if not text.strip(" ,\t\n") or "\0" in text:
         raise ValueError("an empty name")
     return text
+
+
+def texts(*names: str, several: Sequence[str] = ()) -> Any:
+    """Return a validator that reads settings of these names, and those with several names in one, with `as_text`."""
+
+    def read(value: Any, info: ValidationInfo) -> Any:
+        return as_text(value, several=info.field_name in several)
+
+    return field_validator(*names, *several, mode="before")(read)
+
+
+def each_once(*names: str) -> Any:
+    """Return a validator that refuses names that are given twice in settings of these names."""
+
+    def check(value: str | None, info: ValidationInfo) -> str | None:
+        check_once(split_names(value or ""), str(info.field_name))
+        return value
+
+    return field_validator(*names)(check)
 
 
 def all_finite(value: Any) -> bool:

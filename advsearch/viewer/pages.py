@@ -11,13 +11,14 @@ import shutil
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from advsearch import rooms
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_bytes
 from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
 from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
-from advsearch.runs.directory import IMAGES, OBJECT_FILE, PARTS, REPORT
+from advsearch.runs.directory import IMAGES, OBJECT_FILE, PARTS, REPORT, RunDirectory
 from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
@@ -26,6 +27,8 @@ from advsearch.viewer import document
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, write_sweep_page
 from advsearch.viewer.thumbnails import kept_pictures, path_of
+
+Answer = TypeVar("Answer", bound=Result)
 
 LARGEST = 2_700_000
 """Bytes of an object that a page takes along."""
@@ -83,6 +86,13 @@ def write_page(run: Path, result: Result) -> Path:
     made = own(run, result) if own else None
     text = made or shown_page(run, result, shown(result))
     return write_text(run / REPORT, text, durable=False)
+
+
+def keep_answer(run: RunDirectory, result: Answer) -> Answer:
+    """Write the summary and the page of an answer into the open directory of its run, and return it."""
+    run.write_summary(result)
+    write_page(run.path, result)
+    return result
 
 
 def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:

@@ -1,7 +1,7 @@
 """Streets: rows of houses on both sides of a road, by day, in the rain's wake and at dusk. Lengths are metres.
 
 The viewer stands in the right lane of a road along x, 1.5 above it. What lies on the ground is what
-`advsearch.scene.road` lays under the object, so that the two go on into each other.
+`advsearch.scene.grounds` lays under the object, so that the two go on into each other.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.road import WETNESS, reflectance
+from advsearch.scene.grounds import WETNESS, reflectance
 
 from .panorama import Array, EnvironmentFamily
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import Material, ObjectAsset
-from advsearch.scene.finishes import finished
+from advsearch.scene.library import finished
 
 from .atlas import SIZE, joined, pack, painted
 from .draw import Draw

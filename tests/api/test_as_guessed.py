@@ -25,7 +25,7 @@ from advsearch.config import AttackConfig
 from advsearch.controls import LightControl, PoseControl
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.loading import as_controls, instances_in, settings_of
-from advsearch.engine.run_settings import given_to
+from advsearch.engine.naming import given_to
 from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import BarProgress, LineProgress, NotebookProgress, NullProgress, watched
@@ -293,7 +293,7 @@ def _other() -> Callable[..., float]:
 
 def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
     from advsearch.config import SweepConfig
-    from advsearch.engine.metrics import metrics_as_settings, only_here
+    from advsearch.engine.judging import metrics_as_settings, only_here
     from advsearch.questions.sweep.carry_out import job_of, sweep_answers
 
     named = metrics_as_settings({"red": red, "own": lambda image, output, truth: 0.0})

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch import losses
 from advsearch.attacks import Random
-from advsearch.attacks.own_objective import form_of
+from advsearch.attacks.objectives import form_of
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.tasks import Classification, Facts, make_task

@@ -19,7 +19,7 @@ from advsearch.attacks import get_objective
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.engine.objective import of_ensemble
-from advsearch.engine.retrial import Retrials
+from advsearch.engine.verifier import Retrials
 from advsearch.errors import InputError
 from advsearch.questions.attack.answer import MatrixResult
 from advsearch.questions.attack.carry_out import attack_from_config

@@ -11,7 +11,7 @@ import pytest
 
 from advsearch.api import studies as parts
 from advsearch.api.studies import chains_of
-from advsearch.cluster.executor import Done, Work, Workforce
+from advsearch.cluster import Done, Work, Workforce
 from advsearch.config import AttackConfig
 from advsearch.errors import ClusterError
 from advsearch.questions.attack.several import curve_from_config

@@ -38,7 +38,7 @@ from advsearch.questions.region.settings import RegionConfig
 from advsearch.report.wording import objective_text
 from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
-from advsearch.scene.parameters import Parameter
+from advsearch.scene.settings import Parameter
 from advsearch.settings import settings
 
 SIDE = 16

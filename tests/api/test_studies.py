@@ -98,7 +98,7 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
 ) -> None:
     run = str(tmp_path / "it")
     monkeypatch.setattr(
-        "advsearch.questions.attack.several.curve_from_config", lambda config, **more: samples.curve(run=config.run)
+        "advsearch.questions.attack.carry_out.curve_from_config", lambda config, **more: samples.curve(run=config.run)
     )
     assert carry_out(AttackConfig(**several, run=run)) == samples.curve(run=run)
 
@@ -149,7 +149,7 @@ SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "denoise": "none"}
 
 
 def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.questions.region.growing.MOST_PROBED", 20)
+    monkeypatch.setattr("advsearch.questions.region.carry_out.MOST_PROBED", 20)
     config = RegionConfig(
         **SMALL, controls={"pose": {"yaw": [10, 50], "pitch": 0, "roll": 0, "x": 0, "z": 0}, "camera.elevation": {}},
         vary="pose.yaw,camera.elevation", samples=8, map=2, verify_spp=2, run=str(tmp_path / "run"),

@@ -15,8 +15,9 @@ from conftest import ROOT
 from torch import Tensor, nn
 
 from advsearch import losses
-from advsearch.attacks import OBJECTIVES, get_objective, logit_objectives, margin
-from advsearch.attacks.logit_objectives import (
+from advsearch.attacks import OBJECTIVES, get_objective, margin, objective_functions
+from advsearch.attacks.objective_functions import (
+    NEARBY,
     RELIEF,
     SUREST,
     cross_entropy,
@@ -28,7 +29,6 @@ from advsearch.attacks.logit_objectives import (
     targeted_margin,
 )
 from advsearch.attacks.objectives import (
-    NEARBY,
     OBJECTIVE_KINDS,
     asked_by,
     check_objective,
@@ -480,7 +480,7 @@ def test_several_right_answers_are_a_tuple_and_no_loss_of_torch_takes_them() -> 
 def test_ours_take_right_answers_in_every_form(named: tuple[int, ...], tuple_of: Any) -> None:
     for name in ("margin", "cross_entropy", "log_odds", "dlr", "targeted_margin", "targeted_dlr"):
         by_name = getattr(losses, name)(LOGITS, tuple_of)
-        assert torch.equal(by_name, getattr(logit_objectives, name)(LOGITS, IMAGES, named)), name
+        assert torch.equal(by_name, getattr(objective_functions, name)(LOGITS, IMAGES, named)), name
     assert torch.equal(margin(LOGITS, IMAGES, tuple_of), margin(LOGITS, IMAGES, named))
 
 

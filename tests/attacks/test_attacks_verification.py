@@ -28,8 +28,7 @@ from advsearch.attacks import (
     search,
     verify,
 )
-from advsearch.attacks.sample_count import LOOKS, MarginsOf, most_samples
-from advsearch.attacks.trials import paired_difference
+from advsearch.attacks.trials import LOOKS, MarginsOf, most_samples, paired_difference
 from advsearch.attacks.verification import (
     EASIER,
     LEAST_RATE,
@@ -41,7 +40,7 @@ from advsearch.attacks.verification import (
 )
 from advsearch.config import FEWEST_TRIALS
 from advsearch.errors import InputError
-from advsearch.questions.region.growing import GrownBox
+from advsearch.questions.region.carry_out import GrownBox
 from advsearch.questions.region.settings import FEWEST_SAMPLES
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Judgement

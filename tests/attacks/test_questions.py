@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
-from advsearch.attacks.smallest import RATIO, Bracket, confirmed, scaled, shrunk, smallest
+from advsearch.attacks.candidates import RATIO, Bracket, confirmed, scaled, shrunk, smallest
 from advsearch.errors import InputError
-from advsearch.questions.region.growing import grow
+from advsearch.questions.region.carry_out import grow
 
 NORMS = {"linf": lambda w: float(w.abs().sum()), "l2": lambda w: float(w.norm())}
 

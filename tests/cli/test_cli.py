@@ -40,7 +40,7 @@ from advsearch.questions.gap.settings import GapConfig
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
-from advsearch.scene.parameters import Parameter
+from advsearch.scene.settings import Parameter
 from advsearch.settings import Config, settings
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL")

@@ -11,8 +11,8 @@ import pytest
 from simulated_cluster import Failure, Simulated, coordinator
 
 from advsearch import threads
+from advsearch.cluster import Done, Work
 from advsearch.cluster.coordinator import DEPTH, PATIENCE, Coordinator
-from advsearch.cluster.executor import Done, Work
 from advsearch.cluster.worker import MOST_LOADED, Carried, Files, Ready, carry_out_batch, prepare, version
 from advsearch.errors import ClusterError
 

@@ -20,9 +20,8 @@ import pytest
 from conftest import ROOT
 from covering import only
 
-from advsearch.cluster.dask_pool import scheduler_gone
-from advsearch.cluster.executor import Executor, Work
-from advsearch.cluster.opening import CLASSES, executor_of, place_of
+from advsearch.cluster import Executor, Work
+from advsearch.cluster.dask_pool import CLASSES, executor_of, place_of, scheduler_gone
 from advsearch.errors import ClusterError, FileFormatError, InputError
 
 psutil: Any = import_module("psutil")  # which Dask brings along
@@ -217,7 +216,7 @@ FEW = [one for one in ASKING if one.startswith(("import", "def main():\n    ask(
 @pytest.mark.parametrize("text", only(FEW, ASKING))
 def test_a_script_that_every_worker_would_run_again_is_told_what_to_do(tmp_path: Path, text: str) -> None:
     script = tmp_path / "script.py"
-    begin = "from advsearch.cluster.opening import place_of\ndef ask():\n    place_of(2, None)\n"
+    begin = "from advsearch.cluster.dask_pool import place_of\ndef ask():\n    place_of(2, None)\n"
     script.write_text(begin + text, encoding="utf-8")
     environ = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environ, check=False)
@@ -228,7 +227,7 @@ def test_a_script_that_every_worker_would_run_again_is_told_what_to_do(tmp_path:
 
 
 def test_a_script_that_comes_through_a_pipe_has_no_workers() -> None:
-    script = "from advsearch.cluster.opening import place_of; place_of(2, None)"
+    script = "from advsearch.cluster.dask_pool import place_of; place_of(2, None)"
     environ = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable], input=script, capture_output=True, text=True, env=environ, check=False)
     assert "expected a script that they can import, got <stdin>; put it into a file" in done.stderr

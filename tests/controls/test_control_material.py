@@ -15,8 +15,8 @@ from advsearch.controls.material_patterns import PATTERNS, SIDE, covering, tile
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.raster import texel_positions
 from advsearch.scene.settings import CHANNELS
-from advsearch.scene.surface_map import texel_positions
 
 BASE_COLOR = "object.base_color"
 

@@ -17,7 +17,7 @@ from advsearch.controls.camera import CameraControl
 from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement, loaded, made, sphere
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.cameras.model import bundled, pinhole
+from advsearch.scene.camera_model import bundled, pinhole
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.library import list_objects

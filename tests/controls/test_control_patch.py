@@ -22,7 +22,7 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.library import list_objects, load_object
-from advsearch.scene.surface_map import MeshSurface, rasterised, texel_area, texel_positions
+from advsearch.scene.raster import MeshSurface, rasterised, texel_area, texel_positions
 
 SIDE = 512
 

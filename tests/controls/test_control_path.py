@@ -17,8 +17,7 @@ from advsearch.controls.path import CLEAN_AT, PATHS, PathControl
 from advsearch.engine.rendering import sight_of
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.framing import middle
-from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.geometry import camera_to_world, middle, object_to_world
 from advsearch.tasks import Facts
 
 WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"

@@ -15,7 +15,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.surface_map import texel_area
+from advsearch.scene.raster import texel_area
 
 EIGHT_BIT = 1e-4
 """Colours may differ by this much after the way to linear values and back."""

@@ -18,10 +18,10 @@ from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import as_controls
 from advsearch.engine.sweeps.axes import on_grid, read_axes
 from advsearch.errors import InputError
-from advsearch.scene.mitsuba_backend.files.writing import write_scene, write_xml
-from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.writing import write_scene, write_xml
+from advsearch.scene.mitsuba_backend.xml_files import read_scene
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

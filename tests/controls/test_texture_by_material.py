@@ -25,10 +25,9 @@ from advsearch.engine.transport import remark
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.raster import texels_read
-from advsearch.scene.surface_map import looked_up, texels_of_faces
+from advsearch.scene.raster import looked_up, texels_of_faces, texels_read
 from advsearch.scene.transport.lights import why_not
-from advsearch.scene.transport.renderer import TOO_LARGE, LinearRenderer
+from advsearch.scene.transport.matrix import TOO_LARGE, LinearRenderer
 
 Box = tuple[Sequence[float], Sequence[float]]
 CAR: dict[str, list[Box]] = {

@@ -19,7 +19,7 @@ from advsearch.engine.bank import Bank, stratified
 from advsearch.engine.problem import hard_first
 from advsearch.errors import ClusterError
 from advsearch.questions.attack.carry_out import attack_once
-from advsearch.scene.surface import plan
+from advsearch.scene.surface import renderer as surface_renderer
 
 SMALL: dict[str, Any] = {
     "resolution": 48,
@@ -54,13 +54,13 @@ def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
         monkeypatch.setattr(bank, name, value)
     monkeypatch.setattr(transport, "CHANGE_SPP", 4)
-    monkeypatch.setattr(plan, "why_not", lambda renderer, varying: "matrices are tested")
+    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: "matrices are tested")
 
 
 @pytest.fixture(autouse=True)
 def by_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let nothing be predicted by light on surfaces."""
-    monkeypatch.setattr(plan, "why_not", lambda renderer, varying: "matrices are tested")
+    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: "matrices are tested")
 
 
 @pytest.fixture

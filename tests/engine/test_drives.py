@@ -16,7 +16,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import SweepConfig
-from advsearch.engine.sharing import answering
+from advsearch.engine.journal import answering
 from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.drives import longest, over_drives
 from advsearch.engine.sweeps.loop import Sweep

@@ -29,10 +29,9 @@ from advsearch.engine.gradients import (
 )
 from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.check.answer import WHOLE, DerivativeRow, DirectionRow
+from advsearch.questions.check.answer import WHOLE, DerivativeRow, DirectionRow, shown
 from advsearch.questions.check.carry_out import attempts, check_from_config
 from advsearch.questions.check.settings import CheckConfig
-from advsearch.questions.check.words import shown
 from advsearch.runs.results.base import CosineRow
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import ESTIMATORS, SEARCH_STEP, Group, first_plan

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import Trials
-from advsearch.engine.rows import control_group, judgement_of, rate_of, trial_row
+from advsearch.engine.record import control_group, judgement_of, rate_of, trial_row
 from advsearch.errors import InputError
 from advsearch.report import wording
 from advsearch.report.phrases import answer_cells, calls

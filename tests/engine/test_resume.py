@@ -23,15 +23,14 @@ from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
 from advsearch.config import AttackConfig
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.record import Stages
-from advsearch.engine.sharing import Shared
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
 from advsearch.questions.check.settings import CheckConfig
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.questions.stability.settings import StabilityConfig
-from advsearch.runs import database
+from advsearch.runs import files
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import can_resume
 from advsearch.runs.store import Row, Store, Told
@@ -292,11 +291,11 @@ def test_a_kill_before_the_results_had_tables_leaves_a_folder_that_a_run_can_tak
     folder = tmp_path / "run"
     folder.mkdir()
     with closing(sqlite3.connect(folder / "results.sqlite")) as made:
-        made.execute(f"PRAGMA application_id = {database.APPLICATION_ID}")
+        made.execute(f"PRAGMA application_id = {files.APPLICATION_ID}")
     with RunDirectory.create(folder) as run:
         run.write_config(configuration())
     with closing(sqlite3.connect(tmp_path / "results.sqlite")) as made:
-        made.execute(f"PRAGMA application_id = {database.APPLICATION_ID}")
+        made.execute(f"PRAGMA application_id = {files.APPLICATION_ID}")
         made.execute("CREATE TABLE others (text)")
     folder.joinpath("run.yaml").unlink()
     (tmp_path / "results.sqlite").replace(folder / "results.sqlite")

@@ -17,7 +17,7 @@ from advsearch.controls.patch import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.attack_parts import with_derivatives
-from advsearch.engine.run_settings import RUN_SETTINGS, check, given_to
+from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.gap.carry_out import gap_from_config
@@ -83,7 +83,7 @@ def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expec
     "controls", [["texture"], "texture", ("texture",), {"texture": {}}, {"texture:texture": {}}, ["texture", "pose"]]
 )
 def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
+    monkeypatch.setattr(attacking, "_carry_out", lambda job, *_: job)
     job: Any = advsearch.attack("mug", controls=controls, **ALL)
     again = given_to(job.config, job.config.controls)
     texture: Any
@@ -92,7 +92,7 @@ def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatc
 
 
 def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
+    monkeypatch.setattr(attacking, "_carry_out", lambda job, *_: job)
     job: Any = advsearch.attack("mug", controls=["geometry"], over=["texture:label"], **ALL)
     assert job.controls[0].epsilon == 0.07
     assert (job.over[0].epsilon, job.over[0].norm, job.over[0].resolution) == (None, "l2", 16)
@@ -122,7 +122,7 @@ def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch,
 
 
 def _seen(config: AttackConfig, seen: list[Any]) -> None:
-    check(config)
+    check_run_settings(config)
     seen.append((config.epsilon, config.norm, config.texture_resolution))
 
 
@@ -166,7 +166,7 @@ def _seen(config: AttackConfig, seen: list[Any]) -> None:
 )
 def test_a_setting_that_no_control_takes_is_refused(controls: Any, options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as error:
-        check(AttackConfig(object="mug", controls=controls, **options))
+        check_run_settings(AttackConfig(object="mug", controls=controls, **options))
     assert with_flags(str(error.value)).startswith(message)
 
 
@@ -181,7 +181,7 @@ def test_a_setting_that_no_control_takes_is_refused(controls: Any, options: dict
 def test_an_environment_takes_an_epsilon_for_its_harmonics(controls: Any) -> None:
     named = controls if isinstance(controls, dict) else {name: {} for name in controls}
     config = AttackConfig(object="mug", controls=named, epsilon=0.07)
-    check(config)
+    check_run_settings(config)
     (control,) = given_to(config, named)
     assert control.settings()["epsilon"] == 0.07
 
@@ -194,7 +194,7 @@ def test_an_environment_without_harmonics_refuses_an_epsilon_of_its_own() -> Non
 @pytest.mark.parametrize("controls", ["patch", "patch.size", {"patch": {"pixels": [0.1, 0.9]}}])
 def test_a_patch_takes_an_epsilon_for_searched_pixels(controls: Any) -> None:
     config = AttackConfig(object="mug", controls=controls, epsilon=0.07)
-    check(config)
+    check_run_settings(config)
     (control,) = given_to(config, config.controls)
     assert control.settings()["epsilon"] == 0.07
 
@@ -203,14 +203,14 @@ def test_an_epsilon_that_another_control_takes_leaves_a_fixed_patch() -> None:
     config = AttackConfig(
         object="mug", controls={"texture": {}, "patch": {"pixels": 0.5, "size": [0.1, 0.3]}}, epsilon=0.07
     )
-    check(config)
+    check_run_settings(config)
     texture, patch = given_to(config, config.controls)
     assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in patch.settings()
 
 
 def test_an_epsilon_that_another_control_takes_leaves_an_environment_as_it_is() -> None:
     config = AttackConfig(object="mug", controls="texture,environment", epsilon=0.07)
-    check(config)
+    check_run_settings(config)
     texture, environment = given_to(config, "texture,environment")
     assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in environment.settings()
 
@@ -218,7 +218,7 @@ def test_an_epsilon_that_another_control_takes_leaves_an_environment_as_it_is() 
 def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown control in --epsilon 'texure'\. Did you mean 'texture'"):
         try:
-            check(AttackConfig(object="mug", epsilon="texure=1"))
+            check_run_settings(AttackConfig(object="mug", epsilon="texure=1"))
         except UnknownNameError as error:
             error.args = (with_flags(str(error)),)
             raise

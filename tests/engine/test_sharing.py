@@ -15,9 +15,8 @@ from conftest import ROOT
 from stand_ins import StandInProblem, StandInWorkers
 
 from advsearch.attacks import Query
-from advsearch.cluster.executor import InProcess
-from advsearch.engine.journal import Journal
-from advsearch.engine.sharing import Shared, answering, lost
+from advsearch.cluster import InProcess
+from advsearch.engine.journal import Journal, Shared, answering, lost
 from advsearch.errors import ClusterError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told

@@ -39,9 +39,8 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.objective import domain_of
-from advsearch.engine.sweeps import swept_scene
+from advsearch.engine.sweeps import KIND, swept_scene
 from advsearch.engine.sweeps.axes import axis_values, on_grid, read_axes
-from advsearch.engine.sweeps.job import KIND
 from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.points import Points, parts_of_ranges
 from advsearch.errors import AdvsearchError, InputError, RunExistsError, UnknownNameError

@@ -13,10 +13,10 @@ from stand_ins import rows
 
 import advsearch
 from advsearch.attacks.draws import Product
-from advsearch.cluster.executor import Done, Workforce
+from advsearch.cluster import Done, Workforce
 from advsearch.config import SweepConfig
-from advsearch.engine.sharing import answering
-from advsearch.engine.sweeps import surface_light
+from advsearch.engine.journal import answering
+from advsearch.engine.sweeps import predicting
 from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.predicting import Groups
 from advsearch.engine.sweeps.swept_scene import Scenes, SweptScene
@@ -41,7 +41,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
         monkeypatch.setattr(arrangement, name, value)
     numbers: dict[str, float] = {"PAYS": 0.0, "CHECK_SPP": 2, "BOUND": 50.0}
     for name, number in numbers.items():
-        monkeypatch.setattr(surface_light, name, number)
+        monkeypatch.setattr(predicting, name, number)
     made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__
 
     def counted(self: SurfaceRenderer, *given: Any) -> None:
@@ -147,7 +147,7 @@ def test_drives_are_predicted_whatever_is_drawn_for_each(coarse: list[SurfaceRen
 
 def test_a_group_whose_pictures_are_too_far_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     levels = iter([9.0, 1.0])
-    monkeypatch.setattr(surface_light, "over_all", lambda found: Deviation(next(levels), 0.0, 2.0, pictures=6))
+    monkeypatch.setattr(predicting, "over_all", lambda found: Deviation(next(levels), 0.0, 2.0, pictures=6))
     found = swept(grid=GRID)
     told = found.summary.transport
     assert told is not None and "1 of 2 groups were rendered" in str(told.reason)
@@ -176,8 +176,8 @@ def test_why_a_sweep_is_rendered(more: dict[str, Any], reason: str | None) -> No
 
 
 def test_few_pictures_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surface_light, "PAYS", 2.0)
-    monkeypatch.setattr(surface_light, "CHECK_SPP", 32)
+    monkeypatch.setattr(predicting, "PAYS", 2.0)
+    monkeypatch.setattr(predicting, "CHECK_SPP", 32)
     told = swept(grid=GRID, resolution=128).summary.transport
     assert told == LinearTransport(
         used=False, reason="light on surfaces pays where 79 pictures differ in the camera alone; here 8 do"

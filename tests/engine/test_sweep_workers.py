@@ -16,10 +16,10 @@ from test_sweep import FakeRenderer
 import advsearch
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
-from advsearch.cluster.executor import Call, Done, Workforce
+from advsearch.cluster import Call, Done, Workforce
 from advsearch.config import SweepConfig
-from advsearch.engine.rows import LOST
-from advsearch.engine.sharing import answering
+from advsearch.engine.journal import answering
+from advsearch.engine.record import LOST
 from advsearch.engine.sweeps import loop, swept_scene
 from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.swept_scene import Scenes

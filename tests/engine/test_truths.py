@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 import torch
 
-from advsearch.engine.answers import KnownTruths
+from advsearch.engine.judging import KnownTruths
 from advsearch.tasks import Facts
 
 

@@ -35,7 +35,7 @@ def load_node(path: Path) -> None:
 def load_mitsuba(path: Path) -> None:
     """Read a Mitsuba scene, with its first shape that can be one as the object, and put it into Mitsuba."""
     import advsearch
-    from advsearch.scene.mitsuba_backend.files.scene import contents
+    from advsearch.scene.mitsuba_backend.scene_files import contents
 
     names = contents(path).objects
     if names:
@@ -127,8 +127,8 @@ def load_blend(path: Path) -> None:
 
 def load_threedb(path: Path) -> None:
     """Read a folder of 3DB as `import-3db` does."""
-    from advsearch.engine.sweeps.imported import read_picture
-    from advsearch.runs.threedb import read_threedb
+    from advsearch.engine.sweeps.summary import read_picture
+    from advsearch.runs.export import read_threedb
 
     for one in read_threedb(path.parent):
         if one.picture is not None:
@@ -182,7 +182,7 @@ def warm_up(loaders: Iterable[str]) -> None:
 
         import advsearch.scene.environments
         import advsearch.scene.importing.objects
-        import advsearch.scene.mitsuba_backend.files.scene
+        import advsearch.scene.mitsuba_backend.scene_files
 
         Image.init()
     if {"model", "labels"} & set(loaders):

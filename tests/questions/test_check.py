@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.engine.measuring import OutOfTime, Results
+from advsearch.engine.record import OutOfTime, Results
 from advsearch.progress import Progress
+from advsearch.questions.check import answer as words
 from advsearch.questions.check import carry_out as checking
-from advsearch.questions.check import words
 from advsearch.questions.check.answer import CheckedRow, CheckResult
 from advsearch.questions.check.carry_out import check_from_config
 from advsearch.questions.check.settings import CheckConfig

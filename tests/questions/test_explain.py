@@ -17,12 +17,10 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
-from advsearch.explanations.observations import Answered, Factor, Observations
-from advsearch.explanations.rules import CountedRule, RuleCondition
+from advsearch.explanations import Answered, CountedRule, Factor, Observations, RuleCondition
 from advsearch.questions.explain import renders as explaining
-from advsearch.questions.explain.answer import ExplainResult
+from advsearch.questions.explain.answer import ExplainResult, pairs_text
 from advsearch.questions.explain.renders import along, lies_inside, sweep_inside
-from advsearch.questions.explain.words import pairs_text
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.summary import read_result

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import fisher_exact
 
+from advsearch import explanations
 from advsearch.errors import InputError
-from advsearch.explanations import rules as libraries
-from advsearch.explanations.observations import Factor, Observations, observed
-from advsearch.explanations.rules import CountedRule, RuleCondition, covered, find_rules
+from advsearch.explanations import CountedRule, Factor, Observations, RuleCondition, covered, find_rules, observed
 from advsearch.questions.explain.findings import find_clusters, find_envelope, find_importance
 
 FACTORS = (
@@ -197,7 +196,7 @@ def test_a_library_that_is_missing_is_named_with_the_command(monkeypatch: pytest
 
     monkeypatch.setattr("importlib.import_module", absent)
     with pytest.raises(InputError, match=r"needs scikit-learn.*pip install 'advsearch\[explain\]'"):
-        libraries.import_library("sklearn.tree")
+        explanations.import_library("sklearn.tree")
 
 
 @pytest.mark.parametrize("kinds", [2, 3])

@@ -50,8 +50,7 @@ from advsearch.questions.harden.scenes import (
     white_light_changed,
 )
 from advsearch.questions.harden.settings import HardenConfig
-from advsearch.questions.harden.steps import Gradients
-from advsearch.questions.harden.training import Course, Score, TrainingRounds, score
+from advsearch.questions.harden.training import Course, Gradients, Score, TrainingRounds, score
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
 
@@ -354,7 +353,7 @@ def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pyt
             seen.append((owners, seed, images.requires_grad))
         return images
 
-    monkeypatch.setattr("advsearch.questions.harden.steps._changed", changed)
+    monkeypatch.setattr("advsearch.questions.harden.training._changed", changed)
     made = student()
     with threads.one_each_for_torch() as pool:
         Gradients(made, student().model, pool).take(batch, None, 7)

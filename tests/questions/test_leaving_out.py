@@ -18,10 +18,9 @@ from advsearch.controls import LightControl, TextureControl
 from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import BOUND, measured_bounces
-from advsearch.questions.plan.carry_out import plan_from_config
-from advsearch.questions.plan.leaving_out import ALL, RENDERS, WHAT, measured_gains, resolved_texels
+from advsearch.questions.plan.carry_out import ALL, RENDERS, WHAT, measured_gains, plan_from_config, resolved_texels
 from advsearch.questions.plan.settings import PlanConfig
-from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
+from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
 
 SIZE = 40
@@ -84,8 +83,8 @@ def test_gains_have_a_row_for_each_item_and_their_proof() -> None:
 
 
 def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.questions.plan.leaving_out.ITEMS", {"tracing": ""})
-    monkeypatch.setattr("advsearch.questions.plan.leaving_out.NOTHING", EVERYTHING)
+    monkeypatch.setattr("advsearch.questions.plan.carry_out.ITEMS", {"tracing": ""})
+    monkeypatch.setattr("advsearch.questions.plan.carry_out.NOTHING", EVERYTHING)
     renderer = made("camera.exposure")
     rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=128, repeats=2, depth=2)
     tracing, bounces, _ = rows  # no row of predicted pictures: an exposure needs no render
@@ -96,7 +95,7 @@ def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.slow
 def test_renders_that_are_predicted_have_a_row_beside_the_adjoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.questions.plan.leaving_out.ITEMS", {"tracing": ""})
+    monkeypatch.setattr("advsearch.questions.plan.carry_out.ITEMS", {"tracing": ""})
     renderer = made("texture", denoiser="oidn")
     depth = renderer.scene.max_depth
     rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=4, repeats=2, depth=depth)

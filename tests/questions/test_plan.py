@@ -14,16 +14,15 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
-from advsearch.engine.measuring import Results
 from advsearch.engine.planning import cosine_samples, cosines
+from advsearch.engine.record import Results
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress
 from advsearch.questions.plan import carry_out as planning
-from advsearch.questions.plan.answer import GainRow, PlanResult
+from advsearch.questions.plan.answer import READING, GainRow, PlanResult
 from advsearch.questions.plan.carry_out import plan_from_config, quieter
 from advsearch.questions.plan.settings import PlanConfig
-from advsearch.questions.plan.words import READING
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results.base import CosineRow, PathLength

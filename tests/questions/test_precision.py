@@ -17,43 +17,47 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as precision_text
-from advsearch.cluster.executor import Done, InProcess, Workforce
+from advsearch.cluster import Done, InProcess, Workforce
 from advsearch.config import AttackConfig
 from advsearch.engine import attack_parts as attacking
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import load_scene
 from advsearch.errors import ClusterError, InputError
 from advsearch.progress import NullProgress
-from advsearch.questions.precision import measurement as measuring
-from advsearch.questions.precision.answer import PrecisionReference, PrecisionResult, Recommended
+from advsearch.questions.precision import carry_out as measuring
+from advsearch.questions.precision.answer import PrecisionReference, PrecisionResult, Recommended, precision_figures
+from advsearch.questions.precision.benches import (
+    COUNTS,
+    PolicyCurve,
+    SearchMark,
+    curve_of,
+    marks_at,
+    missing,
+    sooner,
+    variants,
+)
 from advsearch.questions.precision.carry_out import precision_from_config, references_of
-from advsearch.questions.precision.diagrams import precision_figures
-from advsearch.questions.precision.fits import (
+from advsearch.questions.precision.gradient import MATRIX, GradientBench, estimated_parts, matrix_groups
+from advsearch.questions.precision.points import (
     FURTHEST,
     INDEPENDENT,
     STRATIFIED,
-    confirm_recommendation,
-    fit_line,
-    fixed_seconds,
-    levels_off,
-    reaching,
-    recommend,
-    warning_of,
-)
-from advsearch.questions.precision.gradient import MATRIX, GradientBench, estimated_parts, matrix_groups
-from advsearch.questions.precision.image import COUNTS, variants
-from advsearch.questions.precision.objective import PolicyCurve, SearchMark, curve_of, marks_at, missing, sooner
-from advsearch.questions.precision.points import (
     WARM_UP,
     MeasuredSetting,
     Point,
     ReferenceValue,
-    Sample,
+    confirm_recommendation,
+    fit_line,
+    fixed_seconds,
+    levels_off,
     point_of,
     quartiles,
+    reaching,
+    recommend,
     reference_of,
     reference_through,
     typical_seconds,
+    warning_of,
 )
 from advsearch.questions.precision.recommended import MeasuredLine, Section, rounding
 from advsearch.questions.precision.rounds import (
@@ -113,7 +117,7 @@ def measured(
     points = []
     for count in COUNTS_TRIED:
         errors = [reference.relative_error(noisy(count, 100 * count + k, bias, power)) for k in range(8)]
-        samples = [Sample({"error": error}, fixed + 1e-3 * count) for error in errors]
+        samples = [({"error": error}, fixed + 1e-3 * count) for error in errors]
         points.append(point_of(setting(count, series), samples, floor=reference.error))
     return points
 
@@ -187,8 +191,8 @@ def test_no_point_below_the_reference_is_called_known() -> None:
 
 def test_seconds_leave_the_warm_up_out() -> None:
     times = [9.0] * WARM_UP + [1.0, 3.0, 2.0]
-    assert typical_seconds([Sample({}, one) for one in times]) == 2.0
-    assert typical_seconds([Sample({}, one) for one in (9.0, 4.0)]) == 4.0
+    assert typical_seconds([({}, one) for one in times]) == 2.0
+    assert typical_seconds([({}, one) for one in (9.0, 4.0)]) == 4.0
 
 
 def test_quartiles() -> None:
@@ -299,7 +303,7 @@ def test_what_is_chosen_among_noisy_points_looks_better_than_it_is_until_it_is_m
 
     def point(series: str, spp: int, repeats: int) -> Point:
         squares = rng.normal(0.0, spp**-0.5, repeats) ** 2
-        return point_of(setting(spp, series), [Sample({"error": math.sqrt(one)}, 1e-3 * spp) for one in squares])
+        return point_of(setting(spp, series), [({"error": math.sqrt(one)}, 1e-3 * spp) for one in squares])
 
     before, after = [], []
     for _ in range(200):
@@ -674,7 +678,7 @@ def test_workers_make_the_references_and_what_is_timed_stays_here(
 
 def test_what_was_measured_is_the_same_after_json() -> None:
     setting = MeasuredSetting("image", "independent", 4, 4.0)
-    point = point_of(setting, [Sample({"error": 0.1}, 0.5)], "error", 0.01)
+    point = point_of(setting, [({"error": 0.1}, 0.5)], "error", 0.01)
     line = MeasuredLine(setting.line, "error", [point], INDEPENDENT, "raw", point)
     reference = PrecisionReference(quantity="image", reference="raw", error=math.inf, parts=2, spp=64)
     curve = PolicyCurve("random", (1, 2), (0.5, 1.0), ((0.1, 0.2, 0.3), (0.2, 0.3, 0.4)), 3)

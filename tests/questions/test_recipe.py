@@ -19,15 +19,25 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.explanations.observations import Answered
+from advsearch.explanations import Answered
+from advsearch.questions.recipe import accuracy
 from advsearch.questions.recipe import carry_out as carrying_out
-from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult
-from advsearch.questions.recipe.description import Recipe, check_figures, planned, read_recipe, recipe_names, titles
-from advsearch.questions.recipe.figures import FIGURES, accuracy, compute, draw_figure, read_options
-from advsearch.questions.recipe.figures.given import fitting
+from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult, told_once
+from advsearch.questions.recipe.description import (
+    FIGURES,
+    Recipe,
+    check_figures,
+    compute,
+    draw_figure,
+    planned,
+    read_options,
+    read_recipe,
+    recipe_names,
+    titles,
+)
+from advsearch.questions.recipe.given import fitting
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, count_of
-from advsearch.questions.recipe.words import figure_table, told_once
 from advsearch.runs.images import write_png
 from advsearch.runs.results.attack import AnswerDistribution, FoundValue
 from advsearch.runs.results.sweep import SurfaceMap
@@ -321,6 +331,9 @@ figures: [{{figure: agreement, of: [renderings, finer]}}]
     assert "expected some in a folder for each object (mug)" in capsys.readouterr().err
     for name in ("rendering-1", "rendering-1-again", "any"):
         write_png(folder / "mug" / f"{name}.png", np.full((20, 30, 3), 0.5))
+    with pytest.raises(InputError, match=r"any\.png: the task asks where the object is"):  # before anything is rendered
+        advsearch.recipe(path, run=tmp_path / "found", photographs=folder, task="detection")
+    assert not (tmp_path / "found").exists()
     for _ in range(2):  # those that it has are not taken again
         assert main(["resume", str(run), f"photographs={folder}", "--json"]) == 0
         printed = json.loads(capsys.readouterr().out)
@@ -504,7 +517,7 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
     empty = sum(cell.lead is None for cell in cells)
     assert empty == sum(not cell.configurations for cell in cells) == 1
     assert made.text[2] == "No picture was drawn in 1 of 16 parts of the diagram, which are hatched."
-    assert draw_figure(made, Path())["png"] and figure_table(made)[1][1][0] == "m"
+    assert draw_figure(made, Path())["png"] and made.table()[1][1][0] == "m"
     same = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=-3.0) for one in answered])
     assert "No difference is shown" in same.text[1]
     unknown = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=None) for one in answered])
@@ -639,7 +652,7 @@ def test_every_figure_is_drawn_and_is_a_table(kind: str, tmp_path: Path) -> None
     table = Table(own.get(kind, EXAMPLE_ROWS), {"round": ["mug"]}, {"views-00-mug": SURFACE})
     made: Any = compute(table, *read_options(EXAMPLES[kind], "here"))[0]
     assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
-    heads, lines = figure_table(made)
+    heads, lines = made.table()
     assert lines and all(len(one) == len(heads) for one in lines)
     assert draw_figure(made, tmp_path)["png"].startswith(b"\x89PNG")
 

@@ -10,7 +10,7 @@ import pytest
 from stand_ins import Impatient, rows
 
 from advsearch.engine import surface_light
-from advsearch.questions.region import carry_out, growing
+from advsearch.questions.region import carry_out
 from advsearch.questions.region.answer import RegionResult
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.store import NAME as STORE
@@ -30,7 +30,7 @@ def coarse() -> Iterator[None]:
         patched.setattr(texels, "GROUND", 32)
         for module, name, value in (
             (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (surface_light, "CHECK_SPP", 4),
-            (surface_light, "BOUND", 50.0), (growing, "MOST_PROBED", 20), (carry_out, "pays_from", lambda *_: 1),
+            (surface_light, "BOUND", 50.0), (carry_out, "MOST_PROBED", 20), (carry_out, "pays_from", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)
         yield
@@ -58,7 +58,7 @@ def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Pa
 
 
 class Stopping(Impatient):
-    """Presses Ctrl-C after so many pictures of growing."""
+    """Presses Ctrl-C after so many pictures of carry_out."""
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
         self._searching = name == "growing the box"

@@ -15,7 +15,7 @@ from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import RetrialCondition, Retrials
+from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import FileFormatError, InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once

@@ -16,13 +16,11 @@ from advsearch.questions.harden.answer import HardenResult
 from advsearch.questions.photographs.answer import PhotoAgreement
 from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.replay.answer import ReplayResult
-from advsearch.questions.report.answer import Evidence
+from advsearch.questions.report.answer import Evidence, evidence_page, markdown
 from advsearch.questions.report.evidence import (
     RULES,
     claims_of,
     evidence_of,
-    evidence_page,
-    markdown,
     photo_claims,
     warnings_over,
 )

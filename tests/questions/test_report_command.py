@@ -17,7 +17,7 @@ from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.report.evidence import QUICK
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.images import write_png
-from advsearch.runs.made_with import NOTE, file_digests
+from advsearch.runs.summary import MADE_WITH, file_digests
 
 
 def test_runs_become_a_page_markdown_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -89,11 +89,11 @@ def test_every_file_that_was_read_is_digested(tmp_path: Path) -> None:
 def test_each_sitting_that_differs_is_noted_once(tmp_path: Path) -> None:
     config = AttackConfig(object="mug", run=str(tmp_path / "run"))
     with RunDirectory.create_for(config) as run:
-        first = run.store.noted(NOTE)
-        run.store.set_note(NOTE, json.dumps([{**first[0], "torch": "0.1"}]))
+        first = run.store.noted(MADE_WITH)
+        run.store.set_note(MADE_WITH, json.dumps([{**first[0], "torch": "0.1"}]))
     for _ in range(2):
         with RunDirectory.resume(tmp_path / "run", config) as run:
-            noted = run.store.noted(NOTE)
+            noted = run.store.noted(MADE_WITH)
     assert [one["torch"] for one in noted] == ["0.1", first[0]["torch"]]
 
 

@@ -19,7 +19,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.stability import carry_out as suite
 from advsearch.questions.stability.answer import StabilityResult
 from advsearch.questions.stability.carry_out import CASES, GROUPS, chosen, run_case
-from advsearch.questions.stability.case import (
+from advsearch.questions.stability.scene import (
     FELL_SHORT,
     OK,
     Case,
@@ -32,7 +32,7 @@ from advsearch.questions.stability.case import (
     holds,
     quadratic,
 )
-from advsearch.questions.stability.cases_noise import clipped_mean, median_of_means
+from advsearch.questions.stability.searches import clipped_mean, median_of_means
 from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.summary import read_result
@@ -123,7 +123,9 @@ def made(outcome: Outcome | Exception, name: str = "made") -> Case:
 
 
 def test_a_row_has_what_the_design_lists() -> None:
-    outcome = Outcome((Check("a", 1.0, most=2.0), Check("b", 5.0, most=2.0)), True, 0.25, "stalled", {"c": 3.0})
+    outcome = Outcome(
+        Check("a", 1.0, most=2.0), Check("b", 5.0, most=2.0), relative_error=0.25, ending="stalled", measured={"c": 3.0}
+    )
     row: Any = run_case(made(outcome)).to_dict()
     wanted = {"case": "made", "control": "pose", "finite": True, "relative_error": 0.25, "ending": "stalled"}
     assert {**row, **wanted} == row
@@ -132,7 +134,7 @@ def test_a_row_has_what_the_design_lists() -> None:
 
 
 def test_what_is_not_finite_falls_short_whatever_the_checks_say() -> None:
-    row = run_case(made(Outcome((Check("a", 1.0, most=2.0),), finite=False)))
+    row = run_case(made(Outcome(Check("a", 1.0, most=2.0), finite=False)))
     assert (row.status, row.decides) == (FELL_SHORT, "NaN or infinite values")
 
 
@@ -156,8 +158,8 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    good = made(Outcome((Check("a", 1.0, most=2.0),), relative_error=0.02, ending="found"), "good")
-    bad = replace(made(Outcome((Check("a", 3.0, most=2.0),)), "bad"), group="stiff")
+    good = made(Outcome(Check("a", 1.0, most=2.0), relative_error=0.02, ending="found"), "good")
+    bad = replace(made(Outcome(Check("a", 3.0, most=2.0)), "bad"), group="stiff")
     monkeypatch.setattr(suite, "CASES", (good, bad))
     yield
 

@@ -46,7 +46,7 @@ def test_a_share_that_rises_with_the_distance_is_pooled() -> None:
 @pytest.mark.parametrize(
     ("correct", "of", "said"),
     [
-        ([20] * 5, 20, "Seen as far as the sweep goes, 80 m, in half of the pictures; at least 80 m"),
+        ([20] * 5, 20, "Seen in at least half of the pictures up to the farthest distance, 80 m; at least 80 m"),
         ([0] * 5, 20, "Not seen in half of the pictures, even from 5 m; at most 5 m"),
         (
             [1, 1, 1, 0, 0],

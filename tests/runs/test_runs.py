@@ -30,11 +30,10 @@ from samples import attack, exr, rated, sweep
 from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.files import open_regular
-from advsearch.runs import directory, images, made_with
-from advsearch.runs.database import MIGRATIONS
+from advsearch.runs import directory, images, summary
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
 from advsearch.runs.export import FORMATS, write_rows
-from advsearch.runs.files import PART, RunLock, replacing, write_bytes, write_text
+from advsearch.runs.files import MIGRATIONS, PART, RunLock, replacing, write_bytes, write_text
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results.base import Result, plain
 from advsearch.runs.store import Row, Store
@@ -467,10 +466,10 @@ def test_files_of_one_in_several_are_repeated_elsewhere(home: Path) -> None:
 def test_a_recipe_that_a_run_has_kept_may_be_another_one(home: Path) -> None:
     recipe = Path("own.yaml")
     recipe.write_text("one")
-    noted = made_with.made_with({"recipe": "own.yaml"})
+    noted = summary.made_with({"recipe": "own.yaml"})
     recipe.write_text("another")
-    assert made_with.changed_file([noted], {"recipe": "own.yaml"}) is None
-    assert made_with.changed_file([noted], {"camera": "own.yaml"}) == "own.yaml"
+    assert summary.changed_file([noted], {"recipe": "own.yaml"}) is None
+    assert summary.changed_file([noted], {"camera": "own.yaml"}) == "own.yaml"
 
 
 # ---- whole or not at all ----

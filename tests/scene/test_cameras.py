@@ -19,12 +19,12 @@ import advsearch
 from advsearch.engine.loading import Scene, framed
 from advsearch.engine.rendering import sight_of
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene.cameras.files import read_camera
-from advsearch.scene.cameras.model import NUMBERS, CameraModel, bundled, pinhole
+from advsearch.scene.camera_files import read_camera
+from advsearch.scene.camera_model import NUMBERS, CameraModel, bundled, pinhole
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.renderer import LinearRenderer
+from advsearch.scene.transport.matrix import LinearRenderer
 from advsearch.tasks import Depth, Facts
 
 HERE = Path(__file__).parent

@@ -15,10 +15,10 @@ from trimesh.visual.material import PBRMaterial
 import advsearch
 from advsearch.controls import make_control, make_space
 from advsearch.scene.description import OBJECT
-from advsearch.scene.exporting.gltf import glb, posed
+from advsearch.scene.glb import glb, posed
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.mitsuba_backend.files.writing import write_scene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.writing import write_scene
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

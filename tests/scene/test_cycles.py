@@ -18,9 +18,9 @@ import torch
 import trimesh
 
 import advsearch
+from advsearch.scene import cycles
+from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.exporting import cycles
-from advsearch.scene.exporting.cycles import BlenderError, Cycles
 from advsearch.scene.importing.blender import PROGRAM
 from advsearch.scene.parts import HazePart
 from advsearch.scene.renderer import Renderer

@@ -22,17 +22,17 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription, describe
-from advsearch.scene.exporting.gltf import glb, posed
 from advsearch.scene.exposure import irradiance
+from advsearch.scene.formation import EVERYTHING
+from advsearch.scene.glb import glb, posed
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.leaving_out import EVERYTHING
-from advsearch.scene.mitsuba_backend.files.writing import write_scene
 from advsearch.scene.mitsuba_backend.meshes import sampling_weights
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.parts import PointLamp
 from advsearch.scene.transport.lights import BasisRenderer
-from advsearch.scene.transport.renderer import LinearRenderer
+from advsearch.scene.transport.matrix import LinearRenderer
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

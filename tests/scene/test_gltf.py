@@ -19,10 +19,10 @@ import advsearch
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import EnvironmentAsset, Material
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.gltf_surfaces import EDGES
-from advsearch.scene.importing.images import display_image
-from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.gltf_parts import EDGES
 from advsearch.scene.importing.objects import import_object, read_parts
+from advsearch.scene.importing.parts import ImportedPart
+from advsearch.scene.importing.pictures import display_image
 from advsearch.scene.importing.texture import filtered, sampled
 
 REPEAT, MIRRORED, CLAMPED, NEAREST, LINEAR = 10497, 33648, 33071, 9728, 9729

@@ -22,12 +22,12 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene import library
+from advsearch.scene import library, surface_parts
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing import objects, unwrap
-from advsearch.scene.importing.images import area_average, display_image
+from advsearch.scene.importing import objects
 from advsearch.scene.importing.objects import guess_up, import_object
+from advsearch.scene.importing.pictures import area_average, display_image
 from advsearch.scene.importing.texture import filtered, sampled
 
 DATA = conftest.DATA / "objects"
@@ -475,7 +475,7 @@ def test_unwrap_of_a_curved_object_does_not_overlap(
 ) -> None:
     if piece < 1500:  # it is taken for a large mesh, which is unwrapped in pieces
         for name, value in {"_PIECE": piece, "_MANY": 1, "_LARGE": 1}.items():
-            monkeypatch.setattr(unwrap, name, value)
+            monkeypatch.setattr(surface_parts, name, value)
     torus = trimesh.creation.torus(1.0, 0.4, major_sections=24, minor_sections=12)
     asset = import_object(exported(tmp_path, "ring.stl", torus))
     check_sound(asset)
@@ -1018,7 +1018,7 @@ def test_textures_have_a_limit_in_all(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_large_pictures_are_averaged_in_bands_to_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
     image = Image.fromarray(np.random.default_rng(0).integers(0, 256, (1100, 1300, 3), np.uint8))
     whole = display_image(image, 100)
-    monkeypatch.setattr("advsearch.scene.importing.images._BAND", 50_000)
+    monkeypatch.setattr("advsearch.scene.importing.pictures._BAND", 50_000)
     assert np.array_equal(display_image(image, 100), whole)
 
 
@@ -1048,10 +1048,10 @@ def test_faces_of_vertices_that_are_not_there(tmp_path: Path, index: str) -> Non
 
 
 def test_a_heap_of_faces_is_laid_out_in_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.scene.importing.unwrap._MOST_PATCHES", 8)
+    monkeypatch.setattr("advsearch.scene.surface_parts._MOST_PATCHES", 8)
     corners = np.random.default_rng(0).random((33, 3, 3))
     heap = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(99).reshape(-1, 3), process=False)
-    monkeypatch.setattr("advsearch.scene.importing.unwrap._MANY", 8)
+    monkeypatch.setattr("advsearch.scene.surface_parts._MANY", 8)
     asset = import_object(exported(tmp_path, "heap.stl", heap))
     check_sound(asset)
     assert overlap(asset.mesh) == 0 and len(asset.mesh.faces) == 33
@@ -1105,6 +1105,12 @@ GLTF_CHANGES: dict[str, tuple[list[Any], Any, str]] = {
     "null meshes": (["meshes"], None, r"glTF whose meshes is a valid list, got 'null'"),
     "integer as list": (["scene"], [0], r"glTF whose scene is a valid integer, got '\[0\]'"),
     "text as integer": (["accessors", 0, "count"], "8", r"glTF whose accessors\[0\]\.count is a valid integer"),
+    "extensions as text": (["nodes", 0, "extensions"], "all", r"glTF whose extensions are objects, got '\"all\"'"),
+    "extension as number": (
+        ["extensions"],
+        {"KHR_lights_punctual": 2},
+        r"glTF whose extensions are objects, got",
+    ),
     "negative index": (
         ["meshes", 0, "primitives", 0, "indices"],
         -1,

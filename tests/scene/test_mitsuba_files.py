@@ -14,10 +14,10 @@ import torch
 
 import advsearch
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.scene.mitsuba_backend.files.haze import haze_in
-from advsearch.scene.mitsuba_backend.files.scene import contents, import_plugins
-from advsearch.scene.mitsuba_backend.files.xml import read_scene
+from advsearch.scene.mitsuba_backend.scene_files import contents, import_plugins
+from advsearch.scene.mitsuba_backend.shapes import haze_in
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.xml_files import read_scene
 from advsearch.scene.parts import PluginPart
 
 pytestmark = pytest.mark.usefixtures("two_threads")

@@ -17,11 +17,11 @@ import advsearch
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.mitsuba_backend.files.scene import import_plugins
-from advsearch.scene.mitsuba_backend.files.writing import write_scene
 from advsearch.scene.mitsuba_backend.meshes import base_texture, repeating
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.scene_files import import_plugins
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.writing import write_scene
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

@@ -12,10 +12,10 @@ import OpenEXR
 import pytest
 
 import advsearch
-from advsearch.scene.mitsuba_backend.files.writing import write_xml
-from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.writing import write_xml
+from advsearch.scene.mitsuba_backend.xml_files import read_scene
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -46,7 +46,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from advsearch import threads
-from advsearch.scene.mitsuba_backend.files.writing import write_xml
+from advsearch.scene.mitsuba_backend.writing import write_xml
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 threads.configure(1)
 values = np.linspace(0, 2, 8 * 16 * 4, dtype=np.float32).reshape(8, 16, 4)

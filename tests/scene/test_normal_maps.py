@@ -21,12 +21,12 @@ import advsearch
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import OBJECT, SceneDescription, describe
-from advsearch.scene.exporting.gltf import glb, posed
-from advsearch.scene.importing.normal_maps import FLAT, holds_normals, normal_map
+from advsearch.scene.glb import glb, posed
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.mitsuba_backend.files.writing import write_scene
+from advsearch.scene.importing.parts import FLAT, holds_normals, normal_map
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.parts import PointLamp
 
 pytestmark = pytest.mark.usefixtures("two_threads")

@@ -15,8 +15,8 @@ from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import describe
+from advsearch.scene.grounds import Photograph, irradiance
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.photograph import Photograph, irradiance
 from advsearch.scene.settings import resolve
 
 SIZE = 32

@@ -15,8 +15,8 @@ from PIL import Image
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.objects import import_object, read_parts
+from advsearch.scene.importing.parts import ImportedPart
 
 XYZ = ("float x", "float y", "float z")
 FACES = ("list uchar int vertex_indices",)

@@ -15,8 +15,7 @@ from advsearch.engine.loading import load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import describe
-from advsearch.scene.formation import ImageFormation, to_8_bit
-from advsearch.scene.leaving_out import EVERYTHING
+from advsearch.scene.formation import EVERYTHING, ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.scene import BASE_COLOR, MitsubaScene
 from advsearch.scene.renderer import Renderer
 

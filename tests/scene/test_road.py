@@ -13,8 +13,8 @@ from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.road import ROAD, paved, reflectance
-from advsearch.scene.surface_map import texels_of_faces
+from advsearch.scene.grounds import ROAD, paved, reflectance
+from advsearch.scene.raster import texels_of_faces
 
 SIZE = 16
 

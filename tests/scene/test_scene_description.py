@@ -7,8 +7,7 @@ import pytest
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import FRAME_FILL, SceneDescription, describe
-from advsearch.scene.framing import middle
-from advsearch.scene.geometry import camera_to_world, object_to_world, rotation
+from advsearch.scene.geometry import camera_to_world, middle, object_to_world, rotation
 from advsearch.scene.settings import SETTINGS, resolve
 
 

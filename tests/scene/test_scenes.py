@@ -21,10 +21,10 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.scenes import LUMENS, split_node
-from advsearch.scene.mitsuba_backend.files.writing import write_scene
-from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.writing import write_scene
+from advsearch.scene.mitsuba_backend.xml_files import read_scene
 from advsearch.scene.parts import PointLamp, SpotLamp
 
 ROUND = {"roughnessFactor": 0.8, "metallicFactor": 0.0}

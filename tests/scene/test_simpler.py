@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Mesh, simpler
 from advsearch.scene.library import load_object
-from advsearch.scene.simpler import simpler
 
 
 def ball(rows: int = 90, columns: int = 180) -> Mesh:

@@ -22,7 +22,7 @@ from advsearch.runs.summary import attack_of
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
-from advsearch.scene.transport import renderer as linear
+from advsearch.scene.transport import matrix as linear
 from advsearch.scene.transport.matrix import COARSE, TextureTransport
 
 SIZE = 64

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.mtl import map_of
 from advsearch.scene.importing.objects import import_object, read_parts
+from advsearch.scene.importing.parts import ImportedPart
 
 POINTS = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 MAPPED = POINTS + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"

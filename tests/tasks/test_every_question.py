@@ -17,7 +17,7 @@ from torch import nn
 import advsearch
 from advsearch.cli.main import main
 from advsearch.questions.photographs.carry_out import Photographs
-from advsearch.questions.photographs.files import rendering_file
+from advsearch.questions.photographs.serving import rendering_file
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection

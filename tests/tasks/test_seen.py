@@ -20,9 +20,8 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks import Query
 from advsearch.cli.main import main
-from advsearch.engine.journal import Journal
-from advsearch.engine.rows import judgement_of, trial_row
-from advsearch.engine.sharing import Shared
+from advsearch.engine.journal import Journal, Shared
+from advsearch.engine.record import judgement_of, trial_row
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.runs.directory import RunDirectory

@@ -15,12 +15,13 @@ from small_models import SIDE
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.attacks.objectives import NEARBY, check_objective, get_objective
+from advsearch.attacks.objective_functions import NEARBY
+from advsearch.attacks.objectives import check_objective, get_objective
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning
 from advsearch.runs.images import read_png, to_8bit
-from advsearch.runs.made_with import file_digests
+from advsearch.runs.summary import file_digests
 from advsearch.tasks import Facts, Similarity, make_task
 from advsearch.tasks.similarity import ELSE, ITSELF, TEMPERATURE
 

@@ -26,8 +26,14 @@ from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
-from advsearch.questions.photographs.files import LARGEST, photo_file, rendering_file, rendering_names, sound_photo
-from advsearch.questions.photographs.serving import align_page
+from advsearch.questions.photographs.serving import (
+    LARGEST,
+    align_page,
+    photo_file,
+    rendering_file,
+    rendering_names,
+    sound_photo,
+)
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.viewer.server import Dashboard, https_context, reachable

@@ -8,30 +8,21 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any
 
-from advsearch.attacks.policies.adam import Adam
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
-from advsearch.attacks.policies.pgd import PGD
+from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry
-
-
-def _is_policy(name: str, entry: Any) -> bool:
-    if not isinstance(entry, type) or not is_dataclass(entry):
-        return False
-    return issubclass(entry, Policy) and entry.name == name
-
 
 INSIDE = ("choices", "stay")
 """Policies that only the search asks for."""
 
 
 def _own() -> dict[str, type[Policy[Any]]]:
-    """Return the policies of this folder's modules by their names, sorted."""
     modules = [import_module(f"{__name__}.{one.name}") for one in iter_modules(__path__)]
     classes = [entry for module in modules for entry in vars(module).values() if isinstance(entry, type)]
     found = {entry.name: entry for entry in classes if issubclass(entry, Policy) and "name" in vars(entry)}
@@ -42,7 +33,9 @@ POLICIES: Registry[type[Policy[Any]]] = Registry(
     "advsearch.policies",
     _own(),
     "a dataclass over Policy whose name is that of the entry point",
-    _is_policy,
+    lambda name, entry: (
+        isinstance(entry, type) and is_dataclass(entry) and issubclass(entry, Policy) and entry.name == name
+    ),
 )
 """Every policy by its word on the command line."""
 
@@ -77,7 +70,6 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
 
 
 def _nested(spec: Spec, where: str) -> Policy[Any]:
-    """Return the policy that a wrapper is given."""
     if isinstance(spec, Policy):
         return spec
     if isinstance(spec, str):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Failures, FoundFailure, most_different
 from advsearch.attacks.domain import Domain, half_widths, wraps
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.surrogate import MOST_OWN, Coordinates, Observed, Surrogate, box_coordinates
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
@@ -62,7 +62,6 @@ class ArchiveState:
         spanned: (k,) positions in u of the parameters that span the archive.
         half: (d,) half of each number's range.
         archive: that of ribs; never written to again.
-        generation: how many generations were drawn.
         points: (n, d) float32, this generation's configurations.
         values: objectives of the first of them.
         wrong: whether each of these was a success.

@@ -1,8 +1,5 @@
-"""The policy to use first, and what wraps others: several policies on one budget, or several starts of one.
-
-`auto` looks everywhere, then where a model of what it has seen promises most, then uphill. Of several policies, what
-does better gets more of the budget.
-"""
+"""The policy to use first (it looks everywhere, then where a model of what it has seen promises most, then uphill), and
+what wraps others: several policies on one budget, or several starts of one."""
 
 from __future__ import annotations
 
@@ -14,13 +11,13 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import WhichGradient
-from advsearch.attacks.policies.base import (
+from advsearch.attacks.evaluation import (
     NO_COUNTS,
     Counts,
     Evaluated,
     Policy,
     Proposal,
+    WhichGradient,
     draw_seed,
     one_thread,
     seeded,
@@ -62,14 +59,8 @@ NEAR, FAR, CENTRES = 256, 128, 4
 
 @dataclass(frozen=True)
 class Plan:
-    """What the renders are for.
-
-    Attributes:
-        steps: renders in all.
-        screen: renders of the screen.
-        until: renders after which the ascent begins; `steps` if there is none.
-        gradient: what the ascent asks for.
-    """
+    """What the renders are for: the screen; the ascent, which asks for `gradient`, begins after `until`, or never at
+    `steps`."""
 
     steps: int
     screen: int
@@ -92,7 +83,6 @@ class AutoState:
     Attributes:
         seen: where the box coordinates, which are screened, have been, the norm balls at their start.
         screen: (m, k) where the screen looks after the start.
-        spent: renders so far.
         ascent: of PGD, once it has begun.
         climbing: whether the latest proposal was the ascent's.
         last: the objective of the ascent's latest evaluation.
@@ -112,7 +102,6 @@ class AutoState:
 
     @property
     def box(self) -> Coordinates:
-        """The coordinates that are screened."""
         return self.seen.space
 
 
@@ -238,7 +227,6 @@ def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
 
 
 def _pgd(domain: Domain) -> PGD:
-    """What climbs in a domain."""
     if domain.drawn:
         return PGD(momentum=MOMENTUM_DRAWN)
     return PGD(momentum=MOMENTUM) if domain.exact else PGD()

@@ -1,16 +1,7 @@
-"""Discrete choices around a policy that knows only numbers: options outside, the continuous search inside.
-
-Searches race by successive halving: after each round the better half goes on. Rounds get equal shares of the renders,
-and within a round every search that is still in gets an equal share. They take turns, step by step: next comes whoever
-has most of its share left, so that steps of different searches, which do not wait for each other, can be evaluated
-together. After a round the half that has reached more goes on. With n searches there are 1 + ceil(log2 n) rounds, the
-last for one alone, so it gets many times the renders of those that fell first (Karnin, Koren and Somekh 2013, "Almost
-optimal exploration in multi-armed bandits"; Jamieson and Talwalkar 2016). With one round for all, each gets the same.
-What is left of the renders after the last round is for the best.
-
-A share counts what a proposal may cost, so that the order does not depend on how many are evaluated at once; where one
-costs less, the rounds to come get what is left.
-"""
+"""Discrete choices around a policy that knows only numbers: options outside, the continuous search inside. Searches
+race by successive halving (Karnin, Koren and Somekh 2013, "Almost optimal exploration in multi-armed bandits"; Jamieson
+and Talwalkar 2016): 1 + ceil(log2 n) rounds with equal shares of the renders, and within a round equal shares for all
+that are still in, who take turns, whoever has most left first. A share counts what a proposal may cost."""
 
 from __future__ import annotations
 
@@ -26,8 +17,7 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import (
+from advsearch.attacks.evaluation import (
     NO_COUNTS,
     Counts,
     Evaluated,
@@ -41,15 +31,8 @@ from advsearch.attacks.policies.base import (
 
 @dataclass(frozen=True, eq=False)
 class Runner:
-    """One search in a race.
-
-    Attributes:
-        policy, domain: what searches where.
-        state: the policy's.
-        left: renders left of its share of this round.
-        best: the largest objective it has met.
-        over: whether it has nothing more to propose.
-    """
+    """One search in a race: a policy and its state, renders left of its share of this round, the largest objective it
+    has met, and whether it has nothing more to propose (`over`)."""
 
     policy: Policy[Any]
     domain: Domain
@@ -61,17 +44,8 @@ class Runner:
 
 @dataclass(frozen=True, eq=False)
 class Race:
-    """Where a race stands.
-
-    Attributes:
-        runners: all searches.
-        steps: renders in all.
-        rounds: how many there are.
-        field: numbers of those that are in this round, the best first.
-        round: number of this one, from 0.
-        spent: renders that the evaluations so far took.
-        asked: numbers of the searches whose proposals wait for their evaluations, one for each.
-    """
+    """Where a race of so many steps and rounds stands: the numbers of those that are in this round, the best first
+    (`field`), renders that the evaluations so far took, and the searches whose proposals wait for theirs (`asked`)."""
 
     runners: tuple[Runner, ...]
     steps: int
@@ -181,7 +155,6 @@ class Raced(Policy[Race]):
 
 
 def _begin(race: Race, field: Iterable[int], number: int) -> Race:
-    """Begin a round of what is left of the renders, with equal shares for those that are in."""
     field = tuple(field)
     share = max(1, (race.steps - race.spent) // (race.rounds - number) // len(field))
     runners = [replace(runner, left=0) for runner in race.runners]
@@ -191,7 +164,6 @@ def _begin(race: Race, field: Iterable[int], number: int) -> Race:
 
 
 def _next_round(race: Race) -> Race:
-    """Begin the next round with the best of this one."""
     runners = race.runners
     ranked = sorted(race.field, key=lambda k: runners[k].best, reverse=True)
     able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
@@ -275,15 +247,8 @@ MOST_NUMBERS = 2**24
 
 @dataclass(frozen=True, eq=False)
 class ChoicesState:
-    """Where the search stands.
-
-    Attributes:
-        domain: the whole one.
-        numbers: (k,) positions in u of what is no choice.
-        choices: (c,) positions in u of the choices.
-        combinations: (n, c) the choices' elements of u, one row for each search in the race.
-        race: between the combinations, over the numbers alone.
-    """
+    """Where the search stands: positions in u of numbers (k,) and choices (c,), the choices' elements (n, c) of each
+    search in the race, which goes over the numbers alone."""
 
     domain: Domain
     numbers: Tensor
@@ -340,7 +305,10 @@ class Choices(Policy[ChoicesState]):
         return tuple(replace(proposal, u=_whole(state, proposal.u, number)) for proposal, number in asked), state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
-        inner = [(u[state.numbers], _part(evaluation, state.numbers)) for u, evaluation in evaluated]
+        inner, numbers = [], state.numbers
+        for u, one in evaluated:
+            gradient = None if one.gradient is None else one.gradient[numbers]
+            inner.append((u[numbers], replace(one, gradient=gradient)))
         return replace(state, race=update(state.race, inner))
 
     def counts(self, state: ChoicesState) -> Counts:
@@ -374,14 +342,7 @@ def _without(domain: Domain, numbers: Tensor) -> Domain | None:
     return replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
 
 
-def _part(evaluation: Evaluation, numbers: Tensor) -> Evaluation:
-    """Return the evaluation with the gradient of the numbers alone."""
-    gradient = evaluation.gradient
-    return evaluation if gradient is None else replace(evaluation, gradient=gradient[numbers])
-
-
 def _whole(state: ChoicesState, numbers: Tensor, combination: int) -> Tensor:
-    """Return the configuration with these numbers and that combination."""
     u = state.domain.begin.clone()
     u[state.numbers] = numbers[: len(state.numbers)]
     u[state.choices] = state.combinations[combination]

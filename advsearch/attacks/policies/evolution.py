@@ -1,8 +1,5 @@
-"""Evolution strategies, without gradients: one of independent elements, and covariance matrix adaptation.
-
-A natural evolution strategy follows the gradient of the expected objective; covariance matrix adaptation learns where
-to look from ranks alone.
-"""
+"""Evolution strategies, without gradients: a natural one of independent elements, which follows the gradient of the
+expected objective, and covariance matrix adaptation, which learns where to look from ranks alone."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Distribution, Domain, half_widths, wraps
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
@@ -139,7 +136,6 @@ def utilities(values: Sequence[float]) -> list[float]:
 
 
 def _learn(state: NESState) -> NESState:
-    """Move the distribution after a whole generation."""
     weights = utilities(state.values)
     d = state.domain.dim
     towards, wider = torch.zeros(d), torch.zeros(d)
@@ -177,7 +173,6 @@ class CMAESState:
         scale: (d,) length of the unit of pycma's coordinates: u = P(origin + scale * x).
         wraps: (d,) where leaving the bounds costs nothing.
         strategy: pycma's, as it is after the latest `ask`; never written to again.
-        generation: how many generations were asked for.
         points: (n, d) this generation's coordinates x.
         values: objectives of the first of them.
         outside: for each of these its squared distance from the domain, a mean over elements, in x.
@@ -304,12 +299,10 @@ def _anew(state: CMAESState, sigma: float) -> CMAESState:
 
 
 def _deviations(state: CMAESState) -> Doubles:
-    """Return (d,) standard deviations in x."""
     return np.asarray(state.strategy.stds, dtype=np.float64)
 
 
 def _distribution(state: CMAESState) -> Distribution:
-    """Return the distribution of this run as it stands."""
     deviation = torch.from_numpy(_deviations(state)).float() * state.scale
     return Distribution(_projected(state, np.asarray(state.strategy.mean))[0], deviation)
 

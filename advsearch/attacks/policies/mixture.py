@@ -11,7 +11,7 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Failures, FoundFailure, failure_share, most_different
 from advsearch.attacks.domain import Domain, centre_of_option, wraps
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.errors import InputError
 
 MOST = 50
@@ -40,12 +40,8 @@ than so much of the probability."""
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """The d elements of u in shares of their ranges.
-
-    Attributes:
-        counts: (d,) options of each choice, 0 of a number.
-        around: (d,) bool: angles.
-    """
+    """The d elements of u in shares of their ranges: options (d,) of each choice, 0 of a number, and which (d,) are
+    angles."""
 
     counts: Tensor
     around: Tensor
@@ -63,13 +59,8 @@ class Ranges:
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """A mixture of products: normal distributions cut to their ranges, and probabilities of options.
-
-    Attributes:
-        weights: (k,), sum 1.
-        means, deviations: (k, d) in shares of each range.
-        options: (k, d, most options) probabilities.
-    """
+    """A mixture of k products: normal distributions (k, d) cut to their ranges, in shares of these, and probabilities
+    of options (k, d, most options); the weights (k,) have the sum 1."""
 
     weights: Tensor
     means: Tensor
@@ -89,7 +80,6 @@ class Components:
         return self.weights.log() + each.sum(dim=2)
 
     def draw(self, generator: torch.Generator, ranges: Ranges) -> Tensor:
-        """Return one draw (d,)."""
         k = int(torch.multinomial(self.weights, 1, generator=generator))
         mean, deviation = self.means[k], self.deviations[k]
         low, high = (torch.special.ndtr(end / deviation) for end in ranges.ends(mean))
@@ -105,7 +95,6 @@ class MixtureState:
     """Where the search stands.
 
     Attributes:
-        generation: number of this one.
         learnt: the mixtures of the generations in the window, this one's last; None of an even one.
         points: (n, d) this generation's draws in shares of each range.
         seen: (m, d) the draws that were evaluated, the latest `WINDOW` of them.
@@ -283,7 +272,6 @@ def _maximised(mixture: Components, x: Tensor, weights: Tensor, ranges: Ranges, 
 
 
 def _configuration(state: MixtureState, x: Tensor) -> Tensor:
-    """Return the configuration (d,) float32 at shares x of the ranges."""
     domain = state.domain
     return domain.project((domain.lower + x * (domain.upper - domain.lower)).float())
 

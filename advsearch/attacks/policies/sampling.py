@@ -1,9 +1,5 @@
-"""Policies that look without learning: random search, quasi-random search, and a regular grid.
-
-Random search is the baseline that every worst-case claim is measured against (docs/design.md, "The search").
-Quasi-random points fill the domain more evenly than independent ones. A grid is a full factorial over a few numbers,
-as fine as the renders allow.
-"""
+"""Policies that look without learning: random search, the baseline of every worst-case claim; quasi-random points,
+which fill the domain more evenly; and a grid, as fine as the renders allow."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Block, Domain, centre_of_option
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
 
@@ -62,13 +58,7 @@ CHUNK = 2**20
 
 @dataclass(frozen=True, eq=False)
 class SobolState:
-    """Where the sequence stands.
-
-    Attributes:
-        points: (n, k) of the unit cube, n a power of two; drawn from number `begin` of the sequence on.
-        begin: number of the first of them.
-        done: points proposed so far.
-    """
+    """Where the sequence stands: its points (n, k) from number `begin` on, n a power of two, and how many are done."""
 
     domain: Domain
     seed: int
@@ -121,13 +111,8 @@ class Sobol(Policy[SobolState]):
 
 
 def draw(size: int, seed: int, begin: int, count: int) -> Tensor:
-    """Return `count` points of the scrambled sequence of that seed from number `begin` on: (count, size) float32.
-
-    Args:
-        size: dimensions, at most `MOST`.
-        seed: of the scrambling.
-        begin, count: which points; the first call takes a power of two, which is what keeps the points balanced.
-    """
+    """Return `count` points of the scrambled sequence of that seed from number `begin` on: (count, size) float32. The
+    first call takes a power of two, which is what keeps the points balanced."""
     from scipy.stats import qmc  # takes most of a second, and few runs need it
 
     engine = qmc.Sobol(size, scramble=True, seed=seed)
@@ -153,13 +138,8 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class GridState:
-    """Where a grid stands.
-
-    Attributes:
-        axes: for each number the (m_i,) values that its element of u takes.
-        order: (n,) numbers of the grid's points, coarse ones first.
-        done: how many of them were proposed.
-    """
+    """Where a grid stands: the (m_i,) values of each element of u, the numbers (n,) of the points, coarse ones first,
+    and how many are done."""
 
     domain: Domain
     axes: tuple[Tensor, ...]
@@ -214,7 +194,6 @@ class Grid(Policy[GridState]):
 
 
 def _point(state: GridState, number: int) -> Tensor:
-    """Return the configuration (d,) of a point of the grid."""
     values = []
     for axis in reversed(state.axes):
         number, place = divmod(number, len(axis))

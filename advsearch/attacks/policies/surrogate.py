@@ -1,10 +1,6 @@
-"""A Gaussian process over a few coordinates: what a handful of noisy renders say about the rest of the box.
-
-Matérn-5/2 kernel, one length for each coordinate, and a noise that stands for the renderer's and for all roughness
-finer than the points tell apart. Everything is fitted by maximum likelihood over fixed grids and every proposal is one
-of a finite set of candidates, so that the last bits of a matrix factorisation do not change an answer. The coordinates
-are the box blocks of a domain as one small unit box: poses, cameras, lights, choices; everything but the norm balls.
-"""
+"""A Gaussian process (Matérn-5/2, a length for each coordinate, noise) over the box blocks of a domain as one unit box.
+All is fitted by maximum likelihood over fixed grids, and every proposal is one of finitely many, so that last bits of a
+factorisation do not change an answer."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain, centre_of_option
-from advsearch.attacks.policies.base import Evaluated, seeded
+from advsearch.attacks.evaluation import Evaluated, seeded
 
 MOST_SOBOL = 1000
 """More coordinates than this are screened with independent points; Sobol's advantage is long gone."""
@@ -32,14 +28,8 @@ NEAREST, FARTHEST = 0.01, 0.3
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Which elements of u these are, and what a point x in [0, 1]^k means: u[where] = low + width * x.
-
-    Attributes:
-        where: (k,) positions in u.
-        low, width: (k,) of the bounds.
-        periodic: (k,) whether 0 and 1 are the same place.
-        options: (k,) the number of options of a discrete choice, or 0.
-    """
+    """Which elements of u these are (k,), and what a point x in [0, 1]^k means: u[where] = low + width * x. At the ends
+    of `periodic` ones is the same place; a discrete choice has `options`, others 0."""
 
     where: Tensor
     low: Tensor
@@ -49,7 +39,6 @@ class Coordinates:
 
     @property
     def count(self) -> int:
-        """Number of coordinates."""
         return len(self.where)
 
     def take(self, u: Tensor) -> Tensor:
@@ -190,7 +179,6 @@ class Observed:
     """What was evaluated, and the process behind it.
 
     Attributes:
-        space: of the points.
         points: (n, k) in the unit box.
         values: the n objectives there; what could not be evaluated is not finite.
         scales: of the process, fitted to the first `fitted` points.
@@ -206,11 +194,9 @@ class Observed:
 
     @property
     def finite(self) -> bool:
-        """Whether anything could be evaluated."""
         return any(math.isfinite(value) for value in self.values)
 
     def extended(self, evaluated: Evaluated) -> Observed:
-        """Return it with further configurations and what came of them."""
         points = torch.cat([self.points, *(self.space.take(u)[None] for u, _ in evaluated)])
         return replace(self, points=points, values=(*self.values, *(one.objective for _, one in evaluated)))
 

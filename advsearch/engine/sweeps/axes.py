@@ -30,14 +30,7 @@ _OUTER = {"object": "`object` mug,bowl", "environment": "`environment` studio,no
 
 @dataclass(frozen=True)
 class Axis:
-    """One parameter and its values.
-
-    Attributes:
-        control: the kind of the control.
-        instance: the name of its instance; the kind unless said otherwise.
-        parameter: what it declares.
-        values: at least one, all different.
-    """
+    """One parameter and its values. The instance has the name of its kind unless said otherwise."""
 
     control: str
     instance: str
@@ -51,12 +44,10 @@ class Axis:
 
     @property
     def is_time(self) -> bool:
-        """Whether its values are the frames of a drive."""
         return (self.control, self.parameter.name) == ("path", "time")
 
     @property
     def unit(self) -> str:
-        """Unit of the values."""
         return "name" if self.parameter.options else self.parameter.unit
 
 
@@ -64,16 +55,8 @@ class Axis:
 
 
 def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[Axis, ...]:
-    """Return the axes of a grid.
-
-    Args:
-        grid: name to values: ``"FIRST:LAST:COUNT"``, or a list. A name is KIND.PARAMETER, INSTANCE.PARAMETER of one of
-            `controls`, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
-        controls: what is drawn by chance.
-
-    Raises:
-        UnknownNameError: no such control or parameter.
-        InputError: values that cannot be an axis, two axes for one parameter, or one that is drawn as well.
+    """Return the axes of a grid beside the controls that are drawn by chance: name to values, ``"FIRST:LAST:COUNT"`` or
+    a list. A name is KIND.PARAMETER, INSTANCE.PARAMETER of one of `controls`, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
     """
     instances = {control.name: control for control in controls}
     found: dict[str, Axis] = {}
@@ -92,7 +75,6 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
 
 
 def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
-    """Find the parameter of one axis and read its values."""
     head, dot, rest = name.partition(".")
     parameter_name, colon, late = rest.partition(":")
     kind, early_colon, early = head.partition(":")
@@ -139,11 +121,7 @@ def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, .
 
     Args:
         where: what errors name: ``"`grid` pose.yaw"``.
-        parameter: says what is allowed.
         given: the text, a value, or a list of values.
-
-    Raises:
-        InputError: no such form, a value outside the parameter's range, or one that comes twice.
     """
     values: Sequence[Any]
     if isinstance(given, str) and ":" in given and not parameter.options:
@@ -162,7 +140,6 @@ def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, .
 
 
 def _spaced(where: str, parameter: Parameter, text: str) -> list[float]:
-    """Read FIRST:LAST:COUNT."""
     expected = f"{where}: expected FIRST:LAST:COUNT such as 0:360:24, or values separated by commas, got {text!r}"
     parts = text.split(":")
     if len(parts) != 3:

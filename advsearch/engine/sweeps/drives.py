@@ -1,8 +1,6 @@
-"""Drives: what a sweep over the frames of a path says of whole drives, and the pictures of the worst of them.
-
-A drive is everything that varies but the time: one point of the rest of the grid, one draw. Frames of a drive are not
-independent, so intervals are over drives (a bootstrap of their mean, Efron and Tibshirani 1993, section 13.3).
-"""
+"""Drives: what a sweep over the frames of a path says of whole drives, everything that varies but the time, and the
+worst of them. Frames are not independent, so intervals are over drives (a bootstrap, Efron and Tibshirani 1993, section
+13.3)."""
 
 from __future__ import annotations
 
@@ -15,10 +13,10 @@ from advsearch import seeds
 from advsearch.config import SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.path import PathControl
-from advsearch.engine import run_settings
-from advsearch.engine.driving import evenly, write_drive
+from advsearch.engine.attack_result import evenly, write_drive
+from advsearch.engine.naming import given_to
+from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.axes import Axis
-from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.report.marks import marked
 from advsearch.runs.directory import RunDirectory
@@ -40,7 +38,7 @@ def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[
     """Return the controls with what travels along the path of the configuration, and the grid with its frames last."""
     travelling = next((one for one in drawn if isinstance(one, PathControl)), None)
     if travelling is None:
-        (added,) = run_settings.given_to(config, {PathControl.kind: {}})
+        (added,) = given_to(config, {PathControl.kind: {}})
         assert isinstance(added, PathControl)
         drawn, travelling = (*drawn, added), added
     name, seconds = f"{travelling.name}.time", travelling.seconds
@@ -54,12 +52,7 @@ def time_axis(axes: Sequence[Axis]) -> int | None:
 
 
 class Drives:
-    """The frames of every drive of a sweep.
-
-    Args:
-        job: what was swept.
-        rows: all that are stored.
-    """
+    """The frames of every drive of a sweep."""
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
         place = time_axis(job.axes)

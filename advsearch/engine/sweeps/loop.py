@@ -1,11 +1,7 @@
-"""The loop of a sweep: ask about every configuration, store and count what is answered, sum it up.
-
-Configurations are numbered: scenes (object, environment; beside an answer first all without it), then the grid with its
-last axis fastest, then the draws of a point of the grid, then the models. Models are shown the same pictures, so that
-they can be compared, and one is rendered once. A batch begins at a multiple of its size and is stored in one
-transaction, each row in the place of its number, so that a sweep that was stopped, or whose batches come in another
-order, ends bit for bit as one that was not.
-"""
+"""The loop of a sweep: ask about every configuration, store and count what is answered, sum it up. They are numbered:
+scenes (beside an answer first all without it), then the grid with its last axis fastest, then draws, then models; a
+batch begins at a multiple of its size, so that a sweep that was stopped, or whose batches come in another order, ends
+bit for bit as any other."""
 
 from __future__ import annotations
 
@@ -17,15 +13,13 @@ from typing import Any
 
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
-from advsearch.cluster.executor import Executor, InProcess
-from advsearch.engine.journal import Journal, finite, other_answers, same
+from advsearch.cluster import Executor, InProcess
+from advsearch.engine.attack_result import save_marked
+from advsearch.engine.journal import Journal, Sent, Shared, answering, finite, lost, other_answers, same
 from advsearch.engine.loading import framed
-from advsearch.engine.pictures import save_marked
-from advsearch.engine.record import Stages
-from advsearch.engine.rows import LOST, judgement_of, lost_remarks
-from advsearch.engine.sharing import Sent, Shared, answering, lost
+from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
+from advsearch.engine.sweeps import KIND, Job, check_all
 from advsearch.engine.sweeps.drives import Drives, time_axis
-from advsearch.engine.sweeps.job import KIND, Job, check_all
 from advsearch.engine.sweeps.points import Picks
 from advsearch.engine.sweeps.predicting import combined
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, SweepResult, Tally, rate
@@ -75,14 +69,8 @@ READ_AT_ONCE = 256
 
 
 class Sweep:
-    """One sweep, from its first configuration or from where it was stopped.
-
-    Args:
-        job: what is swept.
-        run: open directory to keep it in, with the rows that are there already; None keeps it in memory.
-        progress: told how far it is.
-        executor: answers batches of queries; None does it here.
-    """
+    """One sweep, from its first configuration or from where it was stopped: `run` has the rows that are there already,
+    and None keeps it in memory. Without an executor all is answered here."""
 
     def __init__(
         self, job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None
@@ -122,11 +110,7 @@ class Sweep:
         self._pairs = self.total // 2 if len(answers) > 1 else 0
 
     def carry_out(self, first: int | None = None) -> SweepResult:
-        """Do what is left and return the answer.
-
-        Args:
-            first: number of the configuration to begin with; None does those that are not stored.
-        """
+        """Do what is left, or all from the configuration with a number on, and return the answer."""
         tally = self._counted()
         ending, worst = FINISHED, None
         self._check_answers()
@@ -161,7 +145,6 @@ class Sweep:
     # ---- the loop ---------------------------------------------------------------------------------------------------
 
     def _left(self) -> list[range]:
-        """Numbers of the configurations that are not stored."""
         return [range(self.total)] if self.run is None else list(self.run.store.missing(KIND, self.total))
 
     def _go_through(self, left: Sequence[range], tally: Tally) -> Tally:
@@ -195,7 +178,6 @@ class Sweep:
                 first = before + self.per_scene
 
     def _take(self, queries: Sequence[Query], answers: Sequence[Evaluation], worker: str, machine: str | None) -> None:
-        """Store what was answered in one batch."""
         answers = [replace(one, machine=machine) for one in answers]
         if self.run is not None:
             for query, answer in zip(queries, answers, strict=True):
@@ -223,11 +205,7 @@ class Sweep:
         return f"about {size}" if self.job.config.keep_pictures == "all" else f"at most about {size}"
 
     def _check_answers(self) -> None:
-        """Look again at the first picture that is stored, where there is more to come here.
-
-        Raises:
-            InputError: a model says something else of it now than it did.
-        """
+        """Look again at the first picture that is stored, where there is more to come here."""
         row = None if self.run is None else next(self.run.store.rows(KIND), None)
         if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
             return
@@ -274,7 +252,6 @@ class Sweep:
         return tally
 
     def rows(self) -> Iterable[Row]:
-        """Return the rows of the sweep that are there."""
         return self.journal.rows if self.run is None else self.run.store.rows(KIND)
 
     def _spend(self, rows: Sequence[Row]) -> None:
@@ -334,7 +311,6 @@ class Sweep:
         return {"verified": checked, "pictured": _claim_of(view.judge(model, u, picture))}
 
     def _query(self, index: int) -> tuple[Query, int]:
-        """What is asked about a configuration by its number, and the number of its model."""
         number, model = divmod(index, self.models)
         return self.job.queries(range(number, number + 1))[model][2], model
 
@@ -351,19 +327,18 @@ class Sweep:
     # ---- the answer -------------------------------------------------------------------------------------------------
 
     def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
-        """Put the summary together and write it."""
         job, seconds = self.job, self.stages.seconds
         view, checked = self._scenes.scene, worst.verified if worst else None
         predicting = self._transport.values() or [[one.summary() for one in (view.light.values() if view else ())]]
         swept = seconds.get("sweep", 0.0)
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
-        gains = self._gains() if formation else {}
+        gains, models = self._gains() if formation else {}, [model.name for model in job.models]
         if formation is not None and len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         summary = SweepSummary(
             run=None if self.run is None else str(self.run.path),
             object=job.config.object,
-            model=",".join(model.name for model in job.models),
+            model=",".join(models),
             task=job.config.task_name,
             environment=self.points.environment or job.config.lit_by,
             controls=[control.name for control in job.controls],
@@ -377,7 +352,7 @@ class Sweep:
             answers=tally.frequent(),
             axes=tally.table(),
             cells=tally.map(),
-            beside=self._beside(tally),
+            beside=BesideAnswer(answer=job.places[-1].answer, pairs=tally.beside(models)) if self._pairs else None,
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
@@ -415,15 +390,7 @@ class Sweep:
             for place in self.job.places
         }
 
-    def _beside(self, tally: Tally) -> BesideAnswer | None:
-        """The clean scene and the answer of a run, where there is one."""
-        if not self._pairs:
-            return None
-        models = [one.name for one in self.job.models]
-        return BesideAnswer(answer=self.job.places[-1].answer, pairs=tally.beside(models))
-
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
-        """What a reader has to know beside the numbers."""
         remarks = lost_remarks(self._lost)
         remarks += self.journal.machines.remarks
         if tally.not_finite:

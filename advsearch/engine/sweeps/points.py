@@ -1,9 +1,6 @@
-"""From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept.
-
-Within a scene, pictures are numbered along the grid, and the draws of one point of the grid follow each other. Every
-picture of a sweep has a draw of its own, also where the grid is the same, so that pictures are independent; only what
-is compared in pairs, without an answer and with it, has the same ones.
-"""
+"""From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept. Every
+picture has a draw of its own, so that pictures are independent; only pairs without and with an answer have the same
+ones."""
 
 from __future__ import annotations
 
@@ -47,14 +44,9 @@ Tell = Callable[[Tensor, "Picks"], list[Mapping[str, Value]]]
 
 @dataclass(frozen=True, eq=False)
 class Picks:
-    """Neighbouring pictures of a scene.
-
-    Attributes:
-        number: of the first of them in the whole sweep.
-        digits: of each, its place on every axis of the grid.
-        shares: (n, k) float64 in [0, 1], the coordinates drawn for small parameters; equal parts are equally likely.
-        parts: of each, the part of every drawn number of the table in which it lies.
-    """
+    """Neighbouring pictures of a scene: the number of the first in the whole sweep; of each, its place on every axis of
+    the grid, shares (n, k) float64 in [0, 1], the coordinates drawn for small parameters, and the part of every drawn
+    number of the table in which it lies."""
 
     number: int
     digits: list[tuple[int, ...]]
@@ -64,15 +56,8 @@ class Picks:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A drawn number, as the table shows it.
-
-    Attributes:
-        name: ``camera.elevation``.
-        unit: of the values.
-        column: of `Picks.shares`.
-        parts: what each part of [0, 1] stands for: a pair of ends, or a value of a list.
-        settled: whether these are its values in every scene.
-    """
+    """A drawn number, as the table shows it: its column of `Picks.shares`, and what equal parts of [0, 1] stand for:
+    pairs of ends, or values of a list; if `settled`, in every scene."""
 
     name: str
     unit: str
@@ -82,7 +67,6 @@ class Drawn:
 
     @property
     def varied(self) -> VariedValue:
-        """What it was drawn from."""
         ends = [end for part in self.parts if isinstance(part, list) for end in part]
         if ends:
             return VariedValue(unit=self.unit, low=min(ends), high=max(ends))
@@ -108,19 +92,14 @@ class Points:
     """The configurations of one scene.
 
     Args:
-        space: the controls.
         domain: their budgets; the start is the scene as it is.
-        axes: of the grid, all of them in the space.
         samples: pictures at each point of the grid.
-        sampler: of the draws.
-        seed: root.
         scenes: number of scenes after which the draws come again, so that what is compared has the same; 0 for never.
         among: how many scenes the sweep has.
 
     Attributes:
         parts: into how many the range of a drawn parameter is cut.
         grid: sizes of the axes and the number of points.
-        count: pictures of the scene.
         drawn: what the table shows of the draws.
         drawn_numbers: how many numbers a draw has, and which of them the table shows; the same for all scenes.
     """
@@ -213,7 +192,6 @@ class Points:
         return Picks(before + first, digits, shares, parts.tolist())
 
     def digits(self, number: int) -> tuple[int, ...]:
-        """Return the place on every axis of the grid of the picture with this number in the scene."""
         return self.grid.digits(number // self.samples)
 
     def noise(self, number: int) -> int:
@@ -240,7 +218,6 @@ class Points:
         return np.concatenate(each) if each else draws.points(0, 0)
 
     def configurations(self, picks: Picks) -> Tensor:
-        """Return u of the pictures, (n, d) float32."""
         u = np.repeat(self._start[None], len(picks.digits), axis=0)
         for column, number, size in self._places:
             u[:, column] = [(digits[number] + 0.5) / size for digits in picks.digits]
@@ -340,7 +317,6 @@ def _by_column(control: BoundNumbers, part: slice, axes: Sequence[tuple[int, Axi
 
 
 def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Picks], list[tuple[str, Value]]]:
-    """A column of the grid."""
     pairs = [(name, value) for value in listed]
     return lambda u, picks: [pairs[digits[number]] for digits in picks.digits]
 
@@ -348,7 +324,6 @@ def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Pi
 def _drawn(
     control: BoundNumbers, parameter_name: str, name: str, begin: int, size: int
 ) -> list[Callable[[Tensor, Picks], list[tuple[str, Value]]]]:
-    """The columns of a drawn parameter."""
     parameter, spec = _spec(control, parameter_name)
     unit = _unit(parameter)
     if isinstance(spec, OneOf):
@@ -370,13 +345,8 @@ def _drawn(
 def _by_description(
     describe: Callable[[Tensor], Mapping[str, Value]], axes: Sequence[tuple[int, Axis]], *, keep: bool
 ) -> Tell:
-    """What the control itself says, one configuration after the other.
-
-    Args:
-        describe: from a configuration of the whole space.
-        axes: those of the control, with their numbers.
-        keep: whether these axes are all that the description depends on, so that it can be kept for the next time.
-    """
+    """What the control itself says, one configuration after the other; kept for the next time if these axes are all
+    that it depends on."""
     kept: dict[tuple[int, ...], dict[str, Value]] = {}
 
     def one(u: Tensor, digits: tuple[int, ...]) -> Mapping[str, Value]:

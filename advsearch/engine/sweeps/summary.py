@@ -1,10 +1,9 @@
-"""Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its answer as Python has it.
-
-The memory that counting takes does not grow, but for a byte a configuration where pairs are compared.
-"""
+"""Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its answer as Python has it; sweeps
+that another program made are read into a run here, too. The memory that counting takes hardly grows."""
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -12,19 +11,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import paired_difference
+from advsearch.engine.sweeps import KIND
 from advsearch.engine.sweeps.axes import Axis
-from advsearch.engine.sweeps.job import KIND
 from advsearch.engine.sweeps.points import Drawn, Picks
+from advsearch.errors import FileFormatError
 from advsearch.report.figures import new_axes, sweep_axes, sweep_figure
 from advsearch.report.markup import answer_html
 from advsearch.report.shown import shown
 from advsearch.runs import store
-from advsearch.runs.export import to_pandas
+from advsearch.runs.directory import RunDirectory, default_name
+from advsearch.runs.export import read_threedb, to_pandas
 from advsearch.runs.results.sweep import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary
+from advsearch.runs.store import Row
 from advsearch.tasks import Judgement
+from advsearch.viewer import thumbnails
+from advsearch.viewer.sweep_page import write_sweep_page
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
 """How a sweep ends."""
@@ -41,15 +46,7 @@ MOST_ANSWERS = 20
 
 @dataclass
 class Count:
-    """Right answers among configurations, for every value of one axis.
-
-    Attributes:
-        name: of the axis.
-        unit: of its values.
-        values: what each place stands for: a number, a name, or a pair of ends.
-        seen: configurations of each value.
-        correct: those that the model got right.
-    """
+    """Right answers among configurations, for every value of one axis: a number, a name, or a pair of ends."""
 
     name: str
     unit: str
@@ -61,7 +58,6 @@ class Count:
         self.seen, self.correct = [0] * len(self.values), [0] * len(self.values)
 
     def add(self, place: int, right: bool) -> None:
-        """Count one configuration."""
         self.seen[place] += 1
         self.correct[place] += right
 
@@ -85,11 +81,8 @@ def rate(correct: int, seen: int) -> CountedAnswers:
 
 
 class Cells:
-    """Counts for every pair of values of two axes, and the sum of the margins there.
-
-    Args:
-        axes: name, unit and values of every axis that has several values, those that are shown first.
-    """
+    """Counts for every pair of values of the first two of several axes (name, unit, values), and the sum of the margins
+    there."""
 
     def __init__(self, axes: Sequence[tuple[str, str, Sequence[Any]]]) -> None:
         self._axes = list(axes[:2])
@@ -102,7 +95,6 @@ class Cells:
         self._margin = [[0.0] * wide for _ in range(high)]
 
     def add(self, places: Sequence[int], trial: Judgement) -> None:
-        """Count one configuration by its places on the axes."""
         if not self.shown:
             return
         column, row = places[0], places[1]
@@ -113,7 +105,6 @@ class Cells:
             self._margin[row][column] += trial.margin
 
     def drawn(self) -> SweepMap | None:
-        """Return the axes, and for each cell the counts and the mean margin; rows are values of the second axis."""
         if not self.shown:
             return None
         pairs = [zip(sums, counts, strict=True) for sums, counts in zip(self._margin, self._finite, strict=True)]
@@ -132,24 +123,17 @@ class Tally:
 
     Args:
         outer: name and values of the axes outside the scene: object, environment, model.
-        axes: of the grid.
         drawn: what the table shows of the draws.
         pairs: configurations without an answer, each of which comes again with it, so many numbers later; 0 for none.
 
     Attributes:
-        seen: configurations.
-        correct: those that the model got right.
         not_finite: those whose margin was not a number; they count as not right.
         worst: the number of the configuration with the largest margin, with what was seen there; the first of equals.
         answers: how often each wrong answer was given.
     """
 
     def __init__(
-        self,
-        outer: Sequence[tuple[str, Sequence[str]]],
-        axes: Sequence[Axis],
-        drawn: Sequence[Drawn],
-        pairs: int = 0,
+        self, outer: Sequence[tuple[str, Sequence[str]]], axes: Sequence[Axis], drawn: Sequence[Drawn], pairs: int = 0
     ) -> None:
         self._verdicts = [bytearray(pairs), bytearray(pairs)]
         self.seen = self.correct = self.not_finite = 0
@@ -165,15 +149,8 @@ class Tally:
         self._cells = Cells([(every[n].name, every[n].unit, every[n].values) for n in self._mapped])
 
     def add(self, index: int, outer: Sequence[int], picks: Picks, place: int, trial: Judgement) -> None:
-        """Count one configuration.
-
-        Args:
-            index: its number.
-            outer: its places on the outer axes.
-            picks: the pictures it belongs to.
-            place: its place among them.
-            trial: what was seen.
-        """
+        """Count the configuration with a number: by its places on the outer axes, and its place among the pictures it
+        belongs to."""
         right = trial.right
         if pairs := len(self._verdicts[0]):
             self._verdicts[index // pairs][index % pairs] = RIGHT if right else WRONG
@@ -222,7 +199,6 @@ class Tally:
         return found
 
     def table(self) -> list[AxisRow]:
-        """Return accuracy by axis and value; axes with a single value are left out."""
         counts = [*self._outer, *self._grid, *self._drawn]
         return [row for count in counts if len(count.values) > 1 for row in count.rows()]
 
@@ -292,3 +268,120 @@ class SweepResult:
 
     def _repr_png_(self) -> bytes | None:
         return sweep_figure(self.summary).get("png")
+
+
+MOST_PIXELS = 1 << 22
+"""Of a picture that is read."""
+
+MOST_VALUES = 96
+"""Different values of a parameter that the result lists."""
+
+AT_ONCE = 1000
+"""Rows that are stored at once."""
+
+
+def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bool = False) -> Path:
+    """Read a folder that 3DB wrote into a run, by default ``runs/NAME-3db-NNN``, and return its folder."""
+    counts = _Counts()
+    with RunDirectory.create(run, overwrite=overwrite, default=default_name(folder.resolve().name, ["3db"])) as kept:
+        rows: list[Row] = []
+        for one in read_threedb(folder):
+            if one.picture is not None:
+                thumbnails.keep(kept.path, one.row.step, thumbnails.thumbnail(read_picture(one.picture)))
+            counts.add(one.row)
+            rows.append(one.row)
+            if len(rows) == AT_ONCE:
+                kept.record(*rows)
+                rows.clear()
+        kept.record(*rows)
+        if not counts.seen:
+            raise FileFormatError(f"{folder}: expected the log of 3DB with at least one line, got an empty one")
+        summary = counts.summary(kept.path, folder)
+        kept.write_summary(summary)
+        write_sweep_page(kept.path, summary)
+        return kept.path
+
+
+class _Counts:
+    """What the rows come to."""
+
+    def __init__(self) -> None:
+        self.seen = self.correct = 0
+        self._names: dict[str, dict[str, None]] = {name: {} for name in ("object", "environment", "model")}
+        self._values: dict[str, dict[float | str, tuple[int, int]] | None] = {}
+        self._wrong: dict[str, int] = {}
+
+    def add(self, row: Row) -> None:
+        right = bool(row.correct)
+        self.seen += 1
+        self.correct += right
+        if not right:
+            self._wrong[row.label or ""] = self._wrong.get(row.label or "", 0) + 1
+        for name, value in row.values.items():
+            if name in self._names:
+                self._names[name][str(value["value"])] = None
+            table = self._values.setdefault(name, {})
+            if table is None:
+                continue
+            seen, correct = table.get(value["value"], (0, 0))
+            table[value["value"]] = (seen + 1, correct + right)
+            if len(table) > MOST_VALUES:
+                self._values[name] = None
+
+    def summary(self, run: Path, folder: Path) -> SweepSummary:
+        tables = []
+        for name, table in self._values.items():
+            if table is None or len(table) < 2:
+                continue
+            count = Count(name, "", sorted(table, key=lambda value: (isinstance(value, str), value)))
+            count.seen, count.correct = ([table[value][place] for value in count.values] for place in (0, 1))
+            tables += count.rows()
+        called = {name: _listed(list(values)) for name, values in self._names.items()}
+        most = sorted(self._wrong.items(), key=lambda pair: -pair[1])[:20]
+        return SweepSummary(
+            run=str(run),
+            object=called["object"],
+            model=called["model"],
+            task="classification",
+            environment=called["environment"],
+            controls=[],
+            ending=FINISHED,
+            image_formation=None,
+            planned=self.seen,
+            **vars(rate(self.correct, self.seen)),
+            not_finite=0,
+            answers=dict(most),
+            axes=tables,
+            cells=None,
+            worst=None,
+            grid={},
+            samples=1,
+            sampler=None,
+            spp=0,
+            renders={"sweep": self.seen},
+            renders_per_second=None,
+            seconds={"total": 0.0},
+            seed=0,
+            warnings=[f"Read from {folder}, as 3DB wrote it; it was not rendered here."],
+            command_line="",
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ",".join(names[:20]) + (f" and {len(names) - 20} more" if len(names) > 20 else "") or "unknown"
+
+
+def read_picture(path: Path) -> object:
+    """Return the picture (H, W, 3) in [0, 1] in a file."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            opened = Image.open(path)
+        with opened as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise FileFormatError(
+                    f"{path}: expected at most {MOST_PIXELS} pixels, got {image.width} x {image.height}"
+                )
+            return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise FileFormatError(f"{path}: expected a picture, got {str(error)[:100]}") from None

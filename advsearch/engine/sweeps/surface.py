@@ -1,15 +1,7 @@
-"""Which parts of an object's surface, when seen, go with wrong answers (docs/sweeps.md, "The surface").
-
-It comes from the rows of a sweep that has ended and from what each of its pictures sees first, without noise: another
-pass over the same rows says the same, whether the sweep was stopped on the way or not.
-
-Whether answers are wrong more often where a part is seen: the interval of a difference is Newcombe's (1998, "Interval
-estimation for the difference between independent proportions", Statistics in Medicine 17, method 10), made of Wilson's
-score intervals (1927). How likely it is by chance comes from sharing the wrong answers out among the pictures anew: a
-part is compared with the part that stands out most each time, so that looking at many parts at once is accounted for,
-and that neighbours are seen together (Westfall and Young 1993, "Resampling-Based Multiple Testing", the single-step
-maximum). How far a part stands out is said by the likelihood-ratio statistic of its two shares.
-"""
+"""Which parts of an object's surface, when seen, go with wrong answers (docs/sweeps.md, "The surface"): the interval of
+a difference is Newcombe's (1998, Statistics in Medicine 17, method 10) of Wilson's (1927); what is chance comes from
+sharing the wrong answers out anew, each time with the part that stands out most (Westfall and Young 1993, the
+single-step maximum) by the likelihood ratio."""
 
 from __future__ import annotations
 
@@ -28,8 +20,8 @@ from advsearch import seeds
 from advsearch.attacks.draws import batches
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.engine.loading import framed, load_scene
-from advsearch.engine.rows import judgement_of
-from advsearch.engine.sweeps.job import Job
+from advsearch.engine.record import judgement_of
+from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.summary import rate
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.progress import Progress
@@ -56,21 +48,8 @@ LEVEL = 0.05
 
 
 class PartCounts:
-    """Counts of n parts over pictures: of the answers, and of the wrong ones shared out by chance.
-
-    Args:
-        parts: n.
-        pictures: how many there will be.
-        failures: of them, those whose answer is wrong.
-        seed: of the chance.
-
-    Attributes:
-        pictures: as given.
-        failures: as given.
-        seen: (n,) pictures in which each part holds.
-        wrong: (n,) of them, those whose answer is wrong.
-        chance: (SHARINGS, n) the same for wrong answers that were shared out.
-    """
+    """Counts of n parts over so many pictures, of which some are `failures`: those that show each (`seen`), and of
+    these the failures (`wrong`), both (n,); `chance` (SHARINGS, n) is the same for failures that are shared out."""
 
     def __init__(self, parts: int, pictures: int, failures: int, seed: int) -> None:
         self.pictures, self.failures = pictures, failures
@@ -80,12 +59,7 @@ class PartCounts:
         self._random = np.random.default_rng(seed)
 
     def add(self, parts: Counts, failed: bool) -> None:
-        """Count a picture.
-
-        Args:
-            parts: numbers of those that hold in it, each once.
-            failed: whether its answer is wrong.
-        """
+        """Count a picture, by the numbers of the parts that hold in it, each once."""
         self.seen[parts] += 1
         self.wrong[parts] += failed
         drawn = self._random.random(SHARINGS) * self._left < self._to_go  # so each choice of pictures is equally likely
@@ -123,13 +97,8 @@ class Association:
 
 
 def association(tally: PartCounts, some: slice, least: int) -> Association:
-    """Compare the answers where each of some parts holds with those where it does not.
-
-    Args:
-        tally: of all pictures.
-        some: the parts.
-        least: a part is compared that holds in so many pictures and does not in as many.
-    """
+    """Compare the answers where each of some parts holds with those where it does not; at least so many pictures of
+    either kind."""
     seen, wrong, pictures, failures = tally.seen[some], tally.wrong[some], tally.pictures, tally.failures
     compared = (seen >= least) & (pictures - seen >= least)
     low, high, difference, p = np.full((4, len(seen)), np.nan)
@@ -154,7 +123,6 @@ def _likelihood_ratio(k: Counts, n: Counts, failures: int, pictures: int) -> Dou
 
 
 def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubles, Doubles, Doubles]:
-    """The difference k / n - others / rest, and both ends of its interval."""
     (one, below, above), (two, under, over) = _wilson(k, n), _wilson(others, rest)
     difference = one - two
     low = difference - np.hypot(one - below, over - two)
@@ -163,7 +131,6 @@ def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubl
 
 
 def _wilson(k: Counts, n: Counts) -> tuple[Doubles, Doubles, Doubles]:
-    """The share k / n and both ends of its score interval."""
     z, share = float(ndtri((1.0 + CONFIDENCE) / 2.0)), k / n
     middle, half = share + z * z / (2 * n), z * np.sqrt(share * (1.0 - share) / n + z * z / (4.0 * n * n))
     return share, (middle - half) / (1.0 + z * z / n), (middle + half) / (1.0 + z * z / n)
@@ -198,23 +165,13 @@ AT_ONCE = 16
 
 
 class SurfaceCounts:
-    """How often each part of an object's surface was seen, and how often the answers were wrong then.
-
-    Args:
-        parts: of the object.
-        tallies: for each model, of as many parts.
-    """
+    """How often each part of an object's surface was seen, and how often the answers of each model were wrong then."""
 
     def __init__(self, parts: SurfaceParts, tallies: Sequence[PartCounts]) -> None:
         self.parts, self.tallies = parts, tuple(tallies)
 
     def add(self, shown: Surfaces, wrong: Mapping[int, bool]) -> None:
-        """Count a picture.
-
-        Args:
-            shown: what it shows.
-            wrong: by the number of the model, whether its answer is wrong.
-        """
+        """Count a picture, by what it shows and the models whose answers are wrong."""
         there = shown.seen(OBJECT)
         face, uv = shown.face[there].numpy(), shown.uv[there].numpy().astype(np.float64)
         seen = np.unique(self.parts.cells(face, uv))
@@ -228,7 +185,6 @@ class SurfaceCounts:
         return {kind: association(self.tallies[model], some, LEAST) for kind, some in self.parts.kinds.items()}
 
     def table(self, name: str, model: str, tally: PartCounts, kind: str, found: Association) -> SurfaceTable:
-        """Return what the summary says of one kind of part."""
         some = self.parts.kinds[kind]
         return SurfaceTable(
             object=name,
@@ -281,15 +237,7 @@ class SurfaceCounts:
 def map_surface(
     job: Job, rows: Iterable[Row], opened: Callable[[int], SweptScene], run: RunDirectory, progress: Progress
 ) -> SurfaceMap:
-    """Count over the surface of each object, write the counts and their figure, and return what the summary says.
-
-    Args:
-        job: what was swept.
-        rows: all that it has stored, in whatever order.
-        opened: gives a scene by its number.
-        run: gets the files.
-        progress: told of each row.
-    """
+    """Count over the surface of each object, write the counts and their figure, and return what the summary says."""
     per_scene, models = opened(0).points[job.sizes[0]].count, len(job.models)
     wrong: npt.NDArray[np.int8] = np.full((len(job.places), per_scene, models), UNKNOWN, np.int8)
     for row in rows:
@@ -327,7 +275,6 @@ def _assets(job: Job) -> dict[str, ObjectAsset]:
 
 
 def _told(job: Job, counts: Mapping[str, SurfaceCounts], run: RunDirectory) -> SurfaceMap:
-    """Compare, write the files, and return the tables."""
     assets, models = _assets(job), [model.name for model in job.models]
     tables, panels = [], []
     arrays: dict[str, Any] = {"objects": np.array(list(counts)), "models": np.array(models)}
@@ -366,7 +313,6 @@ def _panel(
 
 
 def _views(asset: ObjectAsset, parts: SurfaceParts) -> list[MapView]:
-    """What cameras from some sides see of the object alone."""
     alone = framed(load_scene(asset, settings={"ground.size": 0.0}).description, SIDE_PIXELS)
     scene, views = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS)), []
     for azimuth, elevation in SIDES:

@@ -1,14 +1,6 @@
-"""The scenes of a sweep: each answers queries about its pictures, rendered or predicted, by all models of the sweep.
-
-What comes of a query depends on it and on the job alone, so it may be answered anywhere, in whatever company.
-
-Pictures that differ in light alone are put together from basis pictures, once these pay (docs/transport.md). A group
-is a pose, say, under all of its light, and has basis pictures of its own.
-
-The worst configuration is checked again: fresh seeds, enough samples, 8 bits. A sweep has no clean configuration, so
-there is no control group: a trial counts where the model is wrong. Its place in the answer: docs/sweeps.md, "What it
-says".
-"""
+"""The scenes of a sweep: each answers queries by all models, rendered or predicted, which depends on query and job
+alone, so that anybody may. Pictures that differ in light alone are put together from basis pictures, once these pay
+(docs/transport.md). And the worst configuration, checked again (docs/sweeps.md, "What it says")."""
 
 from __future__ import annotations
 
@@ -24,18 +16,15 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, choose_spp, run_trials
-from advsearch.attacks.sample_count import margins_of, most_samples
+from advsearch.attacks.trials import margins_of, most_samples
 from advsearch.described import Value
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, Shared
+from advsearch.engine.judging import judgements
 from advsearch.engine.loading import framed, make_renderer
-from advsearch.engine.metrics import judgements
-from advsearch.engine.record import Stages
-from advsearch.engine.rows import rate_of
-from advsearch.engine.sharing import Shared
-from advsearch.engine.sweeps.job import Job
+from advsearch.engine.record import Stages, rate_of
+from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.points import Picks, Points
-from advsearch.engine.sweeps.predicting import PAYS, SweptPicture, SweptPredictor, WantedPicture
-from advsearch.engine.sweeps.surface_light import SweptSurfaceLight
+from advsearch.engine.sweeps.predicting import PAYS, SweptPicture, SweptPredictor, SweptSurfaceLight, WantedPicture
 from advsearch.engine.transport import CHECK_SPP, Deviation, deviation_under_light
 from advsearch.engine.verifier import ladder_of
 from advsearch.files import scaled
@@ -46,7 +35,7 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
 from advsearch.scene.transport.lights import NOISE, BasisRenderer, Lights, lighting
-from advsearch.scene.transport.renderer import MOST_BYTES, SPP
+from advsearch.scene.transport.matrix import MOST_BYTES, SPP
 from advsearch.tasks import Judgement, Mark
 from advsearch.tasks.base import Truth
 from advsearch.viewer import thumbnails
@@ -113,19 +102,8 @@ class SweptLight(SweptPredictor):
 
 
 class SweptScene:
-    """One scene, ready to be rendered and shown to the models: what a `Problem` is to an attack.
-
-    Args:
-        job: what is swept.
-        number: of the scene.
-
-    Attributes:
-        job, number: likewise.
-        points: its configurations for each size of picture, on which what a control frames may depend.
-        renderers: likewise.
-        light: what predicts pictures of these that differ in little.
-        prepared: nothing.
-    """
+    """One scene, ready to be rendered and shown to the models: what a `Problem` is to an attack. Points, renderers and
+    what predicts pictures are there for each size of picture, on which what a control frames may depend."""
 
     prepared: Any = None
 
@@ -157,7 +135,6 @@ class SweptScene:
 
     @property
     def not_finite(self) -> int:
-        """How many values of pictures were not finite, and were set to 0."""
         rendered = sum(renderer.non_finite for renderer in self.renderers.values())
         return rendered + sum(light.not_finite for light in self.light.values())
 
@@ -165,11 +142,7 @@ class SweptScene:
 
     def answers(self, queries: Sequence[Query]) -> list[Evaluation]:
         """Answer queries of neighbouring rows: a picture is made once for each size, and a model sees all of its own at
-        once.
-
-        Args:
-            queries: by `Job.queries`, or some of these.
-        """
+        once."""
         begun, before, job = time.perf_counter(), self.not_finite, self.job
         models = len(job.models)
         made = {size: self._made(size, queries) for size in self.points}
@@ -218,21 +191,14 @@ class SweptScene:
     # ---- single pictures --------------------------------------------------------------------------------------------
 
     def _score(self, model: int, picture: Tensor, u: Tensor) -> float:
-        """The margin of one model on one picture (H, W, 3), in logits."""
         return self.judge(model, u, to_8_bit(picture)).margin
 
     def judge(self, model: int, u: Tensor, picture: Tensor) -> Judgement:
-        """What one model says of the picture (H, W, 3) of one configuration."""
         return self._judged(model, picture[None], [(u, {})])[0]
 
     def truth(self, model: int, u: Tensor, listed: Mapping[str, Value]) -> Truth:
-        """What is true of a configuration (d,), as the task of one model needs it.
-
-        Args:
-            model: number of it.
-            u: the configuration.
-            listed: values of the grid as they were given, in the place of what single precision makes of them.
-        """
+        """What is true of a configuration (d,), as the task of one model needs it; values of the grid as they were
+        `listed`, not what single precision makes of them."""
         job, size = self.job, self.job.sizes[model]
         if not job.tasks[model].varies:
             return self._truths[model]
@@ -241,18 +207,12 @@ class SweptScene:
         return job.truth(place, model, values, lambda: renderer.surfaces(u))
 
     def picture(self, model: int, u: Tensor, seed: int, spp: int) -> Tensor:
-        """The picture (H, W, 3) that one model sees of one configuration."""
         with torch.no_grad():
             return to_8_bit(self.renderers[self.job.sizes[model]](u, seed=seed, spp=spp))
 
     def surfaces(self, picks: Picks, size: tuple[int, int] | None = None, fineness: int = 1) -> Iterator[Surfaces]:
-        """What is seen in the pixels of pictures, one after the other.
-
-        Args:
-            picks: n of them.
-            size: (height, width) of the pictures; None for those that the first model is shown.
-            fineness: parts of each side of a pixel.
-        """
+        """What is seen in the pixels of pictures, one after the other: of a size, by default that of the first model,
+        in `fineness` parts of each side of a pixel."""
         size = size or self.job.sizes[0]
         for u in self.points[size].configurations(picks):
             yield self.renderers[size].surfaces(u, fineness)
@@ -279,11 +239,7 @@ class SweptScene:
 
 
 class Scenes:
-    """The scenes of a sweep in this process, of which the last one is held.
-
-    Args:
-        job: what is swept.
-    """
+    """The scenes of a sweep in this process, of which the last one is held."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -297,11 +253,10 @@ class Scenes:
         return self.scene
 
     def named(self, name: str) -> SweptScene:
-        """The same by its number as text: see `advsearch.engine.sharing.answering`."""
+        """The same by its number as text: see `advsearch.engine.journal.answering`."""
         return self.open(int(name))
 
     def picture(self, number: int) -> Tensor:
-        """Return the picture (H, W, 3) with this number as the first model sees it."""
         sent = self.job.queries(range(number, number + 1))
         return self.named(sent[0][0]).pictures([query for _, _, query in sent])[0]
 
@@ -318,7 +273,6 @@ class OneModel:
     model: int
 
     def evaluate(self, query: Query) -> Evaluation:
-        """Answer one query: a trial."""
         picture = self.view.picture(self.model, query.u, query.seed, query.spp)
         return Evaluation.of(self.view.judge(self.model, query.u, picture))
 
@@ -326,21 +280,8 @@ class OneModel:
 def check_worst(
     view: SweptScene, job: Job, model: int, u: Tensor, run: RunDirectory | None, stages: Stages
 ) -> WorstVerified | None:
-    """Render a configuration again, and say how often the model is wrong.
-
-    Trials that the run has stored already are not made again.
-
-    Args:
-        view: its scene.
-        job: says how many trials.
-        model: number of the model.
-        u: (d,).
-        run: gets a row for every trial, and has those of a run that was stopped.
-        stages: told how far it is.
-
-    Returns:
-        As `verified` in the summary; None without trials.
-    """
+    """Render a configuration again, and say how often the model is wrong; None without trials. Those that the run has
+    stored already are not made again."""
     config = job.config
     if config.trials == 0:
         return None

@@ -2,13 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 from pydantic import Field
 
+from advsearch.report import wording
+from advsearch.report.figures import BLUE
 from advsearch.report.markup import InNotebook
+from advsearch.report.phrases import answer_cells, margin_text, percent
+from advsearch.report.shown import (
+    ENDED,
+    NO_PROOF,
+    WHY,
+    AnswerPart,
+    Claim,
+    Column,
+    Extent,
+    ShownAnswer,
+    average_claim,
+    case_claim,
+    claim,
+    extent_of,
+    nothing_claimed,
+    searches_text,
+    share_text,
+)
+from advsearch.report.wording import count, interval_text, number_text, short_name
 from advsearch.runs.export import table_to_pandas
-from advsearch.runs.results.attack import AttackSummary, ControlGroup, VerifiedRate
+from advsearch.runs.results.attack import (
+    AttackSummary,
+    ControlGroup,
+    DifferentFailure,
+    DifferentFailures,
+    FailingShare,
+    VerifiedRate,
+)
 from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result, StudyResult
 
 EpsilonBudget = float | None | dict[str, float | None]
@@ -110,3 +139,335 @@ RESULT = AttackSummary
 
 BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResult}
 """Other results of the command, by a field that they alone have."""
+
+
+NOT_VERIFIED = ("not verified", "")
+"""Cells of what was not rendered afresh."""
+
+
+def shown(result: AttackSummary | CurveResult | MatrixResult) -> ShownAnswer:
+    """Return the verdict, the rates and the cost; of a curve or a matrix, its tables and its figure."""
+    if isinstance(result, CurveResult):
+        return _shown_curve(result)
+    return _shown_matrix(result) if isinstance(result, MatrixResult) else _shown_attack(result)
+
+
+def claims(result: AttackSummary | CurveResult | MatrixResult) -> Iterator[Claim]:
+    """Yield what the run stands for."""
+    if isinstance(result, CurveResult):
+        return _claims_of_curve(result)
+    return _claims_of_matrix(result) if isinstance(result, MatrixResult) else _claims_of_attack(result)
+
+
+# ---- one attack -----------------------------------------------------------------------------------------------------
+
+
+def _shown_attack(summary: AttackSummary) -> ShownAnswer:
+    heads = ("", "answer", "probability", "rate", "95 % interval")
+    sections = [AnswerPart(heads=heads, rows=_rates(summary))]
+    if summary.failures and summary.failures.tried:
+        sections.append(failures_part(summary.failures, tried=True))
+    cautions = [text for text in wording.remarks(summary) if text not in summary.warnings]
+    return ShownAnswer(wording.attack_verdict(summary), sections, _facts(summary), cautions=cautions)
+
+
+def _rates(summary: AttackSummary) -> list[list[str]]:
+    clean, success, average = summary.clean, wording.success(summary), summary.average
+    control = clean.control
+    rated = _rate("right", control.correct, control) if control else NOT_VERIFIED
+    rows = [["clean", *answer_cells(summary.task, clean), *rated]]
+    if summary.adversarial:
+        said = answer_cells(summary.task, summary.adversarial)
+        rows.append(["adversarial", *said, *_verified(success, summary.verified)])
+    if summary.baseline:
+        pictures = f"{summary.baseline.renders} pictures"
+        rows.append(["random search", pictures, "", *_verified(success, summary.baseline.verified)])
+    if average:
+        rate = [wording.tally("right", average.correct, average.configurations), interval_text(average.interval)]
+        rows.append(["average case", count(average.configurations, "configuration"), "", *rate])
+    return rows
+
+
+def _verified(what: str, rated: VerifiedRate | None) -> Sequence[str]:
+    return NOT_VERIFIED if rated is None else _rate(what, rated.successes, rated)
+
+
+def _rate(what: str, number: int, rated: VerifiedRate | ControlGroup) -> Sequence[str]:
+    return [wording.tally(what, number, rated.trials, rated.not_a_number), interval_text(rated.interval)]
+
+
+def _facts(summary: AttackSummary) -> dict[str, str]:
+    """What was asked and done; the page has environment and seed."""
+    return {
+        "wanted": wording.goal_text(summary),
+        "changed": wording.changed_text(summary),
+        "objective": wording.objective_text(summary),
+        "printable": wording.print_cost_text(summary),
+        "over": wording.over_text(summary),
+        "along the drive": wording.drive_text(summary),
+        "smallest": wording.smallest_text(summary),
+        "failures": failures_text(summary.failures) if summary.failures else "",
+        "search": f"{summary.policy}, {wording.count(summary.steps, 'step')}: {summary.ending}",
+        "renders": wording.renders_text(summary),
+        "environment": "",
+        "seed": "",
+    }
+
+
+def failures_text(known: DifferentFailures) -> str:
+    """Return how many different failures there are, and which of that is verified."""
+    where = f"{known.found} of {count(known.seen, 'draw')}"
+    if known.places is not None:
+        where = f"{known.found} of {known.places} cells over {' and '.join(known.over)} ({known.seen} were seen)"
+    share = "" if known.share is None else f"; {failing_share_text(known.share)}"
+    if not known.tried:
+        return f"claimed in {where}{share}; none of these was tried with fresh renders"
+    return f"claimed in {where}{share}; with fresh renders {known.held} of the {known.tried} that were tried hold"
+
+
+def failing_share_text(share: FailingShare) -> str:
+    """Return how large a part of all configurations fails."""
+    interval = f"of all configurations {interval_text(share.interval)} fail in one render (95 % interval)"
+    return interval if share.estimate is None else f"{interval}, {percent(share.estimate)} by the estimate"
+
+
+def failures_part(known: DifferentFailures, *, tried: bool = False) -> AnswerPart:
+    """Return a table of the failures that are listed, or of those that were tried."""
+    columns: Mapping[str, Column] = {
+        "failures": range_text,
+        "most often answered": answered_text,
+        "holds in fresh renders": _held,
+        "objective": lambda one: number_text(one.objective),
+    }
+    return AnswerPart.table((one for one in known.listed if not tried or one.verified is not None), columns)
+
+
+def range_text(one: DifferentFailure) -> str:
+    """Return where a failure lies: ``pose.yaw 36 to 72 degrees, material.kind brass``."""
+    return ", ".join(f"{name} {_ends(one, name)}" for name in one.ranges) or "anywhere"
+
+
+def _ends(one: DifferentFailure, name: str) -> str:
+    ends = one.ranges[name]
+    if isinstance(ends, str):
+        return ends
+    value = one.configuration.get(name)
+    unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
+    return f"{number_text(ends[0])} to {number_text(ends[1])}{unit}"
+
+
+def answered_text(one: DifferentFailure) -> str:
+    """Return the most frequent wrong answer of its trials; empty where there is none."""
+    return next(iter(one.verified.labels), "") if one.verified else ""
+
+
+def _held(one: DifferentFailure) -> str:
+    if one.verified is None:
+        return "not tried"
+    rated = f"{one.verified.successes} of {count(one.verified.trials, 'render')}"
+    return f"yes, {rated}" if one.holds else f"no, {rated}"
+
+
+def _claims_of_attack(result: AttackSummary) -> Iterator[Claim]:
+    rate, spent = result.verified, searches_text(result.renders, result.policy, result.baseline is not None)
+    said = wording.attack_verdict(result)
+    extent = extent_of("fresh renders that count as a success", rate)
+    if result.ending == "found" and rate is not None and rate.successes:
+        yield claim("found", f"{said} How many such configurations there are is not known.", extent)
+    elif result.ending in ENDED and rate is not None:
+        yield claim("not found", f"{said} Searched were {spent}. {NO_PROOF}", extent)
+    else:
+        why = WHY.get(result.ending, f"the search ended as {result.ending!r} without trials that carry a claim")
+        yield nothing_claimed(why, said)
+    if result.average is not None:
+        yield average_claim(result.average, wording.budget_text(result))
+
+
+# ---- robust accuracy against epsilon --------------------------------------------------------------------------------
+
+CURVE_NOTE = (
+    "Robust: recognised as it is, and no answer was verified within the epsilon. That is what these attacks found: a "
+    "stronger one may find more. Clopper-Pearson intervals over objects."
+)
+
+
+def _shown_curve(result: CurveResult) -> ShownAnswer:
+    by_epsilon: Mapping[str, Column] = {
+        "epsilon": lambda one: plain_epsilon(one.epsilon) or "own",
+        "robust": "{0.robust}/{0.objects}",
+        "accuracy": lambda one: percent(one.accuracy),
+        "95 % interval": lambda one: interval_text(one.interval),
+        "wrong already": "{0.already_wrong}",
+    }
+    by_object: Mapping[str, Column] = {
+        "object": "{0.object}",
+        "clean right": lambda row: f"{row.clean.correct}/{row.clean.trials}" if row.clean else "",
+        "ending": lambda row: row.ending or "not reached",
+        "epsilon": lambda row: plain_epsilon(row.epsilon),
+        "wrong": lambda row: f"{row.verified.successes}/{row.verified.trials}" if row.verified else "",
+        "margin": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
+    }
+    points = _points(result)
+    told = "; ".join(f"{one.robust} of {one.objects} at {one.epsilon:g}" for one in points)
+    chart = AnswerPart(
+        "Robust accuracy",
+        [f"Over epsilon with 95 % intervals: {told}."],
+        draw=lambda axes: _draw_curve(result, axes),
+        size=(5.6, 3.6),
+        only="page" if len(points) > 1 else "notebook",
+    )
+    known = [one for one in result.curve if one.accuracy is not None]
+    curve = AnswerPart.table(known, by_epsilon, title="" if len(points) > 1 else chart.title, note=CURVE_NOTE)
+    runs = [row.run for row in result.table]
+    objects = AnswerPart.table(result.table, by_object, title="The objects, at the last epsilon tried", parts=runs)
+    meaning = AnswerPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
+    sections = [*([chart] if points else []), *([curve] if known else []), objects, meaning]
+    return ShownAnswer(_said_of_curve(result), sections, {"model": result.model, "policy": result.policy})
+
+
+def _said_of_curve(result: CurveResult) -> str:
+    known = [one for one in result.curve if one.accuracy is not None]
+    if not known:
+        return "No object was attacked to the end."
+    said = [f"{one.robust} of {one.objects}" + _at(one.epsilon) for one in (known[:1] + known[1:][-1:])]
+    return f"Still recognised: {' and '.join(said)}." if len(result.objects) > 1 else _of_one(result)
+
+
+def _of_one(result: CurveResult) -> str:
+    row = result.table[0]
+    if row.ending == "already wrong":
+        return f"The model is wrong about {row.object} as it is."
+    if row.flips_at is None:
+        return f"{row.object} is recognised{_at(row.tried)}."
+    return f"{row.object} is first got wrong at epsilon {plain_epsilon(row.flips_at)}."
+
+
+def _at(epsilon: float | None) -> str:
+    return "" if epsilon is None else f" at epsilon {epsilon:g}"
+
+
+def plain_epsilon(value: EpsilonBudget) -> str:
+    """Return an epsilon as text, by control where there are more; empty of none."""
+    if isinstance(value, dict):
+        return ",".join(f"{name}={plain_epsilon(one)}" for name, one in value.items())
+    return "" if value is None else wording.number_text(value)
+
+
+def _draw_curve(answer: CurveResult, axes: Any) -> None:
+    points = _points(answer)
+    at, accuracy = [one.epsilon for one in points], [one.accuracy for one in points]
+    low, high = ([one.interval[end] for one in points] for end in (0, 1))
+    axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
+    axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
+    axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
+    axes.set_title(f"{', '.join(answer.controls)}: {points[0].objects} objects, {answer.model}")
+    axes.grid(True)
+    axes.legend()
+
+
+def _points(answer: CurveResult) -> list[CurvePoint]:
+    return [one for one in answer.curve if one.epsilon is not None and one.accuracy is not None]
+
+
+def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
+    each = [row.renders for row in result.table if row.renders]
+    total = {kind: sum(one.get(kind, 0) for one in each) for kind in {kind for one in each for kind in one}}
+    searched = searches_text(total, result.policy, bool(total.get("baseline")))
+    spent = f"Searched were, of all objects and epsilons together, {searched}. "
+    for point in result.curve:
+        if point.accuracy is None:
+            continue
+        extent = Extent(
+            what="objects without a failure", count=point.robust, total=point.objects, interval=point.interval
+        )
+        where = "the controls' own budget" if point.epsilon is None else f"epsilon {point.epsilon:g}"
+        text = (
+            f"Within {where} the policy {result.policy} found no failure of {share_text(extent)} objects; "
+            f"{point.already_wrong} are wrong as they are. {spent if total else ''}{NO_PROOF}"
+        )
+        yield claim("measured", text, extent)
+
+
+# ---- attacked on against tested on ----------------------------------------------------------------------------------
+
+
+def _shown_matrix(result: MatrixResult) -> ShownAnswer:
+    """The matrix, with a row for the clean scene; the stronger a cell's colour, the more successes."""
+    heads = ["attacked on", "ending", *(f"tested on {short_name(one.model)}" for one in result.tested)]
+    clean = [one.clean for one in result.tested]
+    counts = [f"right {one.correct}/{one.trials}{wording.no_numbers(one.not_a_number)}" for one in clean]
+    right = [f"{text}, {interval_text(one.interval)}" for text, one in zip(counts, clean, strict=True)]
+    rows = [["clean scene", "", *right]] if clean else []
+    before = len(rows)
+    rows += [[short_name(row.attacked), row.ending, *map(_cell, row.tested)] for row in result.table]
+    shares = {
+        (before + up, 2 + across): cell.verified.rate
+        for up, row in enumerate(result.table)
+        for across, cell in enumerate(row.tested)
+    }
+    spp = f", {result.tested[0].spp} samples per pixel" if result.tested else ""
+    note = (
+        "Successes of the trials, in which the model is wrong on the answer and right on the clean scene with the same "
+        "seed, with 95 % Clopper-Pearson intervals; * where that is verified. All models are shown the scene with the "
+        f"same seeds{spp}, rounded to 8 bits. The stronger a cell's colour, the more successes."
+    )
+    runs = [*[None] * before, *(row.run for row in result.table)]
+    table = AnswerPart("Attacked on, tested on", heads=heads, rows=rows, note=note, parts=runs, shares=shares)
+    tried = sum(bool(row.tested) for row in result.table)
+    size = (2.6 + 1.3 * len(result.models), 1.8 + 0.5 * tried)
+    figure = AnswerPart(draw=lambda axes: _draw_matrix(result, axes), size=size, only="notebook")
+    facts = {
+        "models": ", ".join(f"{one.model} ({' x '.join(map(str, one.input_size))})" for one in result.tested),
+        "ensemble": result.ensemble or "",
+        "policy": result.policy,
+    }
+    return ShownAnswer(_said_of_matrix(result), [table, *([figure] if tried else [])], facts)
+
+
+def _said_of_matrix(result: MatrixResult) -> str:
+    pairs = [(row, cell) for row in result.table for cell in row.tested]
+    if not pairs:
+        return "No answer was tried on any model."
+    if result.ensemble is not None:
+        held = sum(cell.ending == "found" for _, cell in pairs)
+        return f"One answer to all models together misleads {held} of {len(pairs)}."
+    own = [cell for row, cell in pairs if cell.model == row.attacked]
+    others = [cell for row, cell in pairs if cell.model != row.attacked]
+    held, passed = (sum(cell.ending == "found" for cell in cells) for cells in (own, others))
+    return (
+        f"{held} of {len(own)} answers hold on the model that they were searched on; "
+        f"{passed} of {len(others)} on another one."
+    )
+
+
+def _cell(cell: MatrixCell) -> str:
+    rated = cell.verified
+    mark = " *" if cell.ending == "found" else " (wrong already)" if cell.ending == "already wrong" else ""
+    rate = f"{rated.successes}/{rated.trials}{wording.no_numbers(rated.not_a_number)}"
+    return f"{rate}, {wording.interval_text(rated.interval)}{mark}"
+
+
+def _draw_matrix(answer: MatrixResult, axes: Any) -> None:
+    rows = [row for row in answer.table if row.tested]
+    rates = [[cell.verified.rate for cell in row.tested] for row in rows]
+    axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")
+    for up, row in enumerate(rows):
+        for across, cell in enumerate(row.tested):
+            rated = cell.verified
+            colour = "white" if rated.rate > 0.6 else "black"
+            text = f"{rated.successes}/{rated.trials}"
+            axes.text(across, up, text, ha="center", va="center", color=colour)
+    names = [short_name(one.model) for one in answer.tested]
+    axes.set_xticks(range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0)
+    axes.set_yticks(range(len(rows)), [short_name(row.attacked) for row in rows])
+    axes.set(xlabel="tested on", ylabel="attacked on")
+    axes.set_title(f"{', '.join(answer.objects)}, {', '.join(answer.controls)}: wrong in trials")
+
+
+def _claims_of_matrix(result: MatrixResult) -> Iterator[Claim]:
+    for row in result.table:
+        for cell in row.tested:
+            name = f"searched on {row.attacked}, tried on {cell.model}"
+            own = cell.model == row.attacked
+            spent = searches_text(row.renders, result.policy, False) if own else None
+            yield case_claim(name, cell.ending, cell.verified, spent)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import losses
 from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.cluster.executor import Call
+from advsearch.cluster import Call
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.controls.values import sentences
 from advsearch.engine.attack_parts import (
@@ -31,17 +32,10 @@ from advsearch.engine.attack_parts import (
     with_derivatives,
 )
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.journal import Journal, check_made_of
-from advsearch.engine.loading import (
-    Controls,
-    Scene,
-    load_scene,
-    only_here,
-    scene_as_settings,
-    settings_of,
-)
-from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
-from advsearch.engine.metrics import only_here as metrics_only_here
+from advsearch.engine.journal import Journal, Shared, answering, check_made_of
+from advsearch.engine.judging import Metric, check_shared, load_metrics, metrics_as_settings
+from advsearch.engine.judging import only_here as metrics_only_here
+from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
 from advsearch.engine.naming import (
     OF_SCENE,
     AnyModel,
@@ -55,7 +49,6 @@ from advsearch.engine.naming import (
 from advsearch.engine.outcome import summarise
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.stages import Attack
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError
@@ -64,13 +57,10 @@ from advsearch.models import Model
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.attack.several import matrix_from_config
+from advsearch.questions.attack.several import curve_from_config, matrix_from_config
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 PREPARING = "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""
@@ -117,10 +107,6 @@ def attack(
         run: folder to keep the run in; None keeps it in memory only.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
     task = make_task(task) if callable(task) else task
@@ -175,30 +161,16 @@ def attack(
         loaded = models_as_one(model, config, asked)
         measured = load_metrics(config.metrics, metrics)
         job = AttackParts(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
-        if folder is None:
-            return _carry_out(job, watcher(progress))
-        return _go_on(job, folder, watcher(progress))
+        return _carry_out(job, watcher(progress), folder)
 
 
 def attack_from_config(
     config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> AttackResult | CurveResult | MatrixResult:
-    """Do what a configuration describes: one attack, a curve or a matrix of several; see `attack`.
-
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with: what was evaluated is not rendered again.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Do what a configuration describes: one attack, a curve or a matrix of several; see `attack`."""
     if config.is_matrix:
         return matrix_from_config(config, progress=progress, resumed=resumed)
     if config.is_curve:
-        # a circle: several attacks are attacks
-        from advsearch.questions.attack.several import curve_from_config
-
         return curve_from_config(config, progress=progress, resumed=resumed)
     return attack_once(config, progress=progress, resumed=resumed)
 
@@ -219,7 +191,7 @@ def attack_once(
     progress = progress or NullProgress()
     progress.stage(LOADING)
     job = replace(parts_of(config), clean=clean or CleanMatrix())
-    return _carry_out(job, progress) if resumed is None else _go_on(job, resumed, progress)
+    return _carry_out(job, progress, resumed)
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
@@ -264,17 +236,20 @@ def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
     return fixed
 
 
-def _carry_out(job: AttackParts, progress: Progress, run: RunDirectory | None = None) -> AttackResult:
-    """Do it all, in a run directory of its own unless one is given that was begun already."""
-    stages = Stages(progress)
-    stages.begin("setup", PREPARING)
-    problem = problem_on(job)
-    own = job.scene.description
-    warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
-    for text in warnings:
-        progress.message(text)
-    policy = _policy(job, problem)
-    with _directory(job, run) as kept:
+def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None = None) -> AttackResult:
+    """Do it all, or what is left of a run, in a run directory if it is kept."""
+    with ExitStack() as stack:
+        kept = None if resumed is None else stack.enter_context(RunDirectory.of(job.config, resumed))
+        stages = Stages(progress)
+        stages.begin("setup", PREPARING)
+        problem = problem_on(job)
+        own = job.scene.description
+        warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
+        for text in warnings:
+            progress.message(text)
+        policy = _policy(job, problem)
+        if kept is None and job.keep:
+            kept = stack.enter_context(RunDirectory.of(job.config))
         if kept is not None:
             functions = {f"metric {name}": one for name, one in job.metrics.items()}
             objective = {"objective": job.objective} if callable(job.objective) else {}
@@ -308,18 +283,3 @@ def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
     if not isinstance(job.policy, str):
         return with_derivatives(job.policy, job.config)
     return with_derivatives(make_policy(job.policy, **job.config.policy_options), job.config)
-
-
-def _go_on(job: AttackParts, run: str | Path, progress: Progress) -> AttackResult:
-    """Carry out what is left of a run."""
-    with RunDirectory.of(job.config, run) as kept:
-        return _carry_out(job, progress, kept)
-
-
-@contextmanager
-def _directory(job: AttackParts, run: RunDirectory | None) -> Iterator[RunDirectory | None]:
-    if run is not None or not job.keep:
-        yield run
-        return
-    with RunDirectory.of(job.config) as made:
-        yield made

@@ -8,7 +8,6 @@ from advsearch.report.wording import count, number_text, print_cost_text, second
 from advsearch.runs.results.attack import AttackSummary, PrintTerms
 
 PLAN_HEADS = ("parameter", "numbers", "derivative", "why", "step")
-"""Of the columns of a gradient plan."""
 
 
 def method_facts(summary: AttackSummary) -> dict[str, str]:

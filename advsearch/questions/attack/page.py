@@ -13,13 +13,13 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from advsearch.files import JsonObject
+from advsearch.questions.attack.answer import answered_text, failures_part, failures_text, range_text
 from advsearch.questions.attack.method import PLAN_HEADS, method_facts, plan_rows, plan_text
-from advsearch.questions.attack.words import answered_text, failures_part, failures_text, range_text
 from advsearch.report import wording
 from advsearch.report.markup import NARROW, WIDE, Curve, Html, element, join_html, objective_chart
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, is_command, marks_text, objective_label
 from advsearch.runs import directory, images, store
-from advsearch.runs.results.attack import AttackSummary, DifferentFailure, FoundValue, PicturedAnswer
+from advsearch.runs.results.attack import AttackSummary, FoundValue, PicturedAnswer
 from advsearch.runs.results.base import Result
 from advsearch.runs.summary import attack_of
 from advsearch.viewer.document import (
@@ -49,16 +49,12 @@ MOST_TRIALS = 24
 AT_THE_END = 1e-6
 """Of a range: as near as that to one of its ends a value was stopped by it."""
 
-_PNG = "image/png"
-
 
 @dataclass(frozen=True)
 class RunData:
     """What a run left behind, as far as the page shows it.
 
     Attributes:
-        path: the run directory.
-        summary: of `summary.json`.
         recipe: the text of `run.yaml`; empty when there is none.
         pictures: path inside the run directory to a data URL, sorted.
         curves: kind of evaluation to its objectives in order.
@@ -81,21 +77,12 @@ def page(run: Path, result: Result) -> str | None:
     Raises:
         FileFormatError: the results are damaged.
     """
-    return attack_page_html(read_run(run)) if isinstance(result, AttackSummary) else None
-
-
-def read_run(path: Path) -> RunData:
-    """Return what the run in `path` left behind; errors as for `page`."""
-    recipe = path / directory.CONFIG
-    return RunData(
-        path=path,
-        summary=attack_of(path),
-        recipe=recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else "",
-        pictures=_read_pictures(path),
-        curves=_read_curves(path / store.NAME),
-        frames=_read_frames(path / directory.IMAGES / "search.gif"),
-        thing=read_object(path),
-    )
+    if not isinstance(result, AttackSummary):
+        return None
+    recipe = run / directory.CONFIG
+    text = recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else ""
+    curves, frames = _read_curves(run / store.NAME), _read_frames(run / directory.IMAGES / "search.gif")
+    return attack_page_html(RunData(run, attack_of(run), text, _read_pictures(run), curves, frames, read_object(run)))
 
 
 def attack_page_html(data: RunData) -> str:
@@ -118,14 +105,10 @@ def attack_page_html(data: RunData) -> str:
     given = [data_script(_animation(data), "frames")] if data.frames else []
     given += object_data(data.thing)
     scripts = ["make.js", "attack.js", *(["object.js"] if data.thing else [])]
-    return document(wording.title(summary), _header(summary), main, data=given, scripts=scripts, footer=footer)
-
-
-def _header(summary: AttackSummary) -> Html:
     about = subject_html(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
-    return heading(
-        join_html(f"{wording.budget_text(summary)}; ", about), wording.attack_verdict(summary), wording.remarks(summary)
-    )
+    asked = join_html(f"{wording.budget_text(summary)}; ", about)
+    header = heading(asked, wording.attack_verdict(summary), wording.remarks(summary))
+    return document(wording.title(summary), header, main, data=given, scripts=scripts, footer=footer)
 
 
 def _pictures(data: RunData) -> Html:
@@ -143,6 +126,7 @@ def _pictures(data: RunData) -> Html:
     ]
     trials = [name for name in data.pictures if name.startswith("images/verification")]
     trials = ([name for name in trials if name.endswith("-answer.png")] or trials)[:MOST_TRIALS]
+    small = _section("", [_figure(data, name, "", _trial(name)) for name in trials], "small")
     compare = element("div", id="compare", hidden="hidden")
     steps = join_html(element("h2", "The search, step by step"), element("div", id="search"))
     search = element("div", steps, hidden="hidden", class_="screen")
@@ -151,7 +135,7 @@ def _pictures(data: RunData) -> Html:
         compare,
         _section("", shown, note=_same_conditions(summary)),
         _section("What it answers", answered, "large", marks_text(summary.task)),
-        _details("Pictures of the verification", [_figure(data, name, "", _trial(name)) for name in trials], "small"),
+        element("details", element("summary", "Pictures of the verification"), small) if trials else None,
         search if data.frames else None,
     )
 
@@ -176,12 +160,14 @@ def _textures(data: RunData) -> Html:
 
 
 def _failures(data: RunData) -> Html:
-    """Many different failures, of a policy that looks for them: a table, and pictures of those that were tried."""
     known = data.summary.failures
     if known is None:
         return Html("")
+    task = data.summary.task
     shown = [
-        _figure(data, one.picture, _failure_caption(data.summary, one), range_text(one))
+        _figure(
+            data, one.picture, answer_text(task, one.pictured) if one.pictured else answered_text(one), range_text(one)
+        )
         for one in known.listed
         if one.picture and one.holds
     ]
@@ -192,10 +178,6 @@ def _failures(data: RunData) -> Html:
         element("div", *shown, class_="pictures") if shown else None,
         study_table(table.heads, table.rows) if table.rows else None,
     )
-
-
-def _failure_caption(summary: AttackSummary, one: DifferentFailure) -> str:
-    return answered_text(one) if one.pictured is None else answer_text(summary.task, one.pictured)
 
 
 def _rates(summary: AttackSummary) -> Html:
@@ -289,7 +271,6 @@ def _cost(summary: AttackSummary) -> Html:
 
 
 def _method(summary: AttackSummary) -> Html:
-    """How the search worked, and how it got its derivatives; folded."""
     worked = element("details", element("summary", "How the search worked"), facts_table(method_facts(summary)))
     rows = plan_rows(summary)
     if not rows:
@@ -320,14 +301,6 @@ def _section(heading: str, figures: Iterable[Html | None], css: str = "", note: 
     remark = element("p", note, class_="soft") if note else None
     title = element("h2", heading) if heading else None
     return join_html(title, element("div", *shown, class_=f"pictures {css}".strip()), remark)
-
-
-def _details(heading: str, figures: Iterable[Html | None], css: str = "") -> Html:
-    shown = [figure for figure in figures if figure is not None]
-    if not shown:
-        return Html("")
-    pictures = element("div", *shown, class_=f"pictures {css}".strip())
-    return element("details", element("summary", heading), pictures)
 
 
 def _figure(data: RunData, name: str, heading: str, caption: str) -> Html | None:
@@ -387,12 +360,11 @@ def _place(one: FoundValue) -> Html | None:
     """Where the clean and the found value lie between the ends of the range: a ring and a dot."""
     if one.low is None or one.high is None or not isinstance(one.value, (int, float)):
         return None
-    width = one.high - one.low
+    low, width = one.low, one.high - one.low
 
     def at(value: float) -> str:
-        return f"left: {min(max((value - one_low) / width, 0.0), 1.0):.1%}"
+        return f"left: {min(max((value - low) / width, 0.0), 1.0):.1%}"
 
-    one_low = one.low
     marks = [element("span", style=at(one.clean), class_="from")] if isinstance(one.clean, (int, float)) else []
     words = f"from {wording.number_text(one.low)} to {wording.number_text(one.high)}"
     stopped = min(one.value - one.low, one.high - one.value) <= AT_THE_END * width
@@ -410,12 +382,17 @@ def _animation(data: RunData) -> JsonObject:
 
 
 def _read_pictures(path: Path) -> dict[str, str]:
-    """Return a data URL for each picture of the run."""
     found = sorted(
         file for folder in (directory.IMAGES, directory.ARTIFACTS) for file in (path / folder).glob("*.png")
         if file.is_file()
     )  # fmt: skip
-    return {file.relative_to(path).as_posix(): _data_url(file) for file in found}
+    read = {file: file.read_bytes() for file in found}
+    return {
+        file.relative_to(path).as_posix(): data_url(
+            images.smaller_png(data, SMALLER_SIDE) if len(data) > LARGE_PICTURE else data, "image/png"
+        )
+        for file, data in read.items()
+    }
 
 
 def _read_frames(file: Path) -> list[str]:
@@ -430,11 +407,6 @@ def _read_frames(file: Path) -> list[str]:
     except (OSError, SyntaxError, Image.DecompressionBombError):
         return []
     return frames if len(frames) > 1 else []
-
-
-def _data_url(file: Path) -> str:
-    data = file.read_bytes()
-    return data_url(images.smaller_png(data, SMALLER_SIDE) if len(data) > LARGE_PICTURE else data, _PNG)
 
 
 def _read_curves(path: Path) -> dict[str, list[float | None]]:

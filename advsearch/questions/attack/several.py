@@ -1,8 +1,4 @@
-"""Several attacks as one answer: robust accuracy against epsilon, and answers tried on other models.
-
-The curve attacks several objects with several epsilons. The matrix attacks several models, and tries each answer on all
-of them, in pictures that are the same for all.
-"""
+"""Several attacks as one answer: robust accuracy of objects against epsilon, and answers tried on other models."""
 
 from __future__ import annotations
 
@@ -18,15 +14,15 @@ from advsearch import seeds
 from advsearch.api.studies import SETTLED, StudyRun, carry_out_study
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster.executor import Call, Executor
+from advsearch.cluster import Call, Executor
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, check_from_config, executor_for, problem_from_config
+from advsearch.engine.journal import answering
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import RetrialCondition, Retrials
-from advsearch.engine.rows import control_group, verified_rate
-from advsearch.engine.sharing import answering
+from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
+from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.files import JsonObject
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
@@ -53,11 +49,6 @@ def curve_from_config(
     The epsilons are tried from the smallest. An object that flips at one of them flips at every larger one, whose ball
     has the same configuration in it, so it is not attacked again. An object that is wrong as it is counts as not robust
     at any epsilon, and is told apart from those that were found.
-
-    Args:
-        config: with one or several objects and epsilons.
-        progress: told how far it is.
-        resumed: folder of the run to go on with.
     """
     epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
 
@@ -147,14 +138,6 @@ def matrix_from_config(
     Trial k has the same seed for every answer and every model, and none that a search or its verification has used.
     Models of one input size are shown the same picture; for another size the same configuration is rendered anew. A
     success needs the model to be right on the clean scene with the same seed, as everywhere.
-
-    Args:
-        config: with several models.
-        progress: told how far it is.
-        resumed: folder of the run to go on with.
-
-    Raises:
-        InputError: anything that the caller can put right, such as a model that has no class for the label.
     """
     names, progress = different(config.models, "model"), progress or NullProgress()
     progress.stage(LOADING)
@@ -253,12 +236,7 @@ class Transfer:
         return [self._control(one) for one in self._conditions]
 
     def on_each(self, attacked: str, u: Tensor) -> list[MatrixCell]:
-        """Try one answer on every model.
-
-        Args:
-            attacked: the model that it was searched on.
-            u: (d,) the answer.
-        """
+        """Try the answer (d,) to one model on every model."""
         self._begin(f"trying the answer to {attacked} on every model")
         checked = {one.name: self._retrials.answer(attacked, u, one) for one in self._conditions}
         return [

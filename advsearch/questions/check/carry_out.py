@@ -6,12 +6,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
 from advsearch.controls import CONTROLS
-from advsearch.engine import run_settings
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import (
     FACTORS,
@@ -27,18 +28,10 @@ from advsearch.engine.gradients import (
     smooth_loss,
 )
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
-from advsearch.engine.naming import AnyModel
-from advsearch.engine.planning import (
-    CONVERGED,
-    COUNTS,
-    cosine_samples,
-    cosines,
-    measured_plan,
-    plan_gradients,
-    tuned,
-)
+from advsearch.engine.naming import AnyModel, settings_alone
+from advsearch.engine.planning import CONVERGED, COUNTS, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
+from advsearch.engine.record import Results, kept_rows
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.check.answer import (
     WHOLE,
@@ -55,9 +48,6 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import CosineRow
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients import STEP_RANGE, Group, compared
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class CheckKeywords(PlanKeywords, total=False):
@@ -92,18 +82,7 @@ def check(
     progress: Watched = None,
     **settings: Unpack[CheckKeywords],
 ) -> CheckResult:
-    """Compare the gradient of every parameter of a scene with differences (docs/gradients.md).
-
-    All other arguments are the settings of `advsearch check`. The run is kept, in `run` or under runs/.
-
-    Args:
-        object: from `load_scene`, or the name of an object, or a file of one.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Compare the gradient of every parameter of a scene with differences (docs/gradients.md)."""
     config = configured(CheckConfig, object=object, model=model, **settings)
     return check_from_config(config, progress=watcher(progress))
 
@@ -115,9 +94,6 @@ def check_from_config(
 
     What is measured is stored at once, so that a check that was stopped, by Ctrl-C, by a kill or because its `seconds`
     were over, goes on where it was and ends with the same rows; only times differ.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     progress, begun = progress or NullProgress(), time.perf_counter()
     progress.stage(LOADING)
@@ -149,18 +125,9 @@ def check_from_config(
         return kept_rows(run, results, rows(), result)
 
 
-# ---- what is measured, and what was ---------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class CheckedPart:
-    """One scene with its controls and one loss: what is checked in one go.
-
-    Attributes:
-        number: from 1.
-        config: the scene, and what may vary.
-        loss: "linear" or "model".
-    """
+    """One scene with its controls and one loss ("linear" or "model"): what is checked in one go; numbered from 1."""
 
     number: int
     config: CheckConfig
@@ -195,7 +162,7 @@ def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
                     "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
                     "controls": {control: {}},
                     "label": None,
-                    **run_settings.alone(config, control, {}),
+                    **settings_alone(config, control, {}),
                 }
             )
 
@@ -219,7 +186,6 @@ def _rows_of(part: CheckedPart, parts: int, results: Results, progress: Progress
 
 
 def _line(row: CheckedRow) -> str:
-    """A row in a line, for whoever waits."""
     how = f"cosine {row.cosine:.2f}" if isinstance(row, DirectionRow) else f"{row.gradient:.3g}"
     return f"{row.object}, {row.name} by {row.estimator}: {how}, {row.status}"
 
@@ -356,7 +322,6 @@ def _rows(
 
 
 def _key(part: CheckedPart, what: str, along: Sequence[Probe]) -> str:
-    """Under which a measurement is stored."""
     return f"{part.key} {what} {','.join(probe.name for probe in along)}"
 
 

@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import Named, Names, SampledKeywords, asks, configured
 from advsearch.api.studies import carry_out_part
 from advsearch.attacks import clopper_pearson
 from advsearch.engine.loading import Controls
-from advsearch.engine.sweeps.job import check_all
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import interruptible
@@ -21,17 +21,14 @@ from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult, PairPicture
 from advsearch.questions.compare.settings import CompareConfig
 from advsearch.questions.compare.sides import Side, compared, differing, far_apart, read_sides, varying
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.settings import split_names
 from advsearch.viewer import thumbnails
 from advsearch.viewer.columns import Column
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 SWEEP = "sweep"
 """The part that holds the sweep of models."""
@@ -51,10 +48,7 @@ class CompareKeywords(SampledKeywords, total=False):
 
 @asks(CompareConfig, CompareKeywords)
 def compare(
-    compared: str | Path | Sequence[str | Path],
-    *,
-    progress: Watched = None,
-    **settings: Unpack[CompareKeywords],
+    compared: str | Path | Sequence[str | Path], *, progress: Watched = None, **settings: Unpack[CompareKeywords]
 ) -> CompareResult:
     """Compare models, objects or answers on the same pictures, pair by pair (docs/compare.md).
 
@@ -64,10 +58,6 @@ def compare(
     Args:
         compared: names or folders of runs of `sweep`: one of several models, or several of the same draws. With
             `object`, names of models, which are shown it first.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     return compare_from_config(configured(CompareConfig, compared=compared, **settings), progress=watcher(progress))
 
@@ -118,9 +108,7 @@ def compare_from_config(
             seed=config.seed,
             command_line=config.command_line(),
         )
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _counted(first: Side, second: Side, seed: int, pictures: _Pictures) -> ComparedPair:
@@ -135,16 +123,10 @@ def _counted(first: Side, second: Side, seed: int, pictures: _Pictures) -> Compa
 
 def _side(side: Side) -> ComparedSide:
     right, total = int(side.right.sum()), len(side)
-    return ComparedSide(
-        name=side.name,
-        run=str(side.folder),
-        **side.named,
-        configurations=total,
-        correct=right,
-        accuracy=right / total,
-        interval=clopper_pearson(right, total),
-        seconds=side.seconds,
-    )
+    counts = {"configurations": total, "correct": right, "accuracy": right / total}
+    interval = clopper_pearson(right, total)
+    named = {"name": side.name, "run": str(side.folder), **side.named}
+    return ComparedSide(**named, **counts, interval=interval, seconds=side.seconds)
 
 
 def _together(names: Sequence[str]) -> str:
@@ -168,9 +150,6 @@ def _cautions(sides: Sequence[Side]) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-# ---- pictures -------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class _Pictures:
     """Small pictures of pairs in the folder of the run: those that sweeps kept, or rendered again."""
@@ -183,21 +162,16 @@ class _Pictures:
     scenes: dict[Path, Scenes | None] = field(default_factory=dict)
 
     def of(self, first: Side, second: Side, most: int, pair: int) -> Iterator[PairPicture]:
-        """Yield what one side alone gets right, with pictures as far as they are to be had.
-
-        Args:
-            first: of the sides.
-            second: of them.
-            most: pictures of each.
-            pair: number of the two.
-        """
+        """Yield what one side alone gets right, at most so many of each, with pictures as far as they are to be had."""
         numbers, columns = far_apart(first, second, most), varying(first.columns)
         together = first.folder == second.folder and bool((first.numbers == second.numbers).all())
         sides = [first] if together else [first, second]
         with suppress(KeyboardInterrupt), interruptible():
             self._make(numbers, sides, pair)
         for number in numbers:
-            names = [name for place in range(len(sides)) if self._file(name := _name(pair, number, place)).is_file()]
+            names = [
+                name for place in range(len(sides)) if (self.folder / (name := _name(pair, number, place))).is_file()
+            ]
             yield PairPicture(
                 number=number,
                 values={one.name: _value(one, number) for one in columns},
@@ -212,7 +186,7 @@ class _Pictures:
         missing: list[tuple[Side, int, Path]] = []
         for place, side in enumerate(sides):
             for number in numbers:
-                file = self._file(_name(pair, number, place))
+                file = self.folder / _name(pair, number, place)
                 kept = thumbnails.path_of(side.folder, int(side.numbers[number]))
                 if kept.is_file():
                     write_bytes(file, kept.read_bytes(), durable=False)
@@ -233,19 +207,13 @@ class _Pictures:
         if side.folder not in self.scenes:
             self.scenes[side.folder] = None
             try:
-                job = job_of(side.config)
-                check_all(job)
-                self.scenes[side.folder] = Scenes(job)
+                self.scenes[side.folder] = scenes_of(side.config)
             except (InputError, ModelError) as error:
                 self.warnings.append(f"Pictures of {side.folder.name} are not shown: {error}")
         return self.scenes[side.folder]
 
-    def _file(self, name: str) -> Path:
-        return self.folder / name
-
 
 def _name(pair: int, number: int, place: int) -> str:
-    """The file of a picture of a pair, in the folder of the run."""
     return f"images/pair-{pair}-{number}-{'ab'[place]}.jpg"
 
 

@@ -10,7 +10,7 @@ from pydantic import ValidatorFunctionWrapHandler, field_validator, model_valida
 from advsearch.config.scene import SceneConfig
 from advsearch.config.sweep import SweepConfig
 from advsearch.errors import InputError
-from advsearch.settings import as_text, check_once, setting, setting_as_in, settings, split_names
+from advsearch.settings import each_once, setting, setting_as_in, settings, split_names, texts
 
 ALWAYS = ("compared", "pictures", "seed", "threads", "deterministic", "run", "overwrite")
 """The settings that mean something for stored sweeps, too."""
@@ -48,16 +48,8 @@ class CompareConfig(SweepConfig):
     keep_pictures: Literal["all", "wrong", "none"] = setting_as_in(SweepConfig, "keep_pictures", default="wrong")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/WHAT-compare-NNN")
 
-    @field_validator("compared", mode="before")
-    @classmethod
-    def _named(cls, value: Any) -> Any:
-        return as_text(value, several=True)
-
-    @field_validator("compared")
-    @classmethod
-    def _different(cls, value: str) -> str:
-        check_once(split_names(value), "compared")
-        return value
+    _named = texts(several=["compared"])
+    _different = each_once("compared")
 
     @field_validator("object", mode="wrap")
     @classmethod

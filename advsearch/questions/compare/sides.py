@@ -20,8 +20,7 @@ from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import mcnemar, paired_difference
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
-from advsearch.explanations.observations import Factor, Observations
-from advsearch.explanations.rules import FEWEST_ROWS, CountedRule, condition_rows, find_rules
+from advsearch.explanations import FEWEST_ROWS, CountedRule, Factor, Observations, condition_rows, find_rules
 from advsearch.questions.compare.answer import ComparedPair, CountOf, PairPart, PairRule
 from advsearch.report.wording import short_names
 from advsearch.runs.directory import CONFIG
@@ -137,9 +136,6 @@ def observations(columns: Sequence[Column], right: Mask) -> Observations | None:
     return Observations(tuple(factors), np.stack(values, axis=1), right) if values else None
 
 
-# ---- reading --------------------------------------------------------------------------------------------------------
-
-
 def _sides_of(folder: Path, *, alone: bool) -> list[Side]:
     summary = read_result(folder)
     if not isinstance(summary, SweepSummary):
@@ -165,24 +161,23 @@ def _sides_of(folder: Path, *, alone: bool) -> list[Side]:
         for model in range(models):
             rows = order[numbers * models + model]
             columns = tuple(replace(one, data=one.data[rows]) for one in found.parameters)
-            named = {one.name: _together(one) for one in columns if one.name in OF_THE_SIDE}
-            named.setdefault("object", summary.object)
-            named.setdefault("model", config.models[model])
-            named.setdefault("answer", "")
-            side = Side(
-                name="",
-                folder=folder,
-                config=config,
-                summary=summary,
-                named=named,
-                numbers=numbers,
-                right=found.right[rows] == 1,
-                margin=found.margin[rows],
-                answers=np.array(found.answers)[found.answer[rows]],
-                columns=tuple(one for one in columns if one.name not in ("model", "answer")),
-                seconds=seconds,
+            named = {"object": summary.object, "model": config.models[model], "answer": ""}
+            named |= {one.name: _together(one) for one in columns if one.name in OF_THE_SIDE}
+            sides.append(
+                Side(
+                    name="",
+                    folder=folder,
+                    config=config,
+                    summary=summary,
+                    named=named,
+                    numbers=numbers,
+                    right=found.right[rows] == 1,
+                    margin=found.margin[rows],
+                    answers=np.array(found.answers)[found.answer[rows]],
+                    columns=tuple(one for one in columns if one.name not in ("model", "answer")),
+                    seconds=seconds,
+                )
             )
-            sides.append(side)
     return sides
 
 
@@ -199,11 +194,7 @@ def _together(column: Column) -> str:
     return ",".join(levels[number] for number in dict.fromkeys(column.data.tolist()) if number < len(levels))
 
 
-# ---- comparing ------------------------------------------------------------------------------------------------------
-
-
 def _check_pair(first: Side, other: Side) -> None:
-    """Refuse sides whose pictures are no pairs."""
     if first.folder == other.folder:
         return
     where = f"{first.folder} and {other.folder}"
@@ -260,17 +251,8 @@ MOST_VALUES = 64
 
 
 def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> ComparedPair:
-    """Return what the pairs of two sides say, without pictures.
-
-    Args:
-        first: of them.
-        second: of them.
-        seed: of which half of the pairs chooses rules, and which counts them.
-        rules: whether they are sought.
-
-    Raises:
-        InputError: rules are sought, and scikit-learn is missing.
-    """
+    """Return what the pairs of two sides say, without pictures; an InputError where rules are sought and scikit-learn
+    is missing. `seed` says which half of the pairs chooses rules, and which counts them."""
     columns = shared_columns(first, second)
     lost, won = first.right & ~second.right, ~first.right & second.right
     return ComparedPair(
@@ -286,15 +268,8 @@ def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> Com
 
 
 def far_apart(first: Side, second: Side, most: int) -> list[int]:
-    """Return numbers of pairs that one side alone gets right: first those of the first side, then those of the second.
-
-    Of each side the ones where the margins are farthest apart come first.
-
-    Args:
-        first: of the sides.
-        second: of them.
-        most: of each side.
-    """
+    """Return numbers of pairs that one side alone gets right, at most so many of each: first those of the first side,
+    where the margins are farthest apart first."""
     apart = np.nan_to_num(second.margin.astype(np.float64) - first.margin, nan=0.0)
     found: list[int] = []
     for alone, sign in ((first.right & ~second.right, -1.0), (~first.right & second.right, 1.0)):
@@ -334,9 +309,6 @@ def _masks(column: Column) -> Iterator[tuple[AxisValue, Mask]]:
             yield from ((float(f"{value:.6g}"), column.data == value) for value in values)
 
 
-# ---- rules ----------------------------------------------------------------------------------------------------------
-
-
 def _rules(columns: Sequence[Column], alone: Mask, seed: int) -> list[PairRule] | None:
     """Where one side alone is right more often than elsewhere; None of too few pairs, or where nothing varies.
 
@@ -357,5 +329,4 @@ def _rule(rule: CountedRule, factors: Sequence[Factor]) -> PairRule:
 
 
 def _count_of(count: int, total: int) -> CountOf:
-    interval = clopper_pearson(count, total) if total else (0.0, 1.0)
-    return CountOf(count=count, total=total, interval=interval)
+    return CountOf(count=count, total=total, interval=clopper_pearson(count, total) if total else (0.0, 1.0))

@@ -6,29 +6,27 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
-from advsearch.explanations.observations import Answered, Factor, Observations, observed
-from advsearch.explanations.rules import (
+from advsearch.explanations import (
     CHANCE,
     FEWEST_ROWS,
+    Answered,
     CountedRule,
+    Factor,
+    Observations,
     condition_rows,
     find_rules,
+    observed,
 )
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.explain.answer import (
-    EnvelopeRow,
-    ExplainResult,
-    ParameterWeight,
-    RightOf,
-    RuleNotTold,
-    RuleRow,
-)
+from advsearch.questions.explain.answer import EnvelopeRow, ExplainResult, ParameterWeight, RuleNotTold, RuleRow
 from advsearch.questions.explain.findings import Envelope, FactorWeight, find_envelope, find_importance
 from advsearch.questions.explain.renders import AskedSweep, Renders, right_of
 from advsearch.questions.explain.settings import ExplainConfig
@@ -36,10 +34,7 @@ from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.summary import read_result
 from advsearch.settings import split_names
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
 class ExplainKeywords(RunKeywords, total=False):
@@ -55,22 +50,13 @@ class ExplainKeywords(RunKeywords, total=False):
 
 @asks(ExplainConfig, ExplainKeywords)
 def explain(
-    sweeps: str | Path | Sequence[str | Path],
-    *,
-    progress: Watched = None,
-    **settings: Unpack[ExplainKeywords],
+    sweeps: str | Path | Sequence[str | Path], *, progress: Watched = None, **settings: Unpack[ExplainKeywords]
 ) -> ExplainResult:
     """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
-
-    All other arguments are the settings of `advsearch explain`. The run is kept, in `run` or under runs/.
 
     Args:
         sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
             recipe, its sweeps.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=watcher(progress))
 
@@ -100,7 +86,10 @@ def explain_from_config(
     envelope = find_envelope(choosing, counting, config.accuracy)
     with RunDirectory.of(config, resumed) as run:
         renders = Renders(run.path, progress, config, found)
-        table = [_rule_row(rule, found.factors, renders.confirmed(rule, n, asked)) for n, rule in enumerate(rules)]
+        table = [
+            RuleRow(**_told(rule, found.factors), confirmed=renders.confirmed(rule, n, asked))
+            for n, rule in enumerate(rules)
+        ]
         pairs = list(renders.pairs(rules, rows, asked))
         clusters = renders.clusters(asked, run)
         first = asked[0].summary
@@ -117,9 +106,12 @@ def explain_from_config(
             total=len(found),
             interval=clopper_pearson(right, len(found)),
             rules=table,
-            not_told=None if sought.next is None else _not_told(sought.next, found),
-            importance=_weights(importance, found.factors),
-            envelope=None if envelope is None else _envelope_row(envelope, found.factors, config.accuracy),
+            not_told=_not_told(sought.next, found),
+            importance=[
+                ParameterWeight(**{**vars(one), "parameters": [found.factors[place].name for place in one.places]})
+                for one in importance
+            ],
+            envelope=_envelope_row(envelope, found.factors, config.accuracy),
             pairs=pairs,
             pairs_sought=min(config.pairs, len(found) - right),
             clusters=clusters,
@@ -130,9 +122,7 @@ def explain_from_config(
             seed=config.seed,
             command_line=config.command_line(),
         )
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _sweeps_of(folder: Path) -> list[Path]:
@@ -164,45 +154,26 @@ def _cautions(rows: Sequence[Answered], importance: Sequence[FactorWeight]) -> l
     return []
 
 
-# ---- rows of the answer ---------------------------------------------------------------------------------------------
+def _told(rule: CountedRule, factors: Sequence[Factor]) -> dict[str, Any]:
+    """What a rule is, and how often it holds."""
+    elsewhere = right_of(rule.right_elsewhere, rule.of_elsewhere)
+    conditions = condition_rows(rule.conditions, factors)
+    return {"conditions": conditions, **vars(right_of(rule.right, rule.of)), "elsewhere": elsewhere}
 
 
-def _rule_row(rule: CountedRule, factors: Sequence[Factor], confirmed: RightOf | None) -> RuleRow:
-    return RuleRow(
-        conditions=condition_rows(rule.conditions, factors),
-        **vars(right_of(rule.right, rule.of)),
-        elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
-        confirmed=confirmed,
-    )
+def _not_told(rule: CountedRule | None, found: Observations) -> RuleNotTold | None:
+    if rule is None:
+        return None
+    times = rule.times_needed()
+    rows = None if times is None else round_up(times * len(found))
+    return RuleNotTold(**_told(rule, found.factors), chance=rule.chance, asked=CHANCE, rows=rows)
 
 
-def _envelope_row(one: Envelope, factors: Sequence[Factor], accuracy: float) -> EnvelopeRow:
+def _envelope_row(one: Envelope | None, factors: Sequence[Factor], accuracy: float) -> EnvelopeRow | None:
+    if one is None:
+        return None
     rows = condition_rows(one.conditions, factors)
     return EnvelopeRow(conditions=rows, **vars(right_of(one.right, one.of)), accuracy=accuracy, held=one.held)
-
-
-def _weights(importance: Sequence[FactorWeight], factors: Sequence[Factor]) -> list[ParameterWeight]:
-    return [
-        ParameterWeight(
-            parameters=[factors[place].name for place in one.places],
-            share=one.share,
-            interval=one.interval,
-            parts=one.parts,
-        )
-        for one in importance
-    ]
-
-
-def _not_told(rule: CountedRule, found: Observations) -> RuleNotTold:
-    times = rule.times_needed()
-    return RuleNotTold(
-        conditions=condition_rows(rule.conditions, found.factors),
-        **vars(right_of(rule.right, rule.of)),
-        elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
-        chance=rule.chance,
-        asked=CHANCE,
-        rows=None if times is None else round_up(times * len(found)),
-    )
 
 
 def round_up(rows: float) -> int:

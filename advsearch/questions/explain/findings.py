@@ -29,8 +29,7 @@ from scipy.stats import chi2, ncx2
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.explanations.observations import Observations
-from advsearch.explanations.rules import RuleCondition, RuleConditions, covered, import_library
+from advsearch.explanations import Observations, RuleCondition, RuleConditions, covered, import_library
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25
@@ -43,14 +42,8 @@ Places = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class FactorWeight:
-    """What one factor, or two together, decide.
-
-    Attributes:
-        places: numbers of the factors.
-        share: of the variance of the answers, in [0, 1]; what chance adds to it is taken off.
-        interval: of the share, 95 %.
-        parts: how many it was cut into, of two all pairs of parts.
-    """
+    """What one factor, or two together, decide, by their numbers: a share of the variance of the answers, in [0, 1],
+    without what chance adds to it, with its 95 % interval, and into how many parts it was cut."""
 
     places: tuple[int, ...]
     share: float
@@ -131,14 +124,8 @@ RESERVE = 0.01
 
 @dataclass(frozen=True)
 class Envelope:
-    """A box, and what rows that did not choose it say.
-
-    Attributes:
-        conditions: of the box; at most one for each factor.
-        right, of: rows inside.
-        at_least: lower end of the interval of the accuracy.
-        held: whether that is as much as was asked for.
-    """
+    """A box, and what rows that did not choose it say; at most one condition for each factor. `at_least` is the lower
+    end of the interval of the accuracy, and `held` whether that is as much as was asked for."""
 
     conditions: RuleConditions
     right: int
@@ -148,13 +135,8 @@ class Envelope:
 
 
 def find_envelope(choosing: Observations, counting: Observations, accuracy: float) -> Envelope | None:
-    """Return the largest box that promises an accuracy; None where no box of enough rows does.
-
-    Args:
-        choosing: rows that choose the box.
-        counting: other rows that it is tried on, once.
-        accuracy: in (0, 1), which the lower end of a 95 % interval has to reach.
-    """
+    """Return the largest box that promises an accuracy in (0, 1), the lower end of a 95 % interval; None where no box
+    of enough rows does. Some rows choose the box, and others try it, once."""
     conditions: RuleConditions = ()
     inside = np.ones(len(choosing), dtype=bool)
     while _at_least(choosing.right[inside]) < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
@@ -216,13 +198,8 @@ DIMENSIONS = 8
 
 @dataclass(frozen=True)
 class Clusters:
-    """Groups of failures.
-
-    Attributes:
-        members: of each group the failures by number, the most typical first; the largest group first.
-        silhouette: mean of it, in -1 to 1; None where all are one group.
-        apart: whether groups of a cloud without any are less apart.
-    """
+    """Groups of failures by number, the most typical and the largest group first; their mean silhouette, None where all
+    are one group; and whether groups of a cloud without any are less apart."""
 
     members: tuple[tuple[int, ...], ...]
     silhouette: float | None

@@ -18,18 +18,26 @@ from advsearch import seeds
 from advsearch.api.studies import carry_out_part
 from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
-from advsearch.engine.sweeps.job import check_all
-from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.explanations.observations import Answered, Factor, Mask, Observations, figure_value, rows_of
-from advsearch.explanations.rules import CountedRule, RuleCondition, RuleConditions, covered
+from advsearch.explanations import (
+    Answered,
+    CountedRule,
+    Factor,
+    Mask,
+    Observations,
+    RuleCondition,
+    RuleConditions,
+    covered,
+    figure_value,
+    rows_of,
+)
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.progress import Progress
 from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.explain.findings import find_clusters
 from advsearch.questions.explain.settings import ExplainConfig
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
@@ -327,15 +335,10 @@ class Renders:
 
 
 def typical_failures(found: Observations, rules: Sequence[CountedRule], most: int) -> list[tuple[int, RuleConditions]]:
-    """Return failures with the conditions of the rule that they are under, the most typical first.
+    """Return at most so many failures with the conditions of the rule that they are under, the most typical first.
 
-    Rules take turns, and what fails under none of them is the last to take one. Of each the failure nearest to the
-    middle of its failures, by ranks, comes first.
-
-    Args:
-        found: the rows.
-        rules: which rows they cover is said by their conditions; a row belongs to the first.
-        most: failures at most.
+    Rules take turns, a row belongs to the first that covers it, and what fails under none of them is the last to take
+    one. Of each the failure nearest to the middle of its failures, by ranks, comes first.
     """
     left = ~found.right
     queues: list[list[tuple[int, RuleConditions]]] = []
@@ -362,20 +365,15 @@ def _sweep_of(index: int, asked: Sequence[AskedSweep]) -> AskedSweep:
 
 
 def pictures_again(config: SweepConfig, numbers: Sequence[int], progress: Progress) -> tuple[Tensor, Features]:
-    """Return pictures (n, H, W, 3) of a sweep of one model, as the model saw them, and what reads its features.
-
-    Raises:
-        InputError: the scene is not to be had any more, or the task is another than classification.
-    """
-    job = job_of(config)
-    if job.tasks[0].varies:
+    """Return pictures (n, H, W, 3) of a sweep of one model, as the model saw them, and what reads its features; an
+    InputError where the scene is not to be had any more, or the task is another than classification."""
+    scenes, pictures = scenes_of(config), []
+    if scenes.job.tasks[0].varies:
         raise InputError(f"task {config.task_name}: features are read of classifiers")
-    check_all(job)
-    scenes, pictures = Scenes(job), []
     for number in numbers:
         pictures.append(scenes.picture(number))
         progress.advance(1)
-    return torch.stack(pictures), features_of(job.models[0])
+    return torch.stack(pictures), features_of(scenes.job.models[0])
 
 
 def right_of(right: int, of: int) -> RightOf:

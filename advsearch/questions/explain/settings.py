@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
-
-from pydantic import field_validator
+from typing import ClassVar
 
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 
 
 class ExplainConfig(Config):
@@ -34,7 +32,7 @@ class ExplainConfig(Config):
     pairs: int = setting(
         12,
         "explain",
-        "failures for which the nearest right configuration is sought; 0 for none",
+        "failures for which the nearest right configuration is looked for; 0 for none",
         unit="failures",
         ge=0,
         le=100,
@@ -48,27 +46,15 @@ class ExplainConfig(Config):
         le=10_000,
     )
     accuracy: float = setting(
-        0.95,
-        "explain",
-        "accuracy that the envelope promises, at 95 % confidence",
-        gt=0.0,
-        le=0.999,
+        0.95, "explain", "accuracy that the envelope promises, at 95 % confidence", gt=0.0, le=0.999
     )
     seed: int = setting_as_in(SceneConfig, "seed")
     threads: int | None = setting_as_in(SceneConfig, "threads")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-explain-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("sweeps", "run", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any, info: Any) -> Any:
-        return as_text(value, several=info.field_name == "sweeps")
-
-    @field_validator("sweeps")
-    @classmethod
-    def _different(cls, value: str) -> str:
-        check_once(split_names(value), "sweeps")
-        return value
+    _named = texts("run", several=["sweeps"])
+    _different = each_once("sweeps")
 
     @property
     def title(self) -> tuple[str, ...]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import GapKeywords, asks, configured
 from advsearch.api.studies import StudyRun, carry_out_study
@@ -13,9 +14,6 @@ from advsearch.progress import Progress, Watched, watcher
 from advsearch.questions.gap.answer import GapResult, GapRow
 from advsearch.questions.gap.settings import GapConfig
 from advsearch.runs.results.attack import AttackSummary, AverageCase
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 @asks(GapConfig, GapKeywords)
@@ -28,15 +26,8 @@ def gap(
 ) -> GapResult:
     """Compare the worst configuration with the average, for each object and each control (docs/questions.md).
 
-    All other arguments are the settings of `advsearch gap`. The run is kept, in `run` or under runs/.
-
     Args:
         object: from `load_scene`, or names of objects, or files of them, separated by commas.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(GapConfig, object=object, model=model, **settings)
     return gap_from_config(config, progress=watcher(progress))

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 from pydantic import Field
 
+from advsearch.report import wording
+from advsearch.report.figures import BLUE, RED, Figures, drawn
 from advsearch.report.markup import InNotebook
+from advsearch.report.phrases import percent
+from advsearch.report.shown import NO_PROOF, AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
 from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import Fields, Interval, RunResult
 
@@ -63,7 +68,7 @@ class HardenResult(InNotebook, RunResult):
         description="held-out scenes that are right and in which no search over any control has found a wrong answer; "
         "null if it was interrupted, as are the others"
     )
-    after: Share | None = Field(description="the same, of the hardened model, searched anew")
+    after: Share | None = Field(description="the same, of the hardened model, searched again")
     clean_before: Share | None = Field(description="plain renders of held-out scenes that are right")
     clean_after: Share | None
     table: list[HardenedControl]
@@ -88,3 +93,122 @@ class HardenResult(InNotebook, RunResult):
 
 
 RESULT = HardenResult
+
+
+ROBUST = (
+    "Robust: the plain picture of a held-out scene is right, and the search finds no wrong one. 95 % Clopper-Pearson "
+    "intervals over scenes."
+)
+TRAINED = (
+    "Round 0 is the model as it was. Weights are part of the way from those to the trained ones. Judged on scenes in "
+    "the training's environments on which it was not trained."
+)
+
+HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
+
+LINES = (("before", RED), ("after", BLUE))
+
+
+def shown(result: HardenResult) -> ShownAnswer:
+    """Return how robust the model was and is, what it was trained on, and what never was."""
+    rounds: Mapping[str, Column] = {
+        "round": lambda one: str(one[0]),
+        "views trained on": "{0[1].lessons}",
+        "part of the way": lambda one: percent(one[1].part),
+        "plain pictures right": lambda one: percent(one[1].clean),
+        "worst pictures right": lambda one: percent(one[1].robust),
+        "kept": lambda one: "yes" if one[1].kept else "",
+    }
+    split: Mapping[str, Column] = {
+        "side": "{0[0]}",
+        "objects": lambda one: ", ".join(one[1].objects),
+        "environments": lambda one: ", ".join(one[1].environments),
+        "scenes": "{0[1].scenes}",
+        "views": "{0[1].views}",
+    }
+    facts = {
+        "model": result.model,
+        "searched with": result.search,
+        "stronger": result.stronger_search,
+        "load it with": f"model={result.hardened}" if result.hardened else "",
+        "weights": result.weights or "",
+        "pictures": result.pictures or "",
+    }
+    return ShownAnswer(
+        hardened_text(result),
+        [
+            AnswerPart(
+                "Before and after", heads=HEADS, rows=hardened_rows(result), note=ROBUST, figure="images/harden.png"
+            ),
+            AnswerPart.table(enumerate(result.rounds), rounds, title="The training", note=TRAINED, only="page"),
+            AnswerPart.table(result.split.items(), split, title="What it was trained and measured on", only="page"),
+        ],
+        facts,
+        about=[",".join(result.objects), ", ".join(result.controls)],
+    )
+
+
+def claims(result: HardenResult) -> Iterator[Claim]:
+    """Yield the shares of held-out scenes without a failure."""
+    for when, share in (("Before", result.before), ("After hardening", result.after)):
+        if share is not None:
+            extent = Extent(what="held-out scenes", count=share.right, total=share.count, interval=share.interval)
+            text = f"{when}, the searches ({result.search}) found no failure in {share_text(extent)} held-out"
+            yield claim("measured", f"{text} scenes. {NO_PROOF}", extent)
+
+
+def hardened_text(result: HardenResult) -> str:
+    """Return what came out, in a sentence."""
+    before, after, clean, left = result.before, result.after, result.clean_before, result.clean_after
+    if before is None or after is None or clean is None or left is None:
+        return "Stopped before the hardened model was measured."
+    return (
+        f"Of {after.count} held-out scenes the searches leave {after.right} right, before {before.right}; "
+        f"of {left.count} plain pictures {left.right} are right, before {clean.right}."
+    )
+
+
+def hardened_rows(result: HardenResult) -> list[list[str]]:
+    """Return two rows for each control, one of each search; one for all of them where there are several; and one for
+    plain pictures."""
+    return [[name, *_cells(before), *_cells(after)] for name, before, after in _shares(result)]
+
+
+def _shares(result: HardenResult) -> list[tuple[str, Share | None, Share | None]]:
+    """What was measured, before and after."""
+    found = list[tuple[str, Share | None, Share | None]]()
+    for row in result.table:
+        found.append((f"robust to {row.control}", row.before, row.after))
+        found.append((f"robust to {row.control}, stronger search", row.stronger_before, row.stronger))
+    if len(result.table) > 1:
+        found.append(("robust to each", result.before, result.after))
+    if result.clean_after is not None:
+        found.append(("plain pictures right", result.clean_before, result.clean_after))
+    return found
+
+
+def hardened_figure(result: HardenResult) -> Figures:
+    """Draw each share before and after with its interval; nothing where none is known."""
+    shares = _shares(result)
+    if not shares:
+        return {}
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        for place, (_, *of_each) in enumerate(shares):
+            for (label, color), share, up in zip(LINES, of_each, (place - 0.14, place + 0.14), strict=True):
+                if share is not None:
+                    axes.plot(share.interval, [up, up], color=color, alpha=0.35, linewidth=5)
+                    axes.plot(share.accuracy, up, "o", color=color, ms=4, label=label if place == 0 else None)
+        axes.set_yticks(range(len(shares)), [name for name, *_ in shares])
+        axes.invert_yaxis()
+        axes.set(xlabel="share that is right, with 95 % interval", xlim=(-0.03, 1.03))
+        axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
+        axes.grid(True, axis="x")
+        figure.legend(loc="outside lower center", ncols=len(LINES))
+
+    return drawn(draw, (6.4, 1.4 + 0.45 * len(shares)))
+
+
+def _cells(share: Share | None) -> tuple[str, str]:
+    return ("", "") if share is None else (percent(share.accuracy), wording.interval_text(share.interval))

@@ -10,25 +10,25 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from typing_extensions import Unpack
 
 from advsearch import seeds
-from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
+from advsearch.api.keywords import Named, Names, RenderedKeywords, RunKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
-from advsearch.cluster.executor import Executor, InProcess
-from advsearch.engine import run_settings
+from advsearch.cluster import Executor, InProcess
 from advsearch.engine.attack_parts import LOADING, executor_for
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.loading import Controls
-from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name
+from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
-from advsearch.models.reference import Trainable, trainable
+from advsearch.models.reference import trainable
 from advsearch.models.source import split_weights
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.harden.answer import HardenedControl, HardenResult, Share, SplitSide
+from advsearch.questions.harden.answer import HardenedControl, HardenResult, Share, SplitSide, hardened_figure
 from advsearch.questions.harden.lessons import FOLDER, Lesson
 from advsearch.questions.harden.scenes import (
     CLEAN_SCENES,
@@ -43,7 +43,6 @@ from advsearch.questions.harden.scenes import (
     Drawing,
     Looking,
     SceneWork,
-    Split,
     Wanted,
     check_disjoint,
     splits_of,
@@ -58,34 +57,18 @@ from advsearch.questions.harden.training import (
     TrainingRounds,
     right_share,
 )
-from advsearch.questions.harden.words import hardened_figure
 from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.store import Row
 from advsearch.tasks import make_task
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
-class HardenKeywords(RunKeywords, total=False):
+class HardenKeywords(RenderedKeywords, RunKeywords, total=False):
     """Of `harden`."""
 
-    environment: Path | Names | None
-    set: Mapping[str, float | str | Sequence[float]] | None
-    exposure: float | None
-    resolution: int | str | tuple[int, int] | None
-    labels: Path | Names | None
-    prompt: Names | None
-    texture_resolution: int | None
-    denoise: Literal["oidn", "none"]
-    pixel_sampler: Literal["independent", "multijitter"]
-    seed: int
-    threads: int | None
-    deterministic: bool
     controls: Controls
     spp: int | Literal["auto"] | None
     epsilon: float | Mapping[str, float] | None
@@ -143,42 +126,34 @@ def harden(
             (N,). One is taken with each step.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     if not isinstance(model, (str, Path)):
         check_not_spread(settings)
     config = configured(HardenConfig, model=model_name(model), **settings)
     path = run_path(config.run) if resume and config.run is not None else None
     resumed = path if path is not None and is_run(path) else None
-    return _carry_out(config, model, optimiser, beside, watcher(progress), resumed)
+    return harden_from_config(
+        config, progress=watcher(progress), resumed=resumed, model=model, optimiser=optimiser, beside=beside
+    )
 
 
 def harden_from_config(
-    config: HardenConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> HardenResult:
-    """Do what a configuration describes, or go on with it; see `harden`."""
-    return _carry_out(config, config.model, None, None, progress or NullProgress(), resumed)
-
-
-def _carry_out(
     config: HardenConfig,
-    model: AnyModel,
-    optimiser: MakeOptimiser | None,
-    beside: Examples | None,
-    progress: Progress,
-    resumed: Path | None,
+    *,
+    progress: Progress | None = None,
+    resumed: Path | None = None,
+    model: AnyModel | None = None,
+    optimiser: MakeOptimiser | None = None,
+    beside: Examples | None = None,
 ) -> HardenResult:
-    begun = time.perf_counter()
+    """Do what a configuration describes, or go on with it; see `harden`. None takes the configuration's model."""
+    begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage(LOADING)
-    run_settings.check(config)
+    check_run_settings(config)
     task = make_task(config.task)
-    (loaded, *_), warnings = load_models([model], task, config)
-    student = trainable(loaded, config.layers)
+    (loaded, *_), warnings = load_models([config.model if model is None else model], task, config)
+    course = Course(trainable(loaded, config.layers), loaded, config, optimiser, beside)
     splits = splits_of(config, loaded)
-    course = Course(student, loaded, config, optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
         _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None})
         check_made_of(run, [loaded])
@@ -195,17 +170,11 @@ def _carry_out(
         result = work.result(ending, warnings, time.perf_counter() - begun)
         for suffix, data in hardened_figure(result).items():
             write_bytes(run.path / IMAGES / f"{config.command}.{suffix}", data)
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
-    """Note what a training has from Python, or refuse to go on with other means than it began with.
-
-    Raises:
-        InputError: it had something else.
-    """
+    """Note what a training has from Python, or refuse (InputError) to go on with other means than it began with."""
     before = json.loads(run.store.note(MEANS) or "{}")
     if not before:
         run.store.set_note(MEANS, json.dumps(given))
@@ -219,15 +188,8 @@ def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
 
 @dataclass
 class Hardening:
-    """One run of `harden`.
-
-    Attributes:
-        run: keeps what is done.
-        course: trains a copy of the model.
-        scenes: does what there is to do with single ones; has what was asked and the model as it was given.
-        progress: told how far it is.
-        seconds: that its parts took.
-    """
+    """One run of `harden`: a course that trains a copy of the model, and scenes, with what was asked and the model as
+    it was given."""
 
     run: RunDirectory
     course: Course
@@ -242,21 +204,11 @@ class Hardening:
         self.clean: dict[str, Share] = {}
         self._executor: Executor = InProcess(self.scenes)
 
-    @property
-    def student(self) -> Trainable:
-        """What is trained."""
-        return self.course.student
-
-    @property
-    def splits(self) -> Mapping[str, Split]:
-        """The sides of the split by name."""
-        return self.scenes.splits
-
     # ---- the parts --------------------------------------------------------------------------------------------------
 
     def carry_out(self, executor: Executor) -> None:
         """Measure, train, and measure again; the executor does what there is to do with scenes."""
-        self._executor, sides = executor, self.splits
+        self._executor, sides = executor, self.scenes.splits
         check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)])
         gc.freeze()  # as of `scenes_of`
         try:
@@ -295,11 +247,7 @@ class Hardening:
         return {**counts, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
     def _each(self, wanted: Sequence[Wanted]) -> Iterator[tuple[int, Any]]:
-        """Have done what is wanted of scenes; yield the place of each and what came of it, in any order.
-
-        Raises:
-            ClusterError: workers died of one.
-        """
+        """Have done what is wanted of scenes; yield the place of each and what came of it, in any order."""
         places = {id(one): place for place, one in enumerate(wanted)}
         for done in self._executor.results([one] for one in wanted):
             (one,) = done.items
@@ -362,7 +310,6 @@ class Hardening:
             self._note(which, wanted[place].control, wanted[place].number, ending)
 
     def _note(self, which: str, control: str, number: int, ending: str) -> None:
-        """Keep how an attack ended."""
         self.measured[f"{which} {control} {number}"] = ending
         self.run.store.set_note(MEASURED, json.dumps(self.measured))
         seed = seeds.stream(self.config.seed, f"measured {control}", number)
@@ -370,11 +317,10 @@ class Hardening:
         self.run.record(Row(f"{which} {control}", number, seed=seed, spp=self.config.verify_spp, success=wrong))
 
     def _look(self) -> None:
-        """Ask both models about plain pictures of held-out scenes."""
         wanted = [Looking(number) for number in range(self._counts[HELD_OUT])]
         self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
         seen = [one for _, some in self._each(wanted) for one in some]
-        for which, model in (("before", self.scenes.model), ("after", self.student.model)):
+        for which, model in (("before", self.scenes.model), ("after", self.course.student.model)):
             self.clean[which] = _share(round(right_share(model, seen, "plain") * len(seen)), len(seen))
 
     # ---- what came out ----------------------------------------------------------------------------------------------
@@ -405,8 +351,8 @@ class Hardening:
         names, facts = list(config.controls), self._executor.facts
         return HardenResult(
             run=str(self.run.path),
-            environment=",".join(self.splits[TRAINING].environments),
-            objects=list(self.splits[TRAINING].objects),
+            environment=",".join(self.scenes.splits[TRAINING].environments),
+            objects=list(self.scenes.splits[TRAINING].objects),
             controls=names,
             model=config.model,
             task=config.task_name,
@@ -425,7 +371,7 @@ class Hardening:
                     scenes=self._counts[name],
                     views=views[name],
                 )
-                for name, one in self.splits.items()
+                for name, one in self.scenes.splits.items()
             },
             rounds=rounds,
             hardened=_loads(config.model, weights) if done else None,

@@ -17,12 +17,11 @@ from safetensors import torch as safetensors
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.objects import OBJECTS
-from advsearch.cluster.executor import Call
+from advsearch.cluster import Call
 from advsearch.config import AttackConfig
-from advsearch.engine import run_settings
 from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import Scene, load_scene
-from advsearch.engine.naming import load_models, scene_settings
+from advsearch.engine.naming import RUN_SETTINGS, load_models, scene_settings, settings_alone
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
@@ -65,7 +64,6 @@ class Drawing:
 
     Attributes:
         side: name of the split.
-        number: of the scene.
         controls: that make them harder together; none for plain ones alone.
         views: that are made harder.
         plain: views of the scene as it is.
@@ -84,14 +82,8 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Attacking:
-    """An attack that is wanted on a held-out scene.
-
-    Attributes:
-        control: that is searched.
-        number: of the scene.
-        times: how much longer than usual; more than once is the stronger search.
-        weights: of the model, safetensors; None for those that it was given with.
-    """
+    """An attack that is wanted on a held-out scene, `times` as long as usual: more than once is the stronger search.
+    Weights of the model are safetensors; None for those that it was given with."""
 
     control: str
     number: int
@@ -101,11 +93,7 @@ class Attacking:
 
 @dataclass(frozen=True)
 class Looking:
-    """Plain pictures that are wanted of a held-out scene.
-
-    Attributes:
-        number: of the scene.
-    """
+    """Plain pictures that are wanted of a held-out scene."""
 
     number: int
 
@@ -114,11 +102,7 @@ Wanted = Drawing | Attacking | Looking
 
 
 def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
-    """Return the sides of the split by name.
-
-    Raises:
-        InputError: there is nothing on a side, or one environment on both.
-    """
+    """Return the sides of the split by name; an InputError where there is nothing on a side."""
     objects = tuple(OBJECTS) if config.object == ALL else config.objects
     known = tuple(name for name in objects if name not in OBJECTS or _has_class(model, OBJECTS[name].label))
     if not known:
@@ -157,13 +141,7 @@ def scenes_of(settings: JsonObject) -> Call:
 
 @dataclass
 class SceneWork:
-    """What is done with single scenes; pure functions of what is wanted.
-
-    Attributes:
-        config: of the run.
-        model: as it was given.
-        splits: by name.
-    """
+    """What is done with single scenes, with the model as it was given; pure functions of what is wanted."""
 
     config: HardenConfig
     model: Model
@@ -255,9 +233,9 @@ class SceneWork:
     def _of(self, controls: Sequence[str], name: str, **changes: object) -> AttackConfig:
         """What some of the controls are searched with, on an object of a name."""
         config, given = self.config, {control: self.config.controls[control] for control in controls}
-        own: dict[str, object] = dict.fromkeys(run_settings.RUN_SETTINGS)
+        own: dict[str, object] = dict.fromkeys(RUN_SETTINGS)
         for control in controls:
-            for setting, value in run_settings.alone(config, control, given[control]).items():
+            for setting, value in settings_alone(config, control, given[control]).items():
                 before = own[setting]
                 if isinstance(before, Mapping) and isinstance(value, Mapping):
                     own[setting] = {**before, **value}
@@ -292,15 +270,8 @@ GROUND = (0.1, 0.9)
 
 @dataclass(frozen=True)
 class Split:
-    """One side of the split.
-
-    Attributes:
-        name: one of the above.
-        objects: names of bundled objects, or files.
-        environments: names or files.
-        seed: root of its draws.
-        varied: whether each scene has an environment of its own, made from one of these (`variation`).
-    """
+    """One side of the split: objects (bundled ones, or files) and environments, and the root of its draws. With
+    `varied` each scene has an environment of its own, made from one of these."""
 
     name: str
     objects: tuple[str, ...]
@@ -309,13 +280,10 @@ class Split:
     varied: bool = False
 
     def scene(self, number: int, given: Given | None = None) -> tuple[str, Scene]:
-        """Return the scene with this number, and the name of its object; the objects take turns.
+        """Return the scene with this number, from 0, and the name of its object; the objects take turns. Parameters
+        that are given are fixed.
 
         An object in a file that brings no label is called as the file: ``coffee-mug.glb`` is a "coffee mug".
-
-        Args:
-            number: from 0; equal numbers are equal scenes.
-            given: parameters that are fixed in every scene.
         """
         name, rng = self.objects[number % len(self.objects)], self._draws(number)
         made = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
@@ -364,17 +332,11 @@ def fingerprint(asset: ObjectAsset) -> str:
 
 
 def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
-    """Refuse to measure what is trained on: one of the training's environments, or one of its files.
+    """Refuse, by an InputError that names it, to measure what is trained on: one of the training's environments, or one
+    of its files.
 
     Of each bundled object the first instance is looked at; all others are checked when they are drawn, by
     `check_unmeasured`: to make them takes minutes.
-
-    Args:
-        held: what is measured.
-        taught: what weights are fitted to and chosen by.
-
-    Raises:
-        InputError: they share something; it is named.
     """
     both = sorted({name for split in taught for name in split.environments} & set(held.environments))
     if both:
@@ -386,11 +348,8 @@ def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
 
 
 def check_unmeasured(asset: ObjectAsset, measured: Set[str]) -> None:
-    """Refuse to train on an object whose fingerprint is among those of what is measured.
-
-    Raises:
-        InputError: it is; it is named.
-    """
+    """Refuse, by an InputError that names it, to train on an object whose fingerprint is among those of what is
+    measured."""
     if fingerprint(asset) in measured:
         raise InputError(f"held_out: {asset.name} is an object of the training too; name others")
 

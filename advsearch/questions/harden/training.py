@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 import torch
-import torch._dynamo  # by optimisers, too: before there are scenes, whose changes make Python collect what is new
+import torch._dynamo
+import torch.nn.functional as F
 from safetensors import torch as safetensors
 from torch import Tensor, nn
 
@@ -22,16 +26,20 @@ from advsearch.questions.harden.lessons import (
     ARCHIVE,
     FOLDER,
     TOGETHER,
+    Augmentation,
     Lesson,
+    RenderedLesson,
     TextureLesson,
+    ascend,
     harder,
     save_pictures,
+    slopes,
+    surprise,
     with_worst,
     write_archive,
 )
 from advsearch.questions.harden.scenes import TRAINING, VALIDATION
 from advsearch.questions.harden.settings import HardenConfig
-from advsearch.questions.harden.steps import Gradients
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import ARTIFACTS, RunDirectory
 from advsearch.runs.files import write_bytes
@@ -52,12 +60,8 @@ MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
 
 @dataclass(frozen=True)
 class Score:
-    """How a model does on lessons that it was not trained on.
-
-    Attributes:
-        clean: share of plain pictures that it has right.
-        robust: share of the worst pictures, searched for against these weights.
-    """
+    """How a model does on lessons that it was not trained on: its share of plain pictures, and of the worst ones,
+    searched for against these weights."""
 
     clean: float
     robust: float
@@ -83,13 +87,8 @@ class Course:
     _further: Iterator[tuple[Tensor, Tensor]] = field(default_factory=lambda: iter(()))
 
     def round(self, number: int, chosen: Sequence[Lesson], tick: Callable[[], None] = lambda: None) -> None:
-        """Train on lessons; the student has the average of the weights afterwards.
-
-        Args:
-            number: of the round; decides the order.
-            chosen: lessons.
-            tick: told of every step.
-        """
+        """Train on lessons in an order that the number of the round decides; the student has the average of the weights
+        afterwards."""
         parameters, config = self.student.parameters(), self.config
         if self.optimiser is None:
             optimiser: torch.optim.Optimizer = torch.optim.AdamW(parameters, lr=config.rate, weight_decay=WEIGHT_DECAY)
@@ -166,7 +165,6 @@ def right_share(model: Model, chosen: Sequence[Lesson], which: str) -> float:
 
 WEIGHTS = "hardened.safetensors"
 ROUNDS = "rounds"
-"""The note under which the store keeps the scores."""
 FIRST_STEPS = 4
 """Steps of each texture before a training."""
 VALIDATION_VIEWS, JUDGED = 2, 168
@@ -179,15 +177,7 @@ Draw = Callable[[str, str, Sequence[int], int], list[Lesson]]
 
 @dataclass
 class TrainingRounds:
-    """The rounds of a run.
-
-    Attributes:
-        run: keeps them.
-        course: trains.
-        draw: draws lessons.
-        progress: told how far it is.
-        done: what each round came to; the first is the model as it was.
-    """
+    """The rounds of a run; `done` is what each came to, of which the first is the model as it was."""
 
     run: RunDirectory
     course: Course
@@ -271,7 +261,6 @@ class TrainingRounds:
         return found[best], best
 
     def _keep(self, number: int, new: Sequence[Lesson], found: Score, trained: int, part: float) -> None:
-        """Keep weights, what they came to, and the round's pictures."""
         model = self.course.student.model
         self._save(_file(number))
         save_pictures(self.run.path / ARTIFACTS / FOLDER, number, new, model.labels)
@@ -291,3 +280,110 @@ class TrainingRounds:
 
 def _file(number: int) -> str:
     return f"round-{number:03d}.safetensors"
+
+
+PART = 6
+"""Lessons that one thread works at."""
+AUGMENTATION = Augmentation(smallest_crop=0.75, largest_crop=1.15, turn=15.0, cutout=0.0)
+"""What happens to pictures while they are trained on; the search for worse ones sees the same."""
+KEEP = 1.0
+"""Weight of the given model's answers to plain pictures, beside that of the right ones."""
+MIXED, MIXING = 0.5, 0.4
+"""Share of the parts that mix pictures, and both parameters of the beta distribution that their weights come from."""
+
+AnyLesson = TypeVar("AnyLesson", bound=Lesson)
+Found = TypeVar("Found")
+
+
+class Gradients:
+    """Takes gradients for a network that is trained, whose parameters collect them, on threads that have one of torch's
+    each. The answers of the model as it was given to plain pictures are kept."""
+
+    def __init__(self, student: Trainable, given: Model, pool: Executor) -> None:
+        self._student, self._given, self._pool = student, given, pool
+        self._twins: list[Trainable] = []
+
+    def take(self, batch: Sequence[Lesson], beside: tuple[Tensor, Tensor] | None, seed: int) -> None:
+        """Make the worst pictures of lessons worse, and leave the gradient of their loss with the parameters. Further
+        images (N, H, W, 3) and class indices (N,) count too."""
+        batch = sorted(batch, key=lambda one: not isinstance(one, TextureLesson))  # parts are those of `_slopes`
+        ascend(batch, lambda chosen: self._slopes(chosen, seed))
+        plain, worst = 1.0 / len(batch), 1.0 / max(1, len(with_worst(batch)))
+
+        def descend(number: int, twin: Trainable, part: Sequence[Lesson]) -> list[Tensor | None]:
+            loss = self._loss(twin, part, plain, worst, seed + number)
+            return list(torch.autograd.grad(loss, twin.parameters(), allow_unused=True))
+
+        def descend_beside(images: Tensor, labels: Tensor) -> list[Tensor | None]:
+            loss = surprise(self._student.logits(images), [(int(label),) for label in labels]).mean()
+            return list(torch.autograd.grad(loss, self._student.parameters(), allow_unused=True))
+
+        others = [] if beside is None else [self._pool.submit(descend_beside, *beside)]
+        found = [*self._each(descend, batch), *(one.result() for one in others)]
+        for parameter, *own in zip(self._student.parameters(), *found, strict=True):
+            some = [one for one in own if one is not None]
+            parameter.grad = torch.stack(some).sum(dim=0) if some else None
+
+    def _each(
+        self, do: Callable[[int, Trainable, Sequence[AnyLesson]], Found], chosen: Sequence[AnyLesson]
+    ) -> list[Found]:
+        """Have something done with each part of some lessons, with its number and a copy of the network."""
+        parts = [chosen[begin : begin + PART] for begin in range(0, len(chosen), PART)]
+        while len(self._twins) < len(parts):
+            self._twins.append(self._student.twin())
+        return list(self._pool.map(do, itertools.count(), self._twins, parts))
+
+    def _slopes(self, chosen: Sequence[TextureLesson], seed: int) -> list[Tensor]:
+
+        def climb(number: int, twin: Trainable, part: Sequence[TextureLesson]) -> Sequence[Tensor]:
+            return slopes(part, twin.quickly, lambda images: _changed(images, seed + number))
+
+        return [one for some in self._each(climb, chosen) for one in some]
+
+    def _loss(self, student: Trainable, part: Sequence[Lesson], plain: float, worst: float, seed: int) -> Tensor:
+        """What is descended, of a part of a batch, textures first: so much of each plain picture and each worst one.
+
+        Worst textures are changed as the search for them saw them: seen otherwise, they are no longer the worst. At
+        times all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more
+        pictures of it will come; a texture is another one each time. The given model's answers count of scenes as they
+        are alone: where something moved, it is right without being sure.
+        """
+        searched, rng = with_worst(part), np.random.default_rng(seed)
+        textured = [one.worst for one in searched if isinstance(one, TextureLesson)]
+        shown = [[one.plain for one in part], textured, [one.worst for one in searched[len(textured) :]]]
+        images = torch.cat([_changed(torch.stack(some), seed) for some in shown if some])
+        taught = [*part, *searched]
+        right = [one.right for one in taught]
+        mixed = [place for place, one in enumerate(taught) if isinstance(one, RenderedLesson)]
+        if rng.random() >= MIXED:
+            mixed = []
+        others, drawn = rng.permutation(mixed).astype(int).tolist(), float(rng.beta(MIXING, MIXING))
+        share = min(drawn, 1.0 - drawn)
+        if mixed:
+            images[mixed] = torch.lerp(images[mixed], images[others], share)
+        logits = student.logits(images)
+        found = surprise(logits, right)
+        if mixed:
+            of_others = surprise(logits[mixed], [right[place] for place in others])
+            found[mixed] = torch.lerp(found[mixed], of_others, share)
+        as_given = [place for place, one in enumerate(part) if not isinstance(one, RenderedLesson)]
+        loss = plain * found[: len(part)].sum() + worst * found[len(part) :].sum()
+        if as_given:
+            kept = self._forgotten(images[as_given], logits[as_given], [right[place] for place in as_given])
+            loss = loss + plain * KEEP * kept
+        return loss
+
+    def _forgotten(self, plain: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
+        """The Kullback-Leibler divergence of what the given model says of plain pictures (N, H, W, 3), where it is
+        right, to what logits (N, C) say; a sum over all."""
+        with torch.no_grad():
+            wanted = self._given(plain)
+        known = [said in own for said, own in zip(wanted.argmax(dim=1).tolist(), right, strict=True)]
+        target = F.log_softmax(wanted[known], dim=1)
+        return F.kl_div(F.log_softmax(logits[known], dim=1), target, reduction="sum", log_target=True)
+
+
+def _changed(images: Tensor, seed: int) -> Tensor:
+    """Change pictures (N, H, W, 3) by chance; the same way whenever there are as many of them."""
+    generator = torch.Generator().manual_seed(seed)
+    return AUGMENTATION(images.permute(0, 3, 1, 2), generator).permute(0, 2, 3, 1)

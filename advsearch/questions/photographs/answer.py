@@ -10,6 +10,10 @@ PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
 
 
+FOLDER = "photos"
+"""Where photographs are, in `images/` of the run."""
+
+
 class PhotographedRendering(Fields):
     """One rendering, what one model says of it, and of the photographs that were aligned with it."""
 

@@ -18,26 +18,22 @@ from advsearch import seeds
 from advsearch.attacks import clopper_pearson
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
-from advsearch.engine.answers import facts_of
 from advsearch.engine.attack_parts import judged_alone, problem_from_config
-from advsearch.engine.metrics import judgements
-from advsearch.engine.naming import load_models, scene_of
-from advsearch.engine.retrial import kept_answer
-from advsearch.engine.rows import judged
-from advsearch.engine.sweeps.job import check_all
-from advsearch.engine.sweeps.swept_scene import Scenes
-from advsearch.engine.turn import in_turn
+from advsearch.engine.judging import facts_of, judgements
+from advsearch.engine.naming import in_turn, load_models, scene_of
+from advsearch.engine.record import judged
+from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
-from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
-from advsearch.questions.photographs.files import FOLDER, LARGEST, photo_name, rendering_file, sound_photo
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.photographs.answer import FOLDER, LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
+from advsearch.questions.photographs.serving import LARGEST, photo_name, rendering_file, sound_photo
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
-from advsearch.tasks import Judgement, Task, make_task
+from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
 
@@ -63,10 +59,21 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         return _agreement(list(store.rows(PHOTO)))
 
 
-def photographs_in(folder: Path) -> list[Path]:
-    """Return the files in a folder that are photographs by their names; none where there is no such folder."""
+def photographs_in(folder: Path, task: AnyTask) -> list[Path]:
+    """Return the files in a folder that are photographs by their names; none where there is no such folder.
+
+    Raises:
+        InputError: the task asks where the object is, and one of them was aligned with no rendering.
+    """
     files = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+    found = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+    loose = [file for file in found if not _ALIGNED.fullmatch(file.stem)]
+    if loose and (made := make_task(task)) and (made.varies or made.looks):
+        raise InputError(
+            f"{loose[0].name}: the task asks where the object is, and only a rendering says that; name the file "
+            "rendering-NUMBER.jpg by the rendering that it was aligned with, or take it out"
+        )
+    return found
 
 
 class Photographs:
@@ -144,8 +151,6 @@ class Photographs:
             number = held.store.last_step(LOOSE_PHOTO) + 1
             rows = []
             for judge in self._judges(run):
-                if judge.varies:
-                    raise InputError("the task asks where the object is; name the file rendering-NUMBER.jpg after one")
                 values: dict[str, Value] = {"model": {"value": judge.model.name, "unit": ""}}
                 sound = sound_photo(data, judge.size[::-1])
                 row = judged(Row(LOOSE_PHOTO, number, values=values), judge.judgement("", judge.object, sound))
@@ -157,21 +162,16 @@ class Photographs:
         return photo_agreement(run)
 
 
-# ---- judging --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _PhotoJudge:
     """One of a run's models, and how it is shown pictures.
 
     Attributes:
         object: what a rendering shows that says nothing else.
-        model: loaded.
-        task: on it.
+        task: on the model.
         size: (height, width) of the run's renderings, in pixels.
         several: models that the run has.
         truth: what is true of a photograph, by the rendering that it was aligned with and the object.
-        varies: whether that differs between renderings of one object.
     """
 
     object: str
@@ -180,7 +180,6 @@ class _PhotoJudge:
     size: tuple[int, int]
     several: int
     truth: Callable[[str, str], Truth]
-    varies: bool = True
 
     def judgement(self, rendering: str, name: str, data: bytes) -> Judgement:
         """What is to be said of a picture, (any size), of an object; it is made as large as the run's renderings are.
@@ -217,18 +216,15 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
             return task.truth(facts_of(scene_of(config, name), name, config.label, dict))
 
         judges.append(
-            _PhotoJudge(
-                config.objects[0], model, task, config.resolution or model.input_size, len(models), truth, varies=False
-            )
+            _PhotoJudge(config.objects[0], model, task, config.resolution or model.input_size, len(models), truth)
         )
     return judges
 
 
 def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
     """Who judges by the configurations of a sweep."""
-    job = job_of(config)
-    check_all(job)
-    scenes = Scenes(job)
+    scenes = scenes_of(config)
+    job = scenes.job
 
     def truth(model: int, rendering: str, name: str) -> Truth:
         number = int(rendering)
@@ -272,9 +268,6 @@ def _rendered(judge: _PhotoJudge, rendering: str, name: str, file: Path, row: Ro
         raise InputError(f"rendering: the results have no row for {file.stem}; it belongs to another run")
     judgement = judge.judgement(rendering, name, file.read_bytes())
     return judgement.right, judgement.answer.label
-
-
-# ---- counting -------------------------------------------------------------------------------------------------------
 
 
 def _agreement(rows: Sequence[Row]) -> PhotoAgreement:

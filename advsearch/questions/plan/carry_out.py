@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
+from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, configured
 from advsearch.engine.attack_parts import LOADING, problem_from_config
-from advsearch.engine.gradients import inside
+from advsearch.engine.gradients import Loss, inside
 from advsearch.engine.loading import Scene
-from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.planning import (
     GOAL,
@@ -25,18 +30,22 @@ from advsearch.engine.planning import (
     tuned,
 )
 from advsearch.engine.problem import Problem
+from advsearch.engine.record import Results, kept_rows
+from advsearch.engine.transport import WORTH
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, GainRow, PlanResult, TexelRow
-from advsearch.questions.plan.leaving_out import measured_gains, most_gradients, resolved_texels
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import CosineRow, Formation, PathLength
+from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
-from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.lights import predicting, why_not
+from advsearch.scene.transport.matrix import SPP
 
 
 class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):
@@ -57,18 +66,7 @@ def plan(
     progress: Watched = None,
     **settings: Unpack[PlanKeywords],
 ) -> PlanResult:
-    """Choose how every derivative of a search is obtained and what is left out, by measurement (docs/gradients.md).
-
-    All other arguments are the settings of `advsearch plan`. The run is kept, in `run` or under runs/.
-
-    Args:
-        object: from `load_scene`, or the name of an object, or a file of one.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Choose how every derivative of a search is obtained and what is left out, by measurement (docs/gradients.md)."""
     config = configured(PlanConfig, object=object, model=model, **settings)
     return plan_from_config(config, progress=watcher(progress))
 
@@ -81,40 +79,23 @@ def plan_from_config(
     What is measured is kept at once in a run directory, so that a plan that was stopped, by Ctrl-C, by a kill or
     because its `seconds` were over, goes on where it was and ends with the same rows; times differ, and what is chosen
     by them (estimators, the better denoiser) may.
-
-    Args:
-        config: scene, model, controls, and where the run is kept.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     progress, begun = progress or NullProgress(), time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
         progress.stage(LOADING)
-        results = Results(run, config.seconds)
-        problem, _ = problem_from_config(config)
-        work = _Measurements(problem, config, results, progress)
+        work = _Measurements(problem_from_config(config)[0], config, Results(run, config.seconds), progress)
 
         def result(rows: Sequence[PlannedRow], ending: str) -> PlanResult:
             return work.result(rows, ending, str(run.path), time.perf_counter() - begun)
 
-        return kept_rows(run, results, work.rows(), result)
+        return kept_rows(run, work.results, work.rows(), result)
 
 
 class _Measurements:
-    """What a plan measures, one after the other, what matters most first.
-
-    Args:
-        problem: whose derivatives are planned.
-        config: of the plan.
-        results: what is known already.
-        progress: told how far it is.
-    """
+    """What a plan measures, one after the other, what matters most first."""
 
     def __init__(self, problem: Problem, config: PlanConfig, results: Results, progress: Progress) -> None:
-        self._problem, self._config, self._results, self._progress = problem, config, results, progress
+        self._problem, self._config, self.results, self._progress = problem, config, results, progress
         self._other = "none" if config.denoise == "oidn" else "oidn"
         self._seed = seeds.stream(config.seed, "measure")
         self._plan = problem.renderer.plan
@@ -126,11 +107,7 @@ class _Measurements:
         self._left += [f"{name} with denoiser {self._other}" for name in self._controls]
 
     def rows(self) -> Iterator[PlannedRow]:
-        """Measure, and yield each row as it comes.
-
-        Raises:
-            OutOfTime: the time of the results is up.
-        """
+        """Measure, and yield each row as it comes, until the time of the results is up."""
         if self._gradients:
             self._compare_estimators()
             self._left.pop(0)
@@ -146,7 +123,7 @@ class _Measurements:
             self._left.pop(0)
         if not self._controls:
             return
-        self._results.check_time()
+        self.results.check_time()
         self._progress.stage("loading the scene for the other denoiser")
         other, _ = problem_from_config(self._config, denoise=self._other)
         other.plan = other.plan.with_estimator({one.name: one.estimator for one in self._plan.groups}, "as beside")
@@ -155,14 +132,7 @@ class _Measurements:
             self._left.pop(0)
 
     def result(self, rows: Sequence[PlannedRow], ending: str, run: str, seconds: float) -> PlanResult:
-        """Return what some rows come to.
-
-        Args:
-            rows: so far.
-            ending: how it ended.
-            run: the folder.
-            seconds: that it took.
-        """
+        """Return what the rows so far come to."""
         problem, config = self._problem, self._config
         table = [row for row in rows if isinstance(row, CosineRow)]
         tables = {name: [row for row in table if row.denoise == name] for name in (config.denoise, self._other)}
@@ -189,14 +159,13 @@ class _Measurements:
             gains=[row for row in rows if isinstance(row, GainRow)] or None,
             bounces=next((row for row in rows if isinstance(row, PathLength)), None),
             texels=[row for row in rows if isinstance(row, TexelRow)] if left_out else None,
-            limits=_limits() if "material" in used else [],
+            limits=[EstimatorLimit.of(one) for one in LIMITS] if "material" in used else [],
             seconds={"total": seconds},
             seed=config.seed,
             command_line=config.command_line(),
         )
 
     def _compare_estimators(self) -> None:
-        """Choose every contested estimator."""
         problem, renderer = self._problem, self._problem.renderer
         hint = f"{self._gradients} gradients of {count(problem.spp, 'sample')} a pixel; `resolution` shortens it"
         self._progress.stage("comparing ways to differentiate", self._gradients, hint=hint)
@@ -208,14 +177,14 @@ class _Measurements:
             spp=problem.spp,
             every=True,
             tick=lambda: self._progress.advance(1),
-            keep=self._results.get,
+            keep=self.results.get,
         )
 
     def _cosines(self, problem: Problem, control: str, title: str) -> Iterator[CosineRow]:
         renderer, only = problem.renderer, (control,)
 
         def kept(name: str, measure: Callable[[], Any]) -> Any:
-            return self._results.get(f"{renderer.formation.denoiser} {name}", measure)
+            return self.results.get(f"{renderer.formation.denoiser} {name}", measure)
 
         hint = "counted in samples a pixel; `resolution` shortens it, `seconds` ends it"
         self._progress.stage(title, cosine_samples(renderer.plan, controls=only), hint=hint, at_most=True)
@@ -228,7 +197,6 @@ class _Measurements:
             )
 
     def _leaving_out(self) -> Iterator[PlannedRow]:
-        """What leaving things out of a search's renders brings, and the proof that it is safe."""
         problem, renderer, progress = self._problem, self._problem.renderer, self._progress
         seed, u = seeds.stream(self._config.seed, "leaving out"), inside(renderer)
 
@@ -245,20 +213,17 @@ class _Measurements:
             return measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=depth, tick=tick)
 
         hint = "`specialise=false` leaves it out"
-        yield (length := self._results.row("bounces", PathLength, lengths))
-        yield from self._results.rows("gains", GainRow, gains)
-        yield from self._results.rows("texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
+        yield (length := self.results.row("bounces", PathLength, lengths))
+        yield from self.results.rows("gains", GainRow, gains)
+        yield from self.results.rows("texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
 
 
 def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAdvice:
-    """Say which denoiser makes the better gradients: the one that reaches the goal in all controls in less time.
+    """Say which denoiser makes the better gradients, by the cosines of each: the one that reaches the goal in all
+    controls in less time.
 
     A denoiser is part of the image formation, the same in search and verification, so that this is advice: another one
     is another question.
-
-    Args:
-        tables: denoiser to its measured cosines.
-        asked: the run's.
     """
 
     def rank(name: str) -> tuple[bool, float]:
@@ -284,20 +249,194 @@ def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAd
     return DenoiserAdvice(asked=asked, advised=advised, reason=why)
 
 
-def _limits() -> list[EstimatorLimit]:
-    """What the material form does not cover, as it states itself."""
-    return [EstimatorLimit.of(limit) for limit in LIMITS]
-
-
 def _left_out(problem: Problem, used: set[str]) -> list[str]:
     """What a search with these estimators does not compute, in sentences."""
-    sentences = []
-    if "material" not in used:
-        sentences.append("boundary terms: nothing that an adjoint differentiates moves an outline")
-    if not used & BY_ADJOINT:
-        sentences.append("adjoint renders: no coordinate needs one")
-    if not used & BY_DIFFERENCES:
-        sentences.append("renders for differences: every derivative is an adjoint or of the picture itself")
-    if not problem.renderer.scene.volumetric:
-        sentences.append("the volumetric integrator: there is no medium")
-    return sentences
+    known = {
+        "boundary terms: nothing that an adjoint differentiates moves an outline": "material" not in used,
+        "adjoint renders: no coordinate needs one": not used & BY_ADJOINT,
+        "renders for differences: every derivative is an adjoint or of the picture itself": not used & BY_DIFFERENCES,
+        "the volumetric integrator: there is no medium": not problem.renderer.scene.volumetric,
+    }
+    return [text for text, true in known.items() if true]
+
+
+ALL = "everything above"
+"""Name of the row in which all items are put back together."""
+BOUNCES = "bounces"
+"""Name of the row in which paths have their full length."""
+RENDERS = "renders"
+"""Name of the row in which steps render, where a matrix of light transport predicts them."""
+WHAT = {
+    **ITEMS,
+    BOUNCES: "bounces of light beyond the search's longest path",
+    ALL: "all of these",
+    RENDERS: "renders of the steps that light transport predicts",
+}
+"""What is left out, in words, for each row."""
+AGREES = 1.2
+"""Difference, as a share of what another seed changes, up to which two pictures or gradients agree: 1 is expected where
+the random numbers are others."""
+
+
+REPEATS = 3
+"""Timed gradients of each."""
+
+
+def most_gradients(repeats: int = REPEATS) -> int:
+    """Return how many gradients `measured_gains` takes at most: with every item put back, with all, with all bounces
+    and with none, twice to compare and then timed, and predicted ones."""
+    return (2 + repeats) * (len(ITEMS) + 4)
+
+
+def measured_gains(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    spp: int,
+    repeats: int = REPEATS,
+    depth: int | None = None,
+    tick: Callable[[], None] = lambda: None,
+) -> list[GainRow]:
+    """Put back what is left out, item by item and all at once, and measure a gradient.
+
+    Args:
+        renderer: with everything left out.
+        loss: what is differentiated.
+        u: (d,) where.
+        seed: root of the noise.
+        spp: samples a pixel.
+        repeats: timed gradients of each.
+        depth: longest light path of the search, where it is shorter than the scene's.
+        tick: called after each gradient.
+
+    Returns:
+        One row for each item, one for all, and where light transport can predict the pictures of a search one for that
+            too: against a rendered gradient, with a share of the making as large as the shortest search that predicts
+            has, its picture beside one of as many samples as its own.
+    """
+    scene = renderer.scene
+    depth = scene.max_depth if depth is None else depth
+    everyone = {"": renderer if depth == scene.max_depth else renderer.like(scene.like(max_depth=depth))}
+    for item in ITEMS:
+        everyone[item] = renderer.like(scene.like(max_depth=depth, leave_out=EVERYTHING - {item}))
+    if depth < scene.max_depth:
+        everyone[BOUNCES] = renderer
+    everyone[ALL] = renderer.like(scene.like(leave_out=NOTHING))
+    first = [_one(each, loss, u, seed, spp, tick) for each in everyone.values()]  # compiles, and compares
+    again = [_one(each, loss, u, seeds.stream(seed, "another"), spp, tick) for each in everyone.values()]
+    noises = [seeds.stream(seed, "round", number) for number in range(repeats)]
+    rounds = [[_seconds(each, loss, u, noise, spp, tick) for each in everyone.values()] for noise in noises]
+    typical = [statistics.median(times) for times in zip(*rounds, strict=True)]
+    rows = [
+        _row(item, (first[0], again[0], typical[0]), (first[number], again[number], typical[number]))
+        for number, item in list(enumerate(everyone))[1:]
+    ]
+    if why_not(renderer) is None:
+        both = seed, seeds.stream(seed, "another")
+        predicted = [_predicted(renderer, loss, u, noise, spp, tick) for noise in both]
+        seconds = statistics.fmean(one[2] for one in predicted)
+        row = _row(RENDERS, (predicted[0][:2], predicted[1][:2], seconds), (first[0], again[0], typical[0]))
+        with torch.no_grad():  # at few samples the denoiser's own bias is in a rendered picture
+            clean, other = (renderer(u, noise, SPP) for noise in both)
+        apart = _share(clean - predicted[0][0], predicted[1][0] - predicted[0][0], other - clean)
+        rows.append(
+            row.model_copy(update={"picture_difference": apart, "safe": max(apart, row.gradient_difference) <= AGREES})
+        )
+    return rows
+
+
+GradientSamples = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], float]
+"""The picture and the gradient of one seed, those of another, and the seconds of a gradient."""
+
+
+def _row(item: str, without: GradientSamples, having: GradientSamples) -> GainRow:
+    (first, again, seconds), (first_with, again_with, seconds_with) = without, having
+    picture, gradient = (
+        _share(first_with[k] - first[k], again[k] - first[k], again_with[k] - first_with[k]) for k in range(2)
+    )
+    noise = _ratio(again_with[0] - first_with[0], again[0] - first[0])
+    return GainRow(
+        item=item,
+        what=WHAT[item],
+        gain=noise**2 * seconds_with / seconds,
+        picture_difference=picture,
+        gradient_difference=gradient,
+        safe=picture <= AGREES and gradient <= AGREES,
+        seconds=seconds_with,
+    )
+
+
+def _predicted(
+    renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]
+) -> tuple[Tensor, Tensor, float]:
+    """The picture and the gradient that light transport predicts, and the seconds of a gradient with its share of the
+    making."""
+    begun = time.perf_counter()
+    made = predicting(renderer, u, seed)
+    with torch.no_grad():
+        picture = made(u, seed, spp)
+    ready = time.perf_counter()
+    gradient = made.gradient(loss, u, seed, spp)[1]
+    seconds = time.perf_counter() - ready + (ready - begun) / WORTH
+    tick()
+    return picture, gradient, seconds
+
+
+def _one(
+    renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]
+) -> tuple[Tensor, Tensor]:
+    with torch.no_grad():
+        picture = renderer(u, seed, spp)
+    gradient = renderer.gradient(loss, u, seed, spp)[1]
+    tick()
+    return picture, gradient
+
+
+def _seconds(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]) -> float:
+    begun = time.perf_counter()
+    renderer.gradient(loss, u, seed, spp)
+    tick()
+    return time.perf_counter() - begun
+
+
+def _share(difference: Tensor, *noises: Tensor) -> float:
+    """The size of a difference over the root mean square of those that another seed makes."""
+    size = math.sqrt(statistics.fmean(float(noise.norm()) ** 2 for noise in noises))
+    return float(difference.norm()) / size if size > 0.0 else float(difference.norm())
+
+
+def _ratio(above: Tensor, below: Tensor) -> float:
+    size = float(below.norm())
+    return float(above.norm()) / size if size > 0.0 else 1.0
+
+
+PER_PIXEL = 2.0
+"""Texels a pixel that `TexelRow.enough` keeps: two samples a period (Nyquist), with room for oblique views."""
+
+
+def resolved_texels(renderer: Renderer, u: Tensor, *, seed: int, spp: int = 16) -> list[TexelRow]:
+    """Return, for every searched texture, how its texels compare with the pixels that show them."""
+    found = []
+    groups = [group for group in renderer.plan.groups if group.parameter == "texels"]
+    assembled = renderer.scene.assembly(renderer.space.inputs(u))
+    inputs = {name: value.detach() for name, value in assembled.items() if name not in ON_PICTURE}
+    for group in groups:
+        for name in sorted(renderer.routes.get(group.name, ())):
+            found.append(_texels(renderer.scene, group.control, name, inputs, seed, spp))
+    return found
+
+
+def _texels(scene: MitsubaScene, control: str, name: str, inputs: dict[str, Tensor], seed: int, spp: int) -> TexelRow:
+    texture = inputs[name]
+    bright, dark = ({**inputs, name: torch.full_like(texture, level)} for level in (1.0, 0.0))
+    difference = scene.guides(bright, seed, spp)[0] - scene.guides(dark, seed, spp)[0]
+    pixels = int((difference.amax(dim=-1) > 0.0).sum())
+    with scene.shorter(2):
+        gradient = scene.adjoint(inputs, torch.ones(*scene.resolution, 3), seed, spp, wrt=[name])[name]
+    seen, side = int((gradient.abs().amax(dim=-1) > 0.0).sum()), max(texture.shape[:2])
+    enough = side
+    while enough > 2 and seen * (enough / 2 / side) ** 2 >= PER_PIXEL * pixels:
+        enough //= 2
+    return TexelRow(control=control, side=side, seen=seen, pixels=pixels, enough=enough)

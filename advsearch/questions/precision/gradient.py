@@ -13,15 +13,22 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import Estimate, Loss, Probe, agreement, estimated, reference
-from advsearch.questions.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
-from advsearch.questions.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
-from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
+from advsearch.questions.precision.points import (
+    INDEPENDENT,
+    STRATIFIED,
+    UNKNOWN,
+    Array,
+    MeasuredSetting,
+    ReferenceValue,
+    Theory,
+    reference_of,
+)
+from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples, seconds_a_sample
 from advsearch.scene.gradients import BY_ADJOINT, Group, compared
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.plan import why_not_kept
-from advsearch.scene.surface.renderer import SurfaceRenderer
-from advsearch.scene.transport.renderer import LinearRenderer, PredictingRenderer, linear_inputs
+from advsearch.scene.surface.renderer import SurfaceRenderer, why_not_kept
+from advsearch.scene.transport.matrix import LinearRenderer, PredictingRenderer, linear_inputs
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
 BY_COORDINATE = 32
@@ -41,13 +48,8 @@ CHECK_SPP = 64
 
 @dataclass(frozen=True)
 class GradientPart:
-    """Coordinates of one control whose gradient one call of an estimator answers.
-
-    Attributes:
-        name: of the control; with parameters where a control has several such parts.
-        groups: of coordinates.
-        estimators: what is compared.
-    """
+    """Coordinates of one control whose gradient one call of an estimator answers; named with parameters where a control
+    has several."""
 
     name: str
     groups: tuple[Group, ...]
@@ -65,19 +67,16 @@ class GradientPart:
 
     def of(self, gradient: Tensor) -> Array:
         """Return the part's entries (n,) of a whole gradient (d,)."""
-        return _array(torch.cat([gradient[group.coordinates] for group in self.groups]))
+        return flat(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
 def estimated_parts(
     groups: Sequence[Group], *, linear: bool, by_matrix: Collection[str] = (), ways: Sequence[str] = (MATRIX,)
 ) -> list[GradientPart]:
-    """Return the parts of a space with the estimators that are valid for them.
+    """Return the parts of a space with the estimators that are valid for them, and the `ways` to predict groups in
+    `by_matrix`.
 
-    Args:
-        groups: of the plan.
-        linear: whether the loss is linear: differences of the loss are then those of the picture, and left out.
-        by_matrix: names of the groups that are predicted too; see `matrix_groups`.
-        ways: what predicts them; see `ways_to_predict`.
+    Of a linear loss, differences of the loss are those of the picture, and left out.
     """
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in groups:
@@ -119,11 +118,8 @@ def predicting(way: str, renderer: Renderer, u: Tensor, seed: int, spp: int) -> 
 
 
 def theory_of(estimator: str, sampler: str) -> Theory:
-    """Return the slope that theory gives the error of an estimator against samples of a sampler.
-
-    The interior adjoint is an unbiased mean of samples. Differences have the bias of their step; the material form has
-    its limits.
-    """
+    """Return the slope that theory gives the error of an estimator against samples: the interior adjoint is an unbiased
+    mean of samples; differences have the bias of their step, and the material form has its limits."""
     if estimator != "adjoint":
         return UNKNOWN
     return INDEPENDENT if sampler == "independent" else STRATIFIED
@@ -211,8 +207,6 @@ class GradientBench:
             f"differences {against.value:.3g} +- {against.noise:.1g}: its errors leave out that bias"
         )
 
-    # ---- inside -----------------------------------------------------------------------------------------------------
-
     def _cost(self, estimator: str) -> float:
         if estimator in COST_OF:
             return COST_OF[estimator]
@@ -245,7 +239,7 @@ class GradientBench:
 
     def _by_differences(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
         along = self._coordinates
-        rate = self._rate(lambda spp: self._difference(along[0], seed, spp)) * len(along)
+        rate = seconds_a_sample(lambda spp: self._difference(along[0], seed, spp)) * len(along)
         self.part_spp = part_samples(rate, budget.left, parts=3, counts=(16, 64, 256))
         found = self._gathered(budget, seed, on_done)
         left = float(np.linalg.norm(np.mean([apart for _, apart in found], axis=0))) / 4.0
@@ -257,20 +251,10 @@ class GradientBench:
         return one.value, one.steps[0] - one.steps[1]
 
     def _by_estimator(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
-        by = self.by if self.by != "differences" else self.part.estimators[0]
-        self.by = by
-        rate = self._rate(lambda spp: self._estimated(self._exact, by, seed, spp))
+        self.by = by = self.by if self.by != "differences" else self.part.estimators[0]
+        rate = seconds_a_sample(lambda spp: self._estimated(self._exact, by, seed, spp))
         self.part_spp = part_samples(rate, budget.left)
-
         self.reference = reference_of(self._gathered(budget, seed, on_done))
-
-    def _rate(self, call: Callable[[int], object], pilot: int = 16) -> float:
-        """Seconds a sample, from the second of two calls."""
-        for _ in range(2):
-            begun = time.perf_counter()
-            call(pilot)
-            seconds = time.perf_counter() - begun
-        return seconds / pilot
 
     def _along(self, value: Tensor, seed: int) -> Probe:
         """A direction in all coordinates: the signs of the gradient and half as many random ones."""
@@ -291,6 +275,7 @@ def _coordinate(u: Tensor, group: Group, number: int) -> Probe:
     return Probe(replace(group, size=1, begin=group.begin + number), f"{group.name}.{number}", direction, group.step)
 
 
-def _array(values: Tensor) -> Array:
-    found: Array = values.detach().to(torch.float64).numpy().copy()
+def flat(values: Tensor) -> Array:
+    """Return values of any shape as (n,) float64."""
+    found: Array = values.detach().to(torch.float64).reshape(-1).numpy().copy()
     return found

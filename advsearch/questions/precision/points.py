@@ -10,10 +10,14 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
+
+from advsearch.questions.precision.answer import PrecisionSlope, Recommended
 
 Array = npt.NDArray[np.float64]
 
@@ -28,11 +32,12 @@ may record them again, and so may the first one after other scenes were rendered
 
 @dataclass(frozen=True)
 class MeasuredSetting:
-    """One way to compute a quantity.
+    """One way to compute a quantity: a series (a sampler, an estimator, a policy), the line of a diagram, at a sample
+    count.
 
     Attributes:
         quantity: "image", "gradient" or "objective".
-        series: the line it belongs to in the diagram: a sampler, an estimator, a policy.
+        series: the line it belongs to in the diagram.
         spp: samples a pixel, as they are really taken.
         cost: what it should take, in any one unit; settings are measured cheapest first.
         control: whose gradient; empty otherwise.
@@ -50,17 +55,8 @@ class MeasuredSetting:
         return self.quantity, self.control, self.series
 
 
-@dataclass(frozen=True)
-class Sample:
-    """One measurement of a setting.
-
-    Attributes:
-        numbers: error by measure ("error", "margin_error"), and other numbers ("cosine").
-        seconds: what it took.
-    """
-
-    numbers: Mapping[str, float]
-    seconds: float
+Sample = tuple[Mapping[str, float], float]
+"""One measurement: error by measure ("error", "margin_error") and other numbers ("cosine"), and the seconds."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +64,6 @@ class Point:
     """What the measurements of one setting say.
 
     Attributes:
-        setting: which.
-        measure: "error", or another error that the samples have.
         error: root mean square of the relative error, the reference's own taken off; where it is not known, an upper
             limit: the root mean square as it was measured.
         interval: of the error, 95 %, from the scatter of the samples; (NaN, NaN) for a single one.
@@ -118,16 +112,11 @@ class ReferenceValue:
 
 
 def reference_of(parts: Sequence[Array], bias: float = 0.0) -> ReferenceValue:
-    """Return the mean of independent parts with the standard error that their scatter implies.
+    """Return the mean of at least two independent parts (n,) with the standard error that their scatter implies.
 
-        error^2 = sum_k |part_k - mean|^2 / (K (K - 1)),      for two halves: |half_1 - half_2| / 2
-
-    Args:
-        parts: at least two (n,) arrays from independent noise.
-        bias: a further error in the same unit, known to be there; added in squares.
+    error^2 = sum_k |part_k - mean|^2 / (K (K - 1)). A `bias` that is known to be there is added in squares.
     """
-    if len(parts) < 2:
-        raise ValueError(f"reference: expected at least two independent parts, got {len(parts)}")
+    _check_several(parts)
     mean = np.mean(parts, axis=0)
     scatter = sum(float(np.sum((part - mean) ** 2)) for part in parts)
     error = math.hypot(math.sqrt(scatter / (len(parts) * (len(parts) - 1))), bias)
@@ -135,18 +124,19 @@ def reference_of(parts: Sequence[Array], bias: float = 0.0) -> ReferenceValue:
     return ReferenceValue(mean, _ratio(error, size), size, len(parts))
 
 
+def _check_several(parts: Sequence[Array]) -> None:
+    if len(parts) < 2:
+        raise ValueError(f"reference: expected at least two independent parts, got {len(parts)}")
+
+
 def reference_through(function: Callable[[Array], Array], parts: Sequence[Array]) -> ReferenceValue:
-    """Return a function of the mean of independent parts, with its error by the jackknife (Efron 1982, chapter 3).
+    """Return a function, (n,) to (m,), of the mean of independent parts, with its error by the jackknife (Efron 1982,
+    chapter 3).
 
     For what is no mean itself, such as a picture after its tone curve or a model's margin on it. The error holds the
     jackknife's estimate of bias (noise through a bend) as well as of scatter.
-
-    Args:
-        function: from (n,) to (m,) float64.
-        parts: at least two (n,) arrays from independent noise.
     """
-    if len(parts) < 2:
-        raise ValueError(f"reference: expected at least two independent parts, got {len(parts)}")
+    _check_several(parts)
     count, total = len(parts), np.sum(parts, axis=0)
     value = function(total / count)
     without = [function((total - part) / (count - 1)) for part in parts]
@@ -164,19 +154,19 @@ def point_of(setting: MeasuredSetting, samples: Sequence[Sample], measure: str =
     The samples' noise and the reference's are independent, so their squares add: error^2 = mean of squares - floor^2.
     A root mean square below `KNOWN` times the floor is not known; what is given then is a limit.
     """
-    squares = [sample.numbers[measure] ** 2 for sample in samples]
+    squares = [numbers[measure] ** 2 for numbers, _ in samples]
     raw = statistics.fmean(squares)
     known = raw > (KNOWN * floor) ** 2 and math.isfinite(raw) and raw > 0.0
     error = math.sqrt(raw - floor**2) if known else math.sqrt(raw)
-    others = {name for sample in samples for name in sample.numbers if name not in (measure, "error", "margin_error")}
-    more = {name: statistics.fmean(sample.numbers[name] for sample in samples) for name in sorted(others)}
+    others = {name for numbers, _ in samples for name in numbers if name not in (measure, "error", "margin_error")}
+    more = {name: statistics.fmean(numbers[name] for numbers, _ in samples) for name in sorted(others)}
     interval = _interval(squares, error, raw) if known else (0.0, math.sqrt(raw))
     return Point(setting, measure, error, interval, known, floor, typical_seconds(samples), len(samples), more)
 
 
 def typical_seconds(samples: Sequence[Sample]) -> float:
     """Return the median time without the calls that warm up; of the last call where there are no others."""
-    seconds = [sample.seconds for sample in samples]
+    seconds = [taken for _, taken in samples]
     return statistics.median(seconds[WARM_UP:] or seconds[-1:])
 
 
@@ -198,3 +188,270 @@ def _interval(squares: Sequence[float], error: float, raw: float) -> tuple[float
 
 def _ratio(error: float, size: float) -> float:
     return error / size if size > 0.0 else (0.0 if error == 0.0 else math.inf)
+
+
+AGREES = 0.1
+"""How far a slope may be from theory, whatever its interval."""
+MONTE_CARLO = -0.5
+"""Slope of the error of a mean of independent samples against their number."""
+FURTHEST = 16.0
+"""Times the largest measured sample count beyond which nothing is said."""
+MOSTLY_SAMPLING = 0.25
+"""Share of a call's time that may be fixed for theory to hold against seconds."""
+LEAST_POINTS = 3
+"""Of a fit."""
+
+Against = Literal["samples", "seconds"]
+RoundUp = Callable[[str, float], int]
+"""From a series and a number of samples to the next number that it takes."""
+
+
+@dataclass(frozen=True)
+class Theory:
+    """What a slope should be; None where theory has none. With `at_most` steeper is right too."""
+
+    slope: float | None = None
+    at_most: bool = False
+
+
+INDEPENDENT = Theory(MONTE_CARLO)
+STRATIFIED = Theory(MONTE_CARLO, at_most=True)
+"""Stratification never makes the slope shallower than that of independent samples (Owen 1997), and often steeper."""
+UNKNOWN = Theory()
+
+
+def fit_line(points: Sequence[Point], against: Against = "samples", theory: Theory = UNKNOWN) -> PrecisionSlope | None:
+    """Return the least-squares line of log error against log samples or seconds.
+
+    Only points whose error is known count: one below the reference's own error says nothing. None where fewer than
+    `LEAST_POINTS` are left. An independent slope disagrees with theory where its interval leaves theory out *and* it is
+    further than `AGREES` from it.
+
+    Against seconds, theory holds where time is spent on samples: if there are enough points at which the fixed part of
+    a call is at most `MOSTLY_SAMPLING` of it, the line goes through these, else nothing is said about theory.
+    """
+    known = [point for point in points if point.known]
+    if _counts(known) < LEAST_POINTS:
+        return None
+    fixed, holds = math.nan, True
+    if against == "seconds":
+        fixed = fixed_seconds(points)
+        sampling = [point for point in known if fixed <= MOSTLY_SAMPLING * point.seconds]
+        holds = _counts(sampling) >= LEAST_POINTS
+        known = sampling if holds else known
+    x = np.log([_across(point, against) for point in known])
+    y = np.log([point.error for point in known])
+    slope, offset, half = straight_line(x, y)
+    setting = known[0].setting
+    return PrecisionSlope(
+        quantity=setting.quantity,
+        control=setting.control or None,
+        estimator=setting.series,
+        measure=known[0].measure,
+        against=against,
+        slope=slope,
+        interval=(slope - half, slope + half),
+        offset=offset,
+        points=len(known),
+        fixed_seconds=fixed,
+        theory=theory.slope,
+        or_steeper=theory.at_most,
+        agrees=_agrees(slope, half, theory) if holds else None,
+    )
+
+
+def straight_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
+    """Return slope and offset of the least-squares line through (n,) and (n,), n at least 3, and half the slope's 95 %
+    interval."""
+    count, across = len(x), x - x.mean()
+    spread = float(across @ across)
+    slope = float(across @ (y - y.mean())) / spread
+    offset = float(y.mean() - slope * x.mean())
+    rest = y - offset - slope * x
+    error = math.sqrt(float(rest @ rest) / (count - 2) / spread)
+    return slope, offset, float(stdtrit(count - 2, (1.0 + LEVEL) / 2.0)) * error
+
+
+def fixed_seconds(points: Sequence[Point]) -> float:
+    """Return the time of a call that does not grow with the samples: seconds = fixed + rate x samples.
+
+    By least squares with relative weights, not below 0; NaN for fewer than two sample counts.
+    """
+    if len({point.setting.spp for point in points}) < 2:
+        return math.nan
+    seconds = np.array([point.seconds for point in points])
+    columns = np.stack([np.ones(len(points)), np.array([float(point.setting.spp) for point in points])], axis=1)
+    fixed, _ = np.linalg.lstsq(columns / seconds[:, None], np.ones(len(points)), rcond=None)[0]
+    return max(0.0, float(fixed))
+
+
+def warning_of(slope: PrecisionSlope, points: Sequence[Point]) -> str | None:
+    """Return a sentence where a slope disagrees with theory, with the likeliest reason; None where it agrees."""
+    if slope.agrees is not False or slope.theory is None:
+        return None
+    what = f"{slope.control or slope.quantity} by {slope.estimator}" + ("" if slope.measure == "error" else ", margin")
+    said = f"{what}: the error falls with slope {slope.slope:.2f} against {slope.against}"
+    said += f" (95 %: {slope.interval[0]:.2f} to {slope.interval[1]:.2f}), theory says {slope.theory:g}"
+    return f"{said}{' or steeper' if slope.or_steeper else ''}: {_reason(slope, points)}"
+
+
+def _reason(slope: PrecisionSlope, points: Sequence[Point]) -> str:
+    if slope.slope > (slope.theory or 0.0):
+        if levels_off(points):
+            return "it levels off: a bias is left that no samples remove"
+        return "heavy-tailed noise, clipping at few samples or a bias"
+    return "the fewest samples are not in the asymptotic range yet"
+
+
+def levels_off(points: Sequence[Point]) -> bool:
+    """Whether the last step between known points is less than half as steep as the first ones were."""
+    known = sorted((point for point in points if point.known), key=lambda point: point.setting.spp)
+    steps = [
+        math.log(b.error / a.error) / math.log(b.setting.spp / a.setting.spp)
+        for a, b in pairwise(known)
+        if b.setting.spp > a.setting.spp
+    ]
+    return len(steps) >= 2 and steps[-1] > 0.5 * min(*steps[:-1], 0.0)
+
+
+def recommend(
+    lines: Mapping[tuple[str, str, str], Sequence[Point]], goal: float, round_up: RoundUp | None = None
+) -> Recommended | None:
+    """Return the setting with the least time that reaches a relative error; None where none is known to.
+
+    Args:
+        lines: the points of each line, all of one measure.
+        goal: relative error, over 0.
+        round_up: what sample counts a series takes; None for all whole numbers.
+    """
+    found = [one for points in lines.values() if (one := reaching(points, goal, round_up)) is not None]
+    return min(found, key=lambda one: one.seconds or 0.0, default=None)
+
+
+def reaching(points: Sequence[Point], goal: float, round_up: RoundUp | None = None) -> Recommended | None:
+    """Return the least sample count at which one line reaches a goal, and what it takes there.
+
+    Where the fitted line goes through the interval of every known point, of at least four, it stands for them: it
+    knows more than any one of them. Elsewhere the error is interpolated between points on logarithmic axes; beyond the
+    last one it follows the fitted slope, at most `FURTHEST` times as far, and not at all where the line levels off. A
+    limit counts as an error of that size. Time is interpolated, and beyond the last point grows with the samples.
+    """
+    if not points or not goal > 0.0:
+        return None
+    ordered = sorted(points, key=lambda point: point.setting.spp)
+    setting = ordered[0].setting
+    fitted = _explaining(ordered)
+    count, basis = _samples_for(ordered, goal) if fitted is None else _on_line(fitted, ordered, goal)
+    if count is None:
+        return None
+    spp = (round_up or (lambda _, samples: math.ceil(samples - 1e-9)))(setting.series, count)
+    return Recommended(
+        quantity=setting.quantity,
+        control=setting.control or None,
+        measure=ordered[0].measure,
+        among=None,
+        goal=goal,
+        estimator=setting.series,
+        spp=spp,
+        seconds=_number_at(ordered, spp, "seconds"),
+        error=_number_at(ordered, spp, "error") if fitted is None else _line_at(fitted, spp),
+        basis=basis,
+    )
+
+
+def confirm_recommendation(one: Recommended, point: Point, round_up: RoundUp) -> Recommended:
+    """Return a recommendation that rests on a point measured after it was chosen, with seeds of its own.
+
+    What looks cheapest among noisy points is mostly a lucky one, and its error looks smaller than it is. New
+    measurements don't have that bias: what they say is promised. Where it is more than the goal, the sample count grows
+    as independent samples need it, by (error / goal)^2, at most `FURTHEST` times, and the error shrinks by the root.
+    """
+    assert one.goal is not None and one.spp is not None and one.estimator is not None
+    more = min(FURTHEST, max(1.0, (point.error / one.goal) ** 2))
+    spp = round_up(one.estimator, one.spp * more)
+    times = spp / one.spp
+    return one.model_copy(
+        update={
+            "spp": spp,
+            "seconds": point.seconds * times,
+            "error": point.error / math.sqrt(times),
+            "basis": "confirmed",
+            "repeats": point.repeats,
+        }
+    )
+
+
+def _explaining(ordered: Sequence[Point]) -> PrecisionSlope | None:
+    """The fitted line, if it falls and goes through the intervals of all known points, of at least four."""
+    line = fit_line(ordered)
+    if line is None or line.points < LEAST_POINTS + 1 or line.slope > -0.1:
+        return None
+    known = [point for point in ordered if point.known]
+    through = all(point.interval[0] <= _line_at(line, point.setting.spp) <= point.interval[1] for point in known)
+    return line if through else None
+
+
+def _on_line(line: PrecisionSlope, ordered: Sequence[Point], goal: float) -> tuple[float | None, str]:
+    """The samples at which a fitted line reaches a goal."""
+    least, largest = ordered[0].setting.spp, ordered[-1].setting.spp
+    count = math.exp((math.log(goal) - line.offset) / line.slope)
+    if count > FURTHEST * largest:
+        return None, ""
+    return max(count, float(least)), "measured" if count <= least else "fitted" if count <= largest else "extrapolated"
+
+
+def _line_at(line: PrecisionSlope, spp: int) -> float:
+    return math.exp(line.offset + line.slope * math.log(spp))
+
+
+def _samples_for(ordered: Sequence[Point], goal: float) -> tuple[float | None, str]:
+    """The samples at which ordered points stay at or below a goal from there on."""
+    good = None
+    for point in reversed(ordered):
+        if point.error > goal:
+            break
+        good = point
+    if good is None:
+        return _extrapolated(ordered, goal), "extrapolated"
+    if good is ordered[0]:
+        return float(good.setting.spp), "measured"
+    before = ordered[ordered.index(good) - 1]
+    share = math.log(before.error / goal) / math.log(before.error / good.error)
+    ratio = good.setting.spp / before.setting.spp
+    return before.setting.spp * ratio**share, "interpolated"
+
+
+def _extrapolated(ordered: Sequence[Point], goal: float) -> float | None:
+    line, last = fit_line(ordered), ordered[-1]
+    if line is None or not last.known or line.slope > -0.1 or levels_off(ordered):
+        return None
+    factor = (goal / last.error) ** (1.0 / max(line.slope, -1.0))
+    return last.setting.spp * factor if factor <= FURTHEST else None
+
+
+def _number_at(ordered: Sequence[Point], spp: int, what: Literal["seconds", "error"]) -> float:
+    """A number at a sample count, interpolated, or continued along the last slope (time: in proportion)."""
+    if len(ordered) == 1:
+        return float(getattr(ordered[0], what)) * (spp / ordered[0].setting.spp if what == "seconds" else 1.0)
+    counts = [float(point.setting.spp) for point in ordered]
+    values = [math.log(max(1e-300, getattr(point, what))) for point in ordered]
+    if spp <= counts[-1]:
+        return math.exp(float(np.interp(math.log(spp), np.log(counts), values)))
+    line = fit_line(ordered)
+    slope = 1.0 if what == "seconds" else (MONTE_CARLO if line is None else max(line.slope, -1.0))
+    return math.exp(values[-1] + slope * math.log(spp / counts[-1]))
+
+
+def _counts(points: Sequence[Point]) -> int:
+    return len({point.setting.spp for point in points})
+
+
+def _across(point: Point, against: Against) -> float:
+    return float(point.setting.spp) if against == "samples" else point.seconds
+
+
+def _agrees(slope: float, half: float, theory: Theory) -> bool | None:
+    if theory.slope is None:
+        return None
+    off = slope - theory.slope if theory.at_most else abs(slope - theory.slope)
+    return True if off <= AGREES else None if off <= half else False

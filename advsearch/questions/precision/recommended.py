@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -14,12 +15,16 @@ from advsearch.questions.precision.answer import (
     PrecisionPoint,
     PrecisionReference,
     PrecisionResult,
-    PrecisionSubject,
     Recommended,
     SettingPlace,
 )
-from advsearch.questions.precision.fits import (
+from advsearch.questions.precision.benches import OIDN, PREDICTED, PolicyCurve, missing, sooner
+from advsearch.questions.precision.gradient import COUNTS_OF, SURFACE_LIGHT
+from advsearch.questions.precision.points import (
     Against,
+    MeasuredSetting,
+    Point,
+    ReferenceValue,
     RoundUp,
     Theory,
     confirm_recommendation,
@@ -27,10 +32,6 @@ from advsearch.questions.precision.fits import (
     recommend,
     warning_of,
 )
-from advsearch.questions.precision.gradient import COUNTS_OF, SURFACE_LIGHT
-from advsearch.questions.precision.image import OIDN, PREDICTED
-from advsearch.questions.precision.objective import PolicyCurve, missing, sooner
-from advsearch.questions.precision.points import MeasuredSetting, Point, ReferenceValue
 from advsearch.scene.formation import next_count
 
 TableLine = tuple[str, str, str]
@@ -40,12 +41,9 @@ FAMILIES = {"raw": "without denoiser", "oidn": "with denoiser", "depth": "by pat
 
 @dataclass
 class MeasuredLine:
-    """What was measured of one line of a diagram, in one measure.
+    """What was measured of one line of a diagram (quantity, control, series), in one measure, by rising samples.
 
     Attributes:
-        line: quantity, control and series.
-        measure: which error.
-        points: by rising samples.
         theory: what its slope should be.
         family: of a line of the image: what it is recommended among.
         again: the setting that was recommended, from measurements after that.
@@ -61,17 +59,8 @@ class MeasuredLine:
 
 @dataclass
 class Section:
-    """What was measured: of one part of the work, or of several.
-
-    Attributes:
-        sampler: of the run's pixels, which gradients are taken with.
-        lines: of each line and measure.
-        references: as the report holds them.
-        curves: of each policy.
-        start: verified objective before any search.
-        left_out: settings that did not fit into the time.
-        warnings: sentences.
-    """
+    """What was measured: of one part of the work, or of several. `sampler` is that of the run's pixels, which gradients
+    are taken with, and `start` the verified objective before any search."""
 
     sampler: str
     lines: list[MeasuredLine] = field(default_factory=list)
@@ -129,8 +118,8 @@ class Section:
         )
 
 
-def report_of(subject: PrecisionSubject, section: Section, goal: float) -> PrecisionResult:
-    """Return the report: what was asked for, what was measured and what follows from it; no figures yet."""
+def report_of(section: Section, goal: float, **asked: Any) -> PrecisionResult:
+    """Return the report: what was measured, what follows from it, and what was asked for; no figures yet."""
     slopes, warnings = [], list(section.warnings)
     for one in section.lines:
         for against in AGAINST:
@@ -139,7 +128,7 @@ def report_of(subject: PrecisionSubject, section: Section, goal: float) -> Preci
             slopes += [] if slope is None else [slope]
             warnings += [] if said is None else [said]
     return PrecisionResult(
-        **vars(subject),
+        **asked,
         goal=goal,
         points=_points(section),
         slopes=slopes,
@@ -149,9 +138,6 @@ def report_of(subject: PrecisionSubject, section: Section, goal: float) -> Preci
         left_out=[NotMeasured(**vars(_place(one)), reason="did not fit into the time") for one in section.left_out],
         figures=[],
     )
-
-
-# ---- inside ---------------------------------------------------------------------------------------------------------
 
 
 def _points(section: Section) -> list[PrecisionPoint]:
@@ -209,7 +195,6 @@ def _objective_points(section: Section) -> list[PrecisionPoint]:
 
 
 def _best(section: Section) -> float:
-    """The best median of any policy."""
     tops = [middle for _, curve in section.curves for _, middle, _ in curve.objective]
     return max((value for value in tops if math.isfinite(value)), default=math.nan)
 

@@ -1,7 +1,6 @@
-"""Measures settings in interleaved rounds inside a time budget, cheapest first (work-precision diagrams).
+"""Measures settings in interleaved rounds inside a time budget, cheapest first; nothing here knows how to render.
 
-What is measured is a function of a setting and a seed; nothing here knows how to render. Rounds are interleaved
-(every setting once, then every setting again), so that a machine that slows down meanwhile does so for all of them.
+Every setting is measured once, then every setting again, so that a machine that slows down does so for all of them.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from advsearch import seeds, threads
-from advsearch.cluster.executor import Executor
+from advsearch.cluster import Executor
 from advsearch.cluster.worker import processor
 from advsearch.errors import ClusterError
 from advsearch.questions.precision.answer import Machine
@@ -36,12 +35,7 @@ MOST_PARTS = 64
 
 
 class TimeBudget:
-    """Seconds that may be spent.
-
-    Args:
-        seconds: from now on.
-        clock: seconds, growing.
-    """
+    """Seconds from now on that may be spent, by a clock."""
 
     def __init__(self, seconds: float, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
@@ -59,13 +53,8 @@ class TimeBudget:
 
 @dataclass
 class Rounds(Generic[Result]):
-    """What was measured.
-
-    Attributes:
-        results: what came out and its seconds, for each setting in the order in which they were taken.
-        left_out: settings that did not fit into the budget at all.
-        complete: whether every setting had all its rounds.
-    """
+    """What was measured: what came out and its seconds, for each setting; what did not fit into the budget at all; and
+    whether every setting had all its rounds."""
 
     results: dict[MeasuredSetting, list[tuple[Result, float]]] = field(default_factory=dict)
     left_out: tuple[MeasuredSetting, ...] = ()
@@ -83,10 +72,11 @@ def in_rounds(
     warm_up: int = 1,
     on_done: Callable[[MeasuredSetting], None] | None = None,
 ) -> Rounds[Result]:
-    """Measure settings in rounds until the rounds are done or the budget is used up.
+    """Measure settings in rounds until the rounds are done or the budget is used up; the first of all is always
+    measured.
 
     In the first round a setting is begun only if `least` calls of it, and those that the settings before it still need
-    for as many, fit into what is left; see `Forecast`. The first of all is always measured.
+    for as many, fit into what is left; see `Forecast`.
 
     Args:
         settings: what to measure, cheapest first.
@@ -130,12 +120,7 @@ def in_rounds(
 
 
 class Forecast(Generic[Result]):
-    """What a call should take, judged by those before it.
-
-    Args:
-        results: what was measured so far; read anew at every question.
-        cold: first calls of a setting that take longer, and say little about the next.
-    """
+    """What a call should take, judged by the results before it, whose `cold` first calls take longer and say little."""
 
     def __init__(self, results: dict[MeasuredSetting, list[tuple[Result, float]]], cold: int) -> None:
         self._results, self._cold = results, cold
@@ -193,14 +178,7 @@ def gather(
 ) -> list[Array]:
     """Return independent parts of a reference, each from a seed of its own, as many as fit into a budget.
 
-    Args:
-        parts: from seeds to arrays of one shape, float64.
-        budget: when to stop.
-        seed: root of the seeds.
-        name: of the stream of seeds.
-        least: parts that there are whatever they take: without two, nothing is known about the error.
-        most: parts at most.
-        on_done: told about every part.
+    There are at least `least`, whatever they take: without two, nothing is known about the error.
     """
     found: list[Array] = []
     begun: dict[int, float] = {}
@@ -223,28 +201,25 @@ def gather(
 
 
 def part_samples(rate: float, seconds: float, *, parts: int = 4, counts: Sequence[int] = (16, 64, 256, 1024)) -> int:
-    """Return the largest of some sample counts of which `parts` parts fit into some seconds; the least if none does.
-
-    Args:
-        rate: seconds a sample.
-        seconds: for all parts.
-        parts: how many at least.
-        counts: rising.
-    """
+    """Return the largest of some rising sample counts of which `parts` parts fit into some seconds; the least if none
+    does. `rate` is seconds a sample."""
     fitting = [count for count in counts if parts * count * rate <= seconds]
     return fitting[-1] if fitting else counts[0]
 
 
+def seconds_a_sample(call: Callable[[int], object], *, pilot: int = 16, calls: int = 2) -> float:
+    """Return the seconds a sample of the last of some calls, each of so many samples."""
+    for _ in range(calls):
+        begun = time.perf_counter()
+        call(pilot)
+        seconds = time.perf_counter() - begun
+    return seconds / pilot
+
+
 @dataclass(frozen=True)
 class ReferencePart:
-    """A part of a reference.
-
-    Attributes:
-        name: of what is measured in one sitting.
-        by: what of it, or how it is taken: see `PictureBench.part` and `GradientBench.part_of`.
-        spp: samples a pixel.
-        seed: of its noise.
-    """
+    """A part of a reference: of what sitting, what of it or how it is taken (see `PictureBench.part` and
+    `GradientBench.part_of`), samples a pixel, and the seed of its noise."""
 
     name: str
     by: str
@@ -253,10 +228,8 @@ class ReferencePart:
 
 
 def shared_parts(executor: Executor | None, name: str, by: str, spp: int) -> Parts | None:
-    """Return what has workers carry out parts; None where there are no workers.
-
-    It raises ClusterError if every worker dies of one.
-    """
+    """Return what has workers carry out parts, or raises ClusterError if each dies of one; None where there are no
+    workers."""
     if executor is None:
         return None
 
@@ -275,11 +248,8 @@ _CPU_INFO = Path("/proc/cpuinfo")
 
 
 def timing_machine(cpu_info: Path = _CPU_INFO) -> Machine:
-    """Return what a time has to be read with: the processor, its cores, and the threads in use.
-
-    Args:
-        cpu_info: Linux's description of the processor.
-    """
+    """Return what a time has to be read with: the processor (of Linux's description), its cores, and the threads in
+    use."""
     return Machine(
         cpu=processor(cpu_info),
         cores=threads.cores(),

@@ -42,26 +42,10 @@ class PrecisionConfig(DerivativeConfig):
     )
 
     quantities: str = setting(
-        "image,gradient,objective",
-        "search",
-        "what is measured, separated by commas",
-        "image, gradient, objective",
+        "image,gradient,objective", "search", "what is measured, separated by commas", "image, gradient, objective"
     )
-    seconds: float = setting(
-        120.0,
-        "search",
-        "time that all measurements may take",
-        unit="seconds",
-        gt=0.0,
-        le=1e9,
-    )
-    error: float = setting(
-        0.05,
-        "search",
-        "relative error that the recommended settings should have",
-        gt=0.0,
-        le=1.0,
-    )
+    seconds: float = setting(120.0, "search", "time that all measurements may take", unit="seconds", gt=0.0, le=1e9)
+    error: float = setting(0.05, "search", "relative error that the recommended settings should have", gt=0.0, le=1.0)
     rounds: int = setting(8, "search", "measurements of every setting, at most", ge=3, le=1000)
     samplers: str = setting(
         "independent,stratified,multijitter,orthogonal,ldsampler",

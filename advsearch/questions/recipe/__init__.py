@@ -1,1 +1,52 @@
-"""Experiments that YAML files describe, and what their figures say."""
+"""`advsearch recipe`: an experiment that a YAML file describes, and what its figures say."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from advsearch.cli import output
+from advsearch.cli.question import Positional, QuestionCommand
+
+HELP = "run a whole experiment that a recipe describes, and write a page of figures"
+EXAMPLES = (
+    "recipe list",
+    "recipe backgrounds --quick",
+    'recipe backgrounds --object mug.obj --environment a.hdr,b.hdr --model model.pt2 --label "coffee mug,cup"',
+    "show recipe backgrounds > mine.yaml",
+    "recipe mine.yaml",
+)
+
+LIST = "list"
+"""What lists the recipes instead."""
+
+
+class _Recipe(QuestionCommand):
+    """The command, which can list the recipes too, and takes a file of one."""
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Carry out the recipe and print what it says, or list the recipes."""
+        return _listed(args.json) if getattr(args, "recipe", None) == LIST else super().run(args)
+
+    def file(self, args: argparse.Namespace) -> Path | None:
+        """Return the recipe if it is a file."""
+        from advsearch.questions.recipe.description import is_file_name  # it brings torch, which takes a second
+
+        return Path(args.recipe) if is_file_name(args.recipe) else None
+
+
+def _listed(as_json: bool) -> int:
+    # late, so that --help answers at once
+    from advsearch.questions.recipe.description import titles
+
+    found = titles()
+    if as_json:
+        output.print_json({"schema": 1, "recipes": [{"name": name, "title": text} for name, text in found.items()]})
+    else:
+        print(output.aligned([[name, text] for name, text in found.items()]))
+    return 0
+
+
+COMMAND = _Recipe(
+    "recipe", about="recipe", place=Positional("NAME", "a recipe, or list", "; list shows the recipes that there are")
+)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import PurePath
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from advsearch.report.markup import InNotebook
+from advsearch.report.phrases import percent
+from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.wording import count, interval_text, short_name
 from advsearch.runs.results.base import Fields, Interval, RunResult
 from advsearch.runs.results.sweep import CountedAnswers, SurfaceTable
+
+HeadsAndRows = tuple[list[str], list[list[str]]]
+
+COUNT_HEADS = ["right", "accuracy", "95 % interval"]
 
 
 class RecipePart(Fields):
@@ -29,11 +39,33 @@ class RecipeFigure(Fields):
     title: str
     text: list[str] = Field(description="what it says, in sentences")
 
+    def table(self) -> HeadsAndRows:
+        """Return its numbers as a table."""
+        raise NotImplementedError
+
 
 class NamedCount(CountedAnswers):
     """Answers about configurations that have one value in common."""
 
     name: str
+
+
+def figure_number(value: float) -> str:
+    """Return a number as figures write it."""
+    return f"{value:.4g}"
+
+
+def bare(name: str) -> str:
+    """Return a parameter's name without its control: ``milk`` for ``contents.milk``."""
+    return name.rpartition(".")[2]
+
+
+def _counts(counts: Sequence[NamedCount]) -> list[list[str]]:
+    """Counts as rows of a table, for `COUNT_HEADS` behind the name."""
+    return [
+        [one.name, f"{one.correct} of {one.configurations}", percent(one.accuracy), interval_text(one.interval)]
+        for one in counts
+    ]
 
 
 class BarsFigure(RecipeFigure):
@@ -42,6 +74,9 @@ class BarsFigure(RecipeFigure):
     figure: Literal["bars"]
     by: str = Field(description="what they differ in")
     bars: list[NamedCount]
+
+    def table(self) -> HeadsAndRows:
+        return [self.by, *COUNT_HEADS], _counts(self.bars)
 
 
 class HeatMapFigure(RecipeFigure):
@@ -54,6 +89,13 @@ class HeatMapFigure(RecipeFigure):
     columns: list[str]
     configurations: list[list[int]]
     correct: list[list[int]]
+
+    def table(self) -> HeadsAndRows:
+        rows = [
+            [name, *(f"{right} of {seen}" for right, seen in zip(correct, configurations, strict=True))]
+            for name, correct, configurations in zip(self.rows, self.correct, self.configurations, strict=True)
+        ]
+        return [self.row, *self.columns], rows
 
 
 class CurveBin(CountedAnswers):
@@ -78,6 +120,19 @@ class CurveFigure(RecipeFigure):
     by: str | None = Field(description="what the lines differ in; null where there is one")
     lines: list[CurveLine]
 
+    def table(self) -> HeadsAndRows:
+        rows = []
+        for line in self.lines:
+            counts = [
+                NamedCount(
+                    name=f"{figure_number(one.low)} to {figure_number(one.high)}",
+                    **one.model_dump(exclude={"low", "high"}),
+                )
+                for one in line.bins
+            ]
+            rows += [[line.name, *row] for row in _counts(counts)]
+        return [self.by or "line", self.along, *COUNT_HEADS], rows
+
 
 class PointsFigure(RecipeFigure):
     """The accuracy for each value of something, side by side for each of several series."""
@@ -88,6 +143,10 @@ class PointsFigure(RecipeFigure):
     names: list[str] = Field(description="of the series")
     rows: list[str]
     counts: list[list[NamedCount]] = Field(description="for each row, each of the series; by the name of the series")
+
+    def table(self) -> HeadsAndRows:
+        rows = [[name, *row] for name, counts in zip(self.rows, self.counts, strict=True) for row in _counts(counts)]
+        return [self.by, self.series, *COUNT_HEADS], rows
 
 
 class GivenAnswer(NamedCount):
@@ -108,6 +167,14 @@ class AnswersFigure(RecipeFigure):
     figure: Literal["answers"]
     by: str = Field(description="what the rows differ in")
     rows: list[AnswersRow]
+
+    def table(self) -> HeadsAndRows:
+        rows = [
+            [row.name, one.name, f"{one.correct} of {one.configurations}", interval_text(one.interval), str(one.right)]
+            for row in self.rows
+            for one in row.answers
+        ]
+        return [self.by, "answer", "given in", "95 % interval", "right"], rows
 
 
 class CuesRow(NamedCount):
@@ -131,6 +198,13 @@ class CuesFigure(RecipeFigure):
     )
     difference_interval: Interval | None = Field(default=None, description="95 %, over pairs of shape and texture")
     rows: list[CuesRow]
+
+    def table(self) -> HeadsAndRows:
+        rows = [
+            [one.name, f"{one.correct} of {one.configurations}", f"{one.textured} of {one.configurations}"]
+            for one in self.rows
+        ]
+        return [self.texture, "the object", "the texture"], rows
 
 
 class TernaryCell(Fields):
@@ -171,6 +245,16 @@ class TernaryFigure(RecipeFigure):
         default_factory=list, description="by what most of the mixture is; empty where there are several answers"
     )
 
+    def table(self) -> HeadsAndRows:
+        if self.leads:
+            rows = [[one.name, str(one.configurations), f"{one.mean:.3g}", f"{one.error:.2g}"] for one in self.leads]
+            return ["where most is", "pictures", "mean lead of the right answer", "standard error"], rows
+        rows = [
+            [one.answer, str(one.given), *(f"{count.correct} of {count.configurations}" for count in one.by_most)]
+            for one in self.answers
+        ]
+        return ["answer", "given", *(f"where most is {bare(name)}" for name in self.shares)], rows
+
 
 class CorruptionModel(Fields):
     """The errors of one model under corruptions."""
@@ -189,6 +273,14 @@ class CorruptionFigure(RecipeFigure):
 
     figure: Literal["corruption error"]
     models: list[CorruptionModel]
+
+    def table(self) -> HeadsAndRows:
+        rows = [
+            [model.model, *row]
+            for model in self.models
+            for row in _counts([*([model.clean] if model.clean else []), *model.errors, model.error])
+        ]
+        return ["model", "corruption", "wrong", "error", "95 % interval"], rows
 
 
 class AgreementCount(Fields):
@@ -220,6 +312,16 @@ class AgreementFigure(RecipeFigure):
     renderings: str = Field(description="the part whose pictures the others are compared with")
     series: list[AgreementSeries]
 
+    def table(self) -> HeadsAndRows:
+        rows = [
+            [one.name, row.name, *map(str, (row.right_right, row.right_wrong, row.wrong_right, row.wrong_wrong)),
+             str(row.same_answer), *_counts([row.agreeing])[0][1:]]
+            for one in self.series
+            for row in [*one.rows, one.total]
+        ]  # fmt: skip
+        both = ["right, right", "right, wrong", "wrong, right", "wrong, wrong", "same answer"]
+        return ["rendering and", "object", *both, "agree", "share", "95 % interval"], rows
+
 
 class ScalingPoint(Fields):
     """Runs on as many workers, one of each object."""
@@ -236,6 +338,13 @@ class ScalingFigure(RecipeFigure):
     cores: int = Field(description="that this process may use")
     points: list[ScalingPoint] = Field(description="by number of workers")
 
+    def table(self) -> HeadsAndRows:
+        rows = [
+            [str(one.workers), *(", ".join(f"{value:.3g}" for value in values) for values in (one.rates, one.gains))]
+            for one in self.points
+        ]
+        return ["workers", "pictures a second", "over the fewest workers"], rows
+
 
 class SurfaceOf(Fields):
     """What goes with wrong answers on the surface of one object."""
@@ -249,6 +358,14 @@ class SurfaceFigure(RecipeFigure):
 
     figure: Literal["surface"]
     maps: list[SurfaceOf]
+
+    def table(self) -> HeadsAndRows:
+        tables = [table for one in self.maps for table in one.tables]
+        rows = [
+            [one.object, short_name(one.model), one.part, *map(str, (one.seen, one.compared, one.worse, one.better))]
+            for one in tables
+        ]
+        return ["object", "model", "parts", "seen", "compared", "with wrong answers", "with right answers"], rows
 
 
 AnyFigure = Annotated[
@@ -289,3 +406,43 @@ class RecipeResult(InNotebook, RunResult):
 
 
 RESULT = RecipeResult
+
+
+def shown(result: RecipeResult) -> ShownAnswer:
+    """Return each figure with what it says and its numbers, and the runs that it took."""
+    told = zip(result.figures, told_once(result.figures), strict=True)
+    sections = [AnswerPart(text=[result.about], only="page")]
+    for number, (one, texts) in enumerate(told, start=1):
+        heads, rows = one.table()
+        sections.append(AnswerPart(one.title, texts, figure=f"images/figure-{number}.png"))
+        sections.append(AnswerPart("The numbers", heads=heads, rows=rows, folded=True, only="page"))
+    columns: Mapping[str, Column] = {
+        "run in parts/": "{0.name}",
+        "command": "{0.command}",
+        "ending": "{0.ending}",
+        "renders": "{0.renders}",
+    }
+    runs = {"title": count(len(result.parts), "run"), "parts": [one.name for one in result.parts]}
+    sections.append(AnswerPart.table(result.parts, columns, **runs, folded=True, only="page"))
+    objects, environments, models = (
+        ", ".join(map(short_name, names))
+        for names in (result.objects, result.environment.split(","), result.model.split(","))
+    )
+    facts = {"objects": objects, "environments": environments, "models": models, "runs": str(len(result.parts))}
+    facts |= {"renders": str(sum(one.renders for one in result.parts))}
+    quick = ["Made with few and small pictures, to see what comes out; no result."] if result.quick else []
+    return ShownAnswer(result.title, sections, facts, [PurePath(result.recipe).stem, models, objects], quick)
+
+
+def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:
+    """Return what each figure says without counts that a figure before it has told; where nothing is left, that."""
+    said: set[str] = set()
+    told = []
+    for number, one in enumerate(figures):
+        same = number > 0 and one.text == figures[number - 1].text
+        new = [text for text in one.text if text not in said or not re.search(r"\d of \d", text)]
+        told.append(
+            ["It says the same as the figure before it."] if same else new or ["It says what figures before it say."]
+        )
+        said |= set(one.text)
+    return told

@@ -8,9 +8,10 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
 from advsearch.api.studies import carry_out_part
@@ -18,9 +19,8 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.engine.attack_parts import check_from_config
-from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
-from advsearch.explanations.observations import TRIAL, WORKERS, Answered, rows_of
+from advsearch.explanations import TRIAL, WORKERS, Answered, rows_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.recipe.answer import RecipeFigure, RecipePart, RecipeResult
@@ -29,31 +29,30 @@ from advsearch.questions.recipe.description import (
     PlannedRun,
     Recipe,
     check_figures,
+    compute,
+    draw_figure,
     made_of,
     names_listed,
     planned,
+    read_options,
     read_recipe,
     recipe_of,
 )
-from advsearch.questions.recipe.figures import compute, draw_figure, read_options
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import Table, photographs_of
-from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.report.phrases import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
-from advsearch.runs.results.base import INTERRUPTED, Result
+from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import attack_of, read_result
 from advsearch.threads import cores
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
 class RecipeKeywords(RunKeywords, total=False):
@@ -76,10 +75,8 @@ class RecipeKeywords(RunKeywords, total=False):
 
 
 TURN = 360.0
-"""Degrees."""
 
 CUES = "cues"
-"""The figure of answers by shape and by texture."""
 
 NOTE = "recipe"
 """Under which a run's store keeps the recipe, so that it goes on as it began."""
@@ -89,14 +86,8 @@ NOTE = "recipe"
 def recipe(recipe: str | Path, *, progress: Watched = None, **settings: Unpack[RecipeKeywords]) -> RecipeResult:
     """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
 
-    All other arguments are the settings of `advsearch recipe`. The run is kept, in `run` or under runs/.
-
     Args:
         recipe: the name of a bundled recipe, or a YAML file.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=watcher(progress))
 
@@ -105,11 +96,6 @@ def recipe_from_config(
     config: RecipeConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> RecipeResult:
     """Carry out the recipe that a configuration names; parts that are done are not done again.
-
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: folder of the run to go on with.
 
     Raises:
         InputError: the recipe has a part or a figure that does not work; nothing is written where that is seen before.
@@ -132,10 +118,38 @@ def recipe_from_config(
             notes += _take(Path(config.photographs), _photographed(described, [one for one, _ in results]), run)
         figures = [] if interrupted else list(_figures(described, config, results, run))
         seconds = time.perf_counter() - begun + (_seconds(run.path) if resumed is not None else 0.0)
-        result = _result(described, config, run, results, figures, notes, seconds)
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        settings = made_of(described, config).settings
+        controls = [name for one, _ in results if isinstance(one.config, SceneConfig) for name in one.config.controls]
+        warnings = [*notes, *(text for _, one in results for text in getattr(one, "warnings", ()))]
+        result = RecipeResult(
+            run=str(run.path),
+            recipe=config.recipe,
+            title=described.title,
+            about=described.about,
+            quick=config.quick,
+            objects=names_listed(settings["object"]),
+            environment=",".join(names_listed(settings.get("environment") or DEFAULT_ENVIRONMENT)),
+            model=",".join(names_listed(settings.get("model") or "reference")),
+            controls=list(dict.fromkeys(controls)),
+            parts=[
+                RecipePart(
+                    name=one.name,
+                    part=one.part,
+                    command=one.config.command,
+                    object=one.config.object,
+                    ending=done.ending,
+                    renders=sum(done.renders.values()),
+                )
+                for one, done in results
+            ],
+            figures=figures,
+            ending=INTERRUPTED if interrupted else "done",
+            warnings=list(dict.fromkeys(warnings)),
+            seconds={"total": seconds},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        return keep_answer(run, result)
 
 
 def _noted(path: Path) -> bool:
@@ -154,8 +168,14 @@ def _seconds(path: Path) -> float:
 
 def _check(described: Recipe, config: RecipeConfig) -> None:
     """Read everything that a recipe says, so that what is wrong in it is told before anything is rendered."""
-    if config.photographs is not None and not _photographed(described, planned(described, config)):
-        raise InputError(f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does")
+    if config.photographs is not None:
+        wanted = _photographed(described, planned(described, config))
+        if not wanted:
+            raise InputError(
+                f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does"
+            )
+        for part in wanted:
+            photographs_in(Path(config.photographs) / Path(part.config.object).stem, part.config.task)
     for one in described.figures:
         read_options(one, config.recipe)
         if one.get("figure") == CUES and config.task is not None and name_in(config.task) == DETECTION:
@@ -166,11 +186,8 @@ def _check(described: Recipe, config: RecipeConfig) -> None:
 
 
 def _check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
-    """Load everything that the runs name; a wrong name or label would end hours of rendering.
-
-    Returns:
-        For each part the parameters that its rows will have.
-    """
+    """Load everything that the runs name, as a wrong name or label would end hours of rendering; for each part the
+    parameters that its rows will have."""
     known: dict[str, set[str]] = {}
     columns: dict[str, set[str]] = {}
     searches = {one.name: one.config for one in runs}
@@ -192,8 +209,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
         check_from_config(config)
     if not isinstance(config, SweepConfig):
         return _declared_columns(config, trials=True)
-    job = job_of(config)
-    check_all(job)
+    job = scenes_of(config).job
     space = job.space(job.places[0], job.sizes[0])
     halfway = torch.full_like(space.start, 0.5)
     return {name for u in (space.start, halfway) for name in space.describe(u)}
@@ -215,21 +231,13 @@ def _photographed(described: Recipe, runs: Iterable[PlannedRun]) -> list[Planned
     return [one for one in own if isinstance(one.config, SweepConfig) and one.config.keep_pictures == "all"]
 
 
-# ---- the runs -------------------------------------------------------------------------------------------------------
+DoneRun = tuple[PlannedRun, AttackSummary | SweepSummary]
 
 
-def _carried_out(
-    runs: Sequence[PlannedRun], run: RunDirectory, progress: Progress, notes: list[str]
-) -> list[tuple[PlannedRun, Result]]:
-    """Carry out the runs that are not done, until one is interrupted; return all that there are.
-
-    Args:
-        runs: in their order.
-        run: of the recipe.
-        progress: told how far it is.
-        notes: gets a sentence for each run that cannot be carried out after another one's answer.
-    """
-    results: list[tuple[PlannedRun, Result]] = []
+def _carried_out(runs: Sequence[PlannedRun], run: RunDirectory, progress: Progress, notes: list[str]) -> list[DoneRun]:
+    """Carry out the runs that are not done, until one is interrupted; return all that there are. `notes` gets a
+    sentence for each run that cannot be carried out after another one's answer."""
+    results: list[DoneRun] = []
     for number, one in enumerate(runs):
         path = run.path / PARTS / one.name
         progress.message(f"run {number + 1} of {len(runs)}: {one.part}, {one.config.object}")
@@ -244,6 +252,7 @@ def _carried_out(
                 continue
             own = _around(own, search.distribution, search.configuration or {})
         done = carry_out_part(path, own, progress)
+        assert isinstance(done, (AttackSummary, SweepSummary))
         results.append((one, done))
         if done.goes_on:
             break
@@ -251,15 +260,11 @@ def _carried_out(
 
 
 def _around(config: SceneConfig, found: AnswerDistribution, searched: Mapping[str, FoundValue]) -> SceneConfig:
-    """Draw evenly from the distribution that a search answers with: mean and deviation are the same.
+    """Draw evenly from the distribution that a search answers with, over the ranges that it searched: mean and
+    deviation are the same.
 
-    An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's did; angles that go
-    all the way round may pass that end, and take the whole turn at most.
-
-    Args:
-        config: of the sweep that draws.
-        found: what the search answers with; its deviations are shares of the ranges.
-        searched: the ranges of its parameters.
+    An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's did; angles that go all
+    the way round may pass that end, and take the whole turn at most.
     """
     controls: dict[str, dict[str, object]] = {}
     for (name, mean), deviation in zip(found.mean.items(), found.deviation, strict=True):
@@ -283,15 +288,12 @@ def _range(name: str, mean: DescribedValue, searched: FoundValue, deviation: flo
 
 
 def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> Iterable[str]:
-    """Take the photographs in a folder into the runs that are compared with some; return what is missing.
-
-    Raises:
-        InputError: there are none at all, or one cannot be read.
-    """
+    """Take the photographs in a folder into the runs that are compared with some; return what is missing. An InputError
+    where there are none at all, or one cannot be read."""
     photographs, missing = Photographs(), list[str]()
     for one in wanted:
         inside = folder / Path(one.config.object).stem
-        photographs.add_files(run.path / PARTS / one.name, files := photographs_in(inside))
+        photographs.add_files(run.path / PARTS / one.name, files := photographs_in(inside, one.config.task))
         missing += [] if files else [f"{one.config.object}: {inside} has no photographs."]
     if len(missing) == len(wanted):
         names = ", ".join(Path(one.config.object).stem for one in wanted[:8])
@@ -299,19 +301,14 @@ def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> Iter
     return missing
 
 
-# ---- what they come to ----------------------------------------------------------------------------------------------
-
-
 def _figures(
-    described: Recipe, config: RecipeConfig, results: Sequence[tuple[PlannedRun, Result]], run: RunDirectory
+    described: Recipe, config: RecipeConfig, results: Sequence[DoneRun], run: RunDirectory
 ) -> Iterable[RecipeFigure]:
-    """Compute and draw the figures."""
     rows: list[Answered] = []
     for one, result in results:
-        if isinstance(result, (AttackSummary, SweepSummary)):
-            found = rows_of(one.part, run.path / PARTS / one.name, result)
-            count = getattr(one.config, WORKERS, None)
-            rows += found if count is None else [replace(row, values={**row.values, WORKERS: count}) for row in found]
+        found = rows_of(one.part, run.path / PARTS / one.name, result)
+        count = getattr(one.config, WORKERS, None)
+        rows += found if count is None else [replace(row, values={**row.values, WORKERS: count}) for row in found]
         if isinstance(result, SweepSummary):
             rows += photographs_of(run.path / PARTS / one.name, result)
     surfaces = {
@@ -323,47 +320,3 @@ def _figures(
         for suffix, data in draw_figure(made, run.path).items():
             write_bytes(run.path / IMAGES / f"figure-{number + 1}.{suffix}", data)
         yield made
-
-
-def _result(
-    described: Recipe,
-    config: RecipeConfig,
-    run: RunDirectory,
-    results: Sequence[tuple[PlannedRun, Result]],
-    figures: Sequence[RecipeFigure],
-    notes: Sequence[str],
-    seconds: float,
-) -> RecipeResult:
-    settings = made_of(described, config).settings
-    controls = [name for one, _ in results if isinstance(one.config, SceneConfig) for name in one.config.controls]
-    warnings = [*notes] + [text for _, one in results for text in getattr(one, "warnings", ())]
-    return RecipeResult(
-        run=str(run.path),
-        recipe=config.recipe,
-        title=described.title,
-        about=described.about,
-        quick=config.quick,
-        objects=names_listed(settings["object"]),
-        environment=",".join(names_listed(settings.get("environment") or DEFAULT_ENVIRONMENT)),
-        model=",".join(names_listed(settings.get("model") or "reference")),
-        controls=list(dict.fromkeys(controls)),
-        parts=[_part(one, result) for one, result in results],
-        figures=list(figures),
-        ending=INTERRUPTED if any(one.goes_on for _, one in results) else "done",
-        warnings=list(dict.fromkeys(warnings)),
-        seconds={"total": seconds},
-        seed=config.seed,
-        command_line=config.command_line(),
-    )
-
-
-def _part(one: PlannedRun, result: Result) -> RecipePart:
-    assert isinstance(result, (AttackSummary, SweepSummary))
-    return RecipePart(
-        name=one.name,
-        part=one.part,
-        command=one.config.command,
-        object=one.config.object,
-        ending=result.ending,
-        renders=sum(result.renders.values()),
-    )

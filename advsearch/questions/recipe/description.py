@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -19,10 +19,15 @@ from advsearch import seeds
 from advsearch.config import CONFIGS
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.explanations.observations import ANSWER, GROUP, PART, PHOTOGRAPHS
-from advsearch.questions.recipe.figures import read_options
+from advsearch.explanations import ANSWER, GROUP, PART, PHOTOGRAPHS
+from advsearch.questions.recipe.accuracy import BARS, CORRUPTION_ERROR, HEAT_MAP, POINTS, SURFACE
+from advsearch.questions.recipe.along import CURVE, SCALING
+from advsearch.questions.recipe.answer import RecipeFigure
+from advsearch.questions.recipe.given import AGREEMENT, ANSWERS, CUES
 from advsearch.questions.recipe.settings import RecipeConfig
-from advsearch.questions.recipe.table import Options
+from advsearch.questions.recipe.table import FigureKind, Options, Table
+from advsearch.questions.recipe.ternary import TERNARY
+from advsearch.report.figures import Figures, drawn
 from advsearch.runs.directory import default_name
 from advsearch.settings import read_yaml, split_names
 from advsearch.settings.configuration import PLACE, SettingsError
@@ -75,13 +80,7 @@ class Part(_Described):
 
 
 class Changes(_Described):
-    """What `quick` makes different.
-
-    Attributes:
-        settings: of all parts.
-        parts: settings of each.
-        without: parts that are left out.
-    """
+    """What `quick` makes different: settings of all parts, settings of each, and parts that are left out."""
 
     settings: Settings = Field(default_factory=dict)
     parts: dict[str, Settings] = Field(default_factory=dict)
@@ -96,7 +95,7 @@ class Recipe(_Described):
         about: what is done for an answer, and whose experiment it is.
         settings: of all parts; what the command line says of objects, environments and models goes over them.
         parts: by name, in the order in which they are carried out.
-        figures: each with a `figure`, its kind, and options (`advsearch.questions.recipe.figures`).
+        figures: each with a `figure`, its kind, and options (`advsearch.questions.recipe.description`).
         groups: names of groups, each with the names of objects in it.
         quick: what is different when it should be quick.
     """
@@ -156,11 +155,7 @@ def titles() -> dict[str, str]:
 
 
 def recipe_yaml(name: str) -> str:
-    """Return the YAML of a bundled recipe.
-
-    Raises:
-        UnknownNameError: there is no such recipe.
-    """
+    """Return the YAML of a bundled recipe."""
     if name not in recipe_names():
         raise UnknownNameError("recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path.")
     return str((_bundled() / f"{name}.yaml").read_text(encoding="utf-8"))
@@ -189,11 +184,7 @@ def is_file_name(name: str) -> bool:
 
 
 def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
-    """Return the recipe that a mapping describes.
-
-    Args:
-        data: as it stands in a YAML file.
-        where: that file, for messages.
+    """Return the recipe that a mapping describes, as it stands in the file `where`.
 
     Raises:
         FileFormatError: something is missing, unknown, or of another kind.
@@ -238,7 +229,6 @@ def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where:
     Raises:
         UnknownNameError: a figure names one; the message says which figure.
         InputError: a part that it shows has not the column that others have.
-        FileFormatError: as for `read_options`.
     """
     for number, described in enumerate(recipe.figures, start=1):
         kind, options = read_options(described, where)
@@ -272,14 +262,8 @@ MOST_RUNS = 1000
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run of a recipe.
-
-    Attributes:
-        name: of its folder.
-        part: that it belongs to.
-        config: what it does.
-        around: the folder of the run whose answer says what is drawn; None where the settings say it.
-    """
+    """One run of a recipe; `around` is the folder of the run whose answer says what is drawn, None where the settings
+    say it."""
 
     name: str
     part: str
@@ -355,3 +339,61 @@ def _config(part: Part, settings: Settings, where: str, config: RecipeConfig, st
 
 def _folder(part: str, number: int, words: Sequence[str]) -> str:
     return f"{part}-{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
+
+
+MODEL = "model"
+"""The column that says which model answered."""
+
+FIGURES: dict[str, FigureKind[Any, Any]] = {
+    "bars": BARS,
+    "heat map": HEAT_MAP,
+    "curve": CURVE,
+    "points": POINTS,
+    "answers": ANSWERS,
+    "cues": CUES,
+    "ternary": TERNARY,
+    "corruption error": CORRUPTION_ERROR,
+    "agreement": AGREEMENT,
+    "scaling": SCALING,
+    "surface": SURFACE,
+}
+
+
+def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
+    """Return the kind of a figure and its options, as they stand in a recipe, with its kind as `figure`; `where` is the
+    recipe.
+
+    Raises:
+        UnknownNameError: there is no such kind.
+        FileFormatError: an option is missing, unknown, or of another kind.
+    """
+    given = dict(described)
+    kind = str(given.pop("figure", ""))
+    if kind not in FIGURES:
+        raise UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
+    try:
+        return kind, FIGURES[kind].options(**given)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        what = ".".join(str(one) for one in first["loc"])[:80]
+        raise FileFormatError(f"{where}: figures: {kind}: {what}: {first['msg'][:200]}; see docs/recipes.md") from None
+
+
+def compute(table: Table, kind: str, options: Options) -> list[RecipeFigure]:
+    """Return the numbers of a figure, and what they say; where it does not tell several models apart, of each model. An
+    InputError where it needs what the answers do not have."""
+    shown = table.of(options.parts)
+    together = FIGURES[kind].tells_models or MODEL in vars(options).values()
+    if together or len({row.values.get(MODEL) for row in shown.rows}) < 2:
+        return [FIGURES[kind].compute(shown, options)]
+    found = []
+    for name, rows in shown.by(MODEL).items():
+        made: RecipeFigure = FIGURES[kind].compute(replace(shown, rows=rows), options)
+        found.append(made.model_copy(update={"title": f"{made.title}: {name}"}))
+    return found
+
+
+def draw_figure(made: RecipeFigure, run: Path) -> Figures:
+    """Return a figure as files; `run` is the recipe's folder."""
+    kind = FIGURES[made.figure]
+    return drawn(lambda figure: kind.draw(made, figure, run), kind.size(made))

@@ -28,11 +28,7 @@ class RecipeConfig(Config):
         "the experiment to run",
         "the name of a recipe, which advsearch recipe list shows, or a YAML file",
     )
-    quick: bool = setting(
-        False,
-        "recipe",
-        "few and small pictures, for a first look",
-    )
+    quick: bool = setting(False, "recipe", "few and small pictures, for a first look")
     photographs: str | None = setting(
         None,
         "recipe",
@@ -86,15 +82,12 @@ class RecipeConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RECIPE-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any, info: Any) -> Any:
-        return SceneConfig._as_text(value, info)
-
-    @field_validator("prompt", mode="before")
-    @classmethod
-    def _prompts_as_text(cls, value: Any) -> Any:
-        return SceneConfig._prompts_as_text(value)
+    _named = field_validator(
+        "recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before"
+    )(lambda value, info: SceneConfig._as_text(value, info))
+    _prompts = field_validator("prompt", mode="before")(lambda value: SceneConfig._prompts_as_text(value))
+    _sized = field_validator("resolution", mode="before")(lambda value: SceneConfig._resolution_from_text(value))
+    _in_range = field_validator("resolution")(lambda value: SceneConfig._resolution_in_range(value))
 
     @field_validator("task", mode="before")
     @classmethod
@@ -119,16 +112,6 @@ class RecipeConfig(Config):
         if any(not text.strip(" ,\t\n") or "\0" in name + text for name, text in value.items()):
             raise ValueError("an empty name")
         return value
-
-    @field_validator("resolution", mode="before")
-    @classmethod
-    def _resolution_from_text(cls, value: Any) -> Any:
-        return SceneConfig._resolution_from_text(value)
-
-    @field_validator("resolution")
-    @classmethod
-    def _resolution_in_range(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
-        return SceneConfig._resolution_in_range(value)
 
     @property
     def title(self) -> tuple[str, ...]:

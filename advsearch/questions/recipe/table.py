@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.explanations.observations import (
+from advsearch.explanations import (
     ANSWER,
     GROUP,
     OTHERS,
@@ -52,11 +52,8 @@ class Table:
         return replace(self, rows=rows)
 
     def value(self, row: Answered, column: str) -> float | str:
-        """Return what a row has in a column: a value, the answer, or the group of its object.
-
-        Raises:
-            InputError: there is no such column.
-        """
+        """Return what a row has in a column: a value, the answer, or the group of its object; an InputError where there
+        is none."""
         if column == ANSWER:
             return row.answer
         if column == PART:
@@ -70,11 +67,8 @@ class Table:
         return row.values[column]
 
     def numbers(self, column: str) -> list[float]:
-        """Return what each row has in a column of numbers.
-
-        Raises:
-            InputError: there is no such column, or it has names.
-        """
+        """Return what each row has in a column of numbers; an InputError where there is no such column, or it has
+        names."""
         values = [self.value(row, column) for row in self.rows]
         numbers = [value for value in values if isinstance(value, (int, float))]
         if len(numbers) < len(values):
@@ -118,10 +112,8 @@ def most_frequent(rows: Iterable[Answered]) -> list[tuple[str, int]]:
 
 
 def photographs_of(folder: Path, summary: SweepSummary) -> list[Answered]:
-    """Return the answers about the photographs that a sweep has; arguments and errors as for `rows_of`.
-
-    One that was aligned with a rendering has all values of that, others have no parameters.
-    """
+    """Return the answers about the photographs that a sweep has, as `rows_of` does: one that was aligned with a
+    rendering has all values of that, others have no parameters."""
     return answered(PHOTOGRAPHS, folder, summary, (PHOTO, LOOSE_PHOTO))
 
 
@@ -129,12 +121,8 @@ CONFIDENCE = 0.95
 
 
 class Options(BaseModel):
-    """Options that every figure has.
-
-    Attributes:
-        title: over it; made from the other options where it is empty.
-        of: the parts whose answers it shows; all where none is named.
-    """
+    """Options that every figure has: a title, made from the other options where it is empty, and the parts whose
+    answers it shows; all where none is named."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -153,15 +141,10 @@ FigureType = TypeVar("FigureType", bound=RecipeFigure)
 
 @dataclass(frozen=True)
 class FigureKind(Generic[Chosen, FigureType]):
-    """One kind of figure.
+    """One kind of figure: the options that it takes, its numbers, what makes these from the answers, and what draws
+    them on a figure of matplotlib, which may look into the recipe's folder, of a size in inches.
 
-    Attributes:
-        options: that it takes.
-        result: its numbers.
-        compute: makes these from the answers.
-        draw: draws them on a figure of matplotlib; it may look into the recipe's folder.
-        size: of that, width and height in inches.
-        tells_models: whether it tells several models apart by itself; of others each model has one.
+    With `tells_models` it tells several models apart by itself; of others each model has one.
     """
 
     options: type[Chosen]

@@ -2,48 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import NamedKeywords, Names, PictureKeywords, asks, configured
 from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import most_at_once
+from advsearch.attacks.trials import clopper_pearson
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, problem_from_config
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.outcome import transport_of
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages
-from advsearch.engine.sharing import Shared
+from advsearch.engine.record import Stages
 from advsearch.engine.surface_light import COMPARED, LIGHTS, SurfaceLight
-from advsearch.engine.sweeps.surface_light import pays_from
+from advsearch.engine.sweeps.predicting import pays_from
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult
-from advsearch.questions.region.growing import ATTEMPTS, MOST_PROBED, USUAL, GrownBox, grow
+from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult, map_figure
 from advsearch.questions.region.settings import RegionConfig
-from advsearch.questions.region.words import map_figure
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
 from advsearch.runs.summary import read_answer
-from advsearch.scene.surface import plan
+from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
+from advsearch.seeds import stream
 from advsearch.settings import split_names
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from advsearch.viewer.pages import keep_answer
 
 
 class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
@@ -66,13 +63,8 @@ AT_CENTRE = 20
 
 @dataclass(frozen=True, eq=False)
 class Varied:
-    """The parameters in which the box grows.
-
-    Attributes:
-        names: of each.
-        places: (k,) where they lie in u.
-        groups: of numbers that they belong to.
-    """
+    """The parameters in which the box grows: their names, (k,) where they lie in u, and the groups of numbers that they
+    belong to."""
 
     names: tuple[str, ...]
     places: Tensor
@@ -87,18 +79,7 @@ def region(
     progress: Watched = None,
     **settings: Unpack[RegionKeywords],
 ) -> RegionResult:
-    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md).
-
-    All other arguments are the settings of `advsearch region`. The run is kept, in `run` or under runs/.
-
-    Args:
-        object: from `load_scene`, or the name of an object, or a file of one.
-        model: from `load_model`, or what that takes.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md)."""
     config = configured(RegionConfig, object=object, model=model, **settings)
     return region_from_config(config, progress=watcher(progress))
 
@@ -106,14 +87,13 @@ def region(
 def region_from_config(
     config: RegionConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> RegionResult:
-    """Grow the region that a configuration describes and keep it in a run directory.
-
-    Raises:
-        InputError: the verdict at the centre depends on the noise, the parameters do not fit, and what a scene raises.
-    """
+    """Grow the region that a configuration describes and keep it in a run directory."""
     stages = Stages(progress or NullProgress())
     stages.begin("setup", LOADING)
-    budget = {} if config.around is None else _budget(config.around)
+    budget: dict[str, object] = {}
+    if config.around is not None:  # its answer has to lie within
+        theirs = AttackConfig.from_yaml(find_run(config.around) / CONFIG)
+        budget = {"epsilon": theirs.epsilon, "norm": theirs.norm}
     problem, warnings = problem_from_config(AttackConfig.of(config, **budget))
     for text in warnings:
         stages.progress.message(text)
@@ -141,14 +121,16 @@ def region_from_config(
             clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
             warnings=warnings,
             transport=transport_of(findings) if findings.transport or findings.rendered_because else None,
-            renders=_renders(findings),
+            renders={
+                "verification": findings.verification_renders
+                + (findings.transport.traced if findings.transport else 0),
+                **({"products": findings.predicted_trials} if findings.predicted_trials else {}),
+            },
             seconds={**stages.seconds, "total": stages.total},
             seed=config.seed,
             command_line=config.command_line(),
         )
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
@@ -200,12 +182,12 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
     """What predicts pictures while the box grows, and those of the map, where a camera moves and that pays; fresh
     samples of the box are rendered (docs/surface-light.md)."""
     problem, stages, findings = verifier.problem, verifier.stages, verifier.findings
-    moved = plan.varied(problem.renderer, varied.groups)
+    moved = surface_renderer.varied(problem.renderer, varied.groups)
     if not config.specialise or not moved & CAMERAS or not moved <= FREE:
         return None
     wanted = USUAL * len(varied.names) + config.map**2
     least = pays_from(problem.renderer, findings.spp, COMPARED)
-    reason = plan.why_not_kept(problem.renderer)
+    reason = surface_renderer.why_not_kept(problem.renderer)
     if reason is None and wanted < least:
         reason = f"light on surfaces pays from {least} pictures on"
     if reason is None:
@@ -219,21 +201,7 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
     return None
 
 
-def _renders(findings: Findings) -> dict[str, int]:
-    """How many pictures were rendered, comparisons included, and how many were predicted."""
-    traced = findings.verification_renders + (findings.transport.traced if findings.transport else 0)
-    predicted = {"products": findings.predicted_trials} if findings.predicted_trials else {}
-    return {"verification": traced, **predicted}
-
-
-def _budget(around: str) -> dict[str, object]:
-    """How far a run's controls may go, so that its answer lies within."""
-    theirs = AttackConfig.from_yaml(find_run(around) / CONFIG)
-    return {"epsilon": theirs.epsilon, "norm": theirs.norm}
-
-
 def _centre(problem: Problem, config: RegionConfig) -> Tensor:
-    """The configuration that the box grows around."""
     if config.around is None:
         return problem.domain.start.clone()
     values = torch.from_numpy(read_answer(find_run(config.around)))
@@ -268,11 +236,8 @@ def _varied(problem: Problem, config: RegionConfig) -> Varied:
 
 
 def _verdict(verifier: Verifier, centre: Tensor) -> bool:
-    """Whether the model is wrong at the centre.
-
-    Raises:
-        InputError: that depends on the noise, or the model's answer is not a number.
-    """
+    """Whether the model is wrong at the centre; an InputError where that depends on the noise, or the answer is not a
+    number."""
     verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
     wrong = nothing = 0
     for trial in verifier.trials("centre", dict.fromkeys(range(AT_CENTRE), centre), sought=False):
@@ -292,20 +257,17 @@ def _verdict(verifier: Verifier, centre: Tensor) -> bool:
 
 
 def _box(problem: Problem, grown: GrownBox, at: Any, varied: Varied) -> list[BoxSide]:
-    """The range of every parameter of the box in its unit."""
     ends = [problem.describe(at(values)) for values in (grown.low, grown.high, grown.centre)]
     rows = []
-    for name in varied.names:
+    for place, name in enumerate(varied.names):
         stem, _, number = name.rpartition(".")
         known = name if name in ends[0] else stem
-        if known not in ends[0]:  # one of many numbers, which nobody describes
-            place = varied.names.index(name)
-            sides = (grown.low, grown.high, grown.centre)
-            low, high, centre = (float(side[place]) for side in sides)
-            rows.append(BoxSide(name=name, unit="of the range", low=low, high=high, centre=centre))
-            continue
-        low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
-        unit = str(ends[0][known].get("unit", ""))
+        if known in ends[0]:
+            low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
+            unit = str(ends[0][known].get("unit", ""))
+        else:  # one of many numbers, which nobody describes
+            low, high, centre = (float(side[place]) for side in (grown.low, grown.high, grown.centre))
+            unit = "of the range"
         rows.append(BoxSide(name=name, unit=unit, low=low, high=high, centre=centre))
     return rows
 
@@ -318,7 +280,6 @@ def _number(described: Any, number: str) -> float:
 def _map(
     verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory, light: SurfaceLight | None
 ) -> MarginMap:
-    """The margin on a grid over two parameters, as numbers and as a picture."""
     hint = f"{side * side} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
@@ -338,3 +299,142 @@ def _map(
     for suffix, data in map_figure(drawn, box).items():
         write_bytes(run.path / "images" / f"map.{suffix}", data)
     return drawn
+
+
+Same = Callable[[Tensor, int], bool]
+"""(u, number) -> whether the answer at u is that of the centre; number numbers its seed."""
+
+
+@dataclass(frozen=True, eq=False)
+class GrownBox:
+    """A box in the unit box in which the answer stays the same: the centre (d,) and its corners (d,), how many of the
+    final samples had the centre's answer, and pictures in all."""
+
+    centre: Tensor
+    low: Tensor
+    high: Tensor
+    same: int
+    samples: int
+    renders: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the share of the box with the centre's answer; see the module."""
+        return clopper_pearson(self.same, self.samples, 1.0 - 0.05 / ATTEMPTS)
+
+    @property
+    def volume(self) -> float:
+        """Share of the unit box that it takes up."""
+        return float((self.high - self.low).prod())
+
+
+LEVELS, ATTEMPTS = 6, 4
+"""How often the step of the faces is halved, and final checks at most."""
+PROBES = 8
+"""Random points at which what a face would win is probed."""
+USUAL, MOST_PROBED = 100, 400
+"""Pictures of growing for each parameter, usually and at most: that is more than twice what boxes, balls, planes and
+noise have taken."""
+
+
+def grow(
+    same: Same, centre: Tensor, *, seed: int, samples: int = 200, on_check: Callable[[], None] = lambda: None
+) -> GrownBox:
+    """Grow a box around the centre, then check it with samples that nothing was fitted to.
+
+    Each face in turn tries to move out by a share of what is left to the bound (1/2 at first, halved at every level at
+    which no face can move any more). The slab that it would win is probed at random points; if all have the centre's
+    answer, it moves. Growing ends after `MOST_PROBED` pictures for each parameter at the latest. Then the box is
+    sampled; on an exception, the face that cuts off the least of the box moves in to it and the box is sampled anew,
+    with other seeds, `ATTEMPTS` times at most; the last check counts whatever it shows.
+
+    Args:
+        same: judges a configuration.
+        centre: (d,) in [0, 1].
+        seed: root of the random points.
+        samples: of the final check, at least 1.
+        on_check: told the beginning of each final check.
+
+    Raises:
+        InputError: the centre is not in the unit box, or samples is under 1.
+    """
+    if samples < 1:
+        raise InputError(f"samples: expected at least 1, got {samples}")
+    if not bool(((centre >= 0.0) & (centre <= 1.0)).all()):
+        raise InputError("the centre of a region has to lie inside the ranges of its parameters")
+    judge = _Judge(same, seed)
+    low, high = centre.clone(), centre.clone()
+    share, faces = 0.5, range(2 * centre.numel())
+    last = MOST_PROBED * centre.numel() - len(faces) * PROBES
+    for _ in range(LEVELS):
+        while judge.count <= last and any([_push(judge, low, high, face, share) for face in faces]):
+            pass
+        share /= 2.0
+    for attempt in range(ATTEMPTS):
+        on_check()
+        points = judge.points(low, high, samples)
+        wrong = points[[not judge(point) for point in points]]
+        if len(wrong) == 0 or attempt == ATTEMPTS - 1:
+            break
+        for point in wrong:
+            _cut(low, high, centre, point)
+    return GrownBox(centre, low, high, samples - len(wrong), samples, judge.count)
+
+
+class _Judge:
+    """Counts what it judges; every call has a seed of its own."""
+
+    def __init__(self, same: Same, seed: int) -> None:
+        self._same, self._seed = same, seed
+        self.count = self._drawn = 0
+
+    def __call__(self, u: Tensor) -> bool:
+        self.count += 1
+        return self._same(u, self.count - 1)
+
+    def points(self, low: Tensor, high: Tensor, number: int) -> Tensor:
+        """(number, d) uniform in a box, other ones at every call."""
+        generator = torch.Generator().manual_seed(stream(self._seed, "region", self._drawn))
+        self._drawn += 1
+        return torch.lerp(low, high, torch.rand(number, low.numel(), generator=generator))
+
+
+SHORTEST = 1e-3
+"""A face does not move by less."""
+
+
+def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float) -> bool:
+    """Move one face out if the slab that it wins has the centre's answer; whether it moved."""
+    axis, up = divmod(face, 2)
+    room = float(1.0 - high[axis] if up else low[axis])
+    step = room if room < 4.0 * SHORTEST else share * room
+    if room <= 0.0 or (step < SHORTEST and step != room):
+        return False
+    bottom, top = low.clone(), high.clone()
+    if up:
+        bottom[axis], top[axis] = high[axis], high[axis] + step
+    else:
+        bottom[axis], top[axis] = low[axis] - step, low[axis]
+    points = judge.points(bottom, top, PROBES)
+    points[0, axis] = top[axis] if up else bottom[axis]
+    if not all(judge(point) for point in points):
+        return False
+    if up:
+        high[axis] = top[axis].clamp(max=1.0)
+    else:
+        low[axis] = bottom[axis].clamp(min=0.0)
+    return True
+
+
+def _cut(low: Tensor, high: Tensor, centre: Tensor, point: Tensor) -> None:
+    """Move in the face that takes the least of the box away so that the point lies outside; the centre stays inside."""
+    if bool(((point < low) | (point > high)).any()):
+        return
+    width = (high - low).clamp_min(1e-12)
+    loss = torch.where(point > centre, (high - point) / width, (point - low) / width)
+    loss = torch.where(point == centre, torch.inf, loss)
+    axis = int(loss.argmin())
+    if point[axis] > centre[axis]:
+        high[axis] = torch.lerp(centre[axis], point[axis], 0.98)
+    else:
+        low[axis] = torch.lerp(centre[axis], point[axis], 0.98)

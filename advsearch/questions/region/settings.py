@@ -34,12 +34,7 @@ class RegionConfig(SceneConfig):
         otherwise="all that the controls search, up to eight",
     )
     samples: int = setting(
-        200,
-        "region",
-        "fresh samples that check the box",
-        unit="renders",
-        ge=FEWEST_SAMPLES,
-        le=1_000_000,
+        200, "region", "fresh samples that check the box", unit="renders", ge=FEWEST_SAMPLES, le=1_000_000
     )
     map: int = setting(
         0,

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import PurePath
 from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report import wording
 from advsearch.report.markup import InNotebook
+from advsearch.report.shown import AnswerPart, Claim, ShownAnswer, case_claim
 from advsearch.runs.results.attack import ControlGroup, VerifiedRate
 from advsearch.runs.results.base import Fields, SceneResult
 
@@ -46,3 +50,59 @@ class ReplayResult(InNotebook, SceneResult):
 
 
 RESULT = ReplayResult
+
+
+HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "answer")
+
+
+def shown(result: ReplayResult) -> ShownAnswer:
+    """Return the table of conditions."""
+    note = (
+        "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
+        "intervals. A success is what the search sought, where the clean scene is right with the same seed under the "
+        "same condition."
+    )
+    table = AnswerPart("Under other conditions", heads=HEADS, rows=replay_rows(result), note=note)
+    about = [f"answer of {PurePath(result.answer).name} ({result.answered})", result.object, ", ".join(result.controls)]
+    return ShownAnswer(replay_text(result), [table], {"answer": result.answer, "model": result.model}, about)
+
+
+def claims(result: ReplayResult) -> Iterator[Claim]:
+    """Yield under which conditions the answer holds."""
+    for row in result.table:
+        name = f"the answer of {PurePath(result.answer).name}, {row.way}"
+        name += "" if row.way == row.condition else f": {row.condition}"
+        yield case_claim(name, row.ending, row.verified, None)
+
+
+def replay_text(result: ReplayResult) -> str:
+    """Return what the table says, in a sentence."""
+    changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
+    if not result.table:
+        return "Nothing was rendered again."
+    own = "holds" if result.table[0].ending == "found" else "does not hold"
+    held = [row for row in changed if row.ending == "found"]
+    worthless = [row for row in changed if row.ending == "already wrong"]
+    text = f"As verified, the answer {own}; changed, it holds under {len(held)} of {len(changed)} conditions."
+    if worthless:
+        names = ", ".join(f"{row.way}: {row.condition}" for row in worthless)
+        text += f" The clean scene itself fails under {names}, where an answer says nothing."
+    return text
+
+
+def replay_rows(result: ReplayResult) -> list[list[str]]:
+    """Return a row for each condition."""
+    return [[row.way, "" if row.way == row.condition else row.condition, *_rates(row)] for row in result.table]
+
+
+def _rates(row: ReplayRow) -> list[str]:
+    clean, rated = row.clean, row.verified
+    if clean is None or rated is None:
+        return ["", "", "", "", f"{NOT_DONE}: {row.reason}"]
+    return [
+        f"{clean.correct}/{clean.trials}{wording.no_numbers(clean.not_a_number)}",
+        wording.interval_text(clean.interval),
+        f"{rated.successes}/{rated.trials}{wording.no_numbers(rated.not_a_number)}",
+        wording.interval_text(rated.interval),
+        {"found": "holds", "already wrong": "clean is wrong too"}.get(row.ending, "does not hold"),
+    ]

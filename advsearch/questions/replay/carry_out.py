@@ -1,7 +1,4 @@
-"""`replay`: the answer of a run under other conditions than it was searched and verified under.
-
-These are other pictures of the same configuration.
-"""
+"""`replay`: the answer of a run under other conditions than it was searched and verified under, in other pictures."""
 
 from __future__ import annotations
 
@@ -10,10 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack
 
 from advsearch import seeds
 from advsearch.api.keywords import Names, RunKeywords, asks, configured
@@ -23,26 +21,21 @@ from advsearch.engine.attack_parts import LOADING, SEARCHED_WITH, AttackParts, p
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import RetrialCondition, Retrials, kept_answer, unchanged
-from advsearch.engine.rows import control_group, verified_rate
+from advsearch.engine.record import control_group, verified_rate
+from advsearch.engine.verifier import RetrialCondition, Retrials, kept_answer, unchanged
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.replay.answer import NOT_DONE, ReplayResult, ReplayRow
 from advsearch.questions.replay.settings import ReplayConfig
-from advsearch.runs import made_with
 from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.store import NAME, Store
-from advsearch.runs.summary import attack_of
-from advsearch.scene.exporting.cycles import BlenderError, Cycles
+from advsearch.runs.summary import MADE_WITH, attack_of, changed_file
+from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP
-from advsearch.viewer.pages import write_page
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
+from advsearch.viewer.pages import keep_answer
 
 OWN = "as verified"
 """The way in which nothing is changed."""
@@ -51,7 +44,6 @@ OWN_LIGHT = "own"
 """What conditions share whose pictures come of the radiance that the run itself would render."""
 
 QUALITIES = (90, 75, 50)
-"""Of JPEG files."""
 
 SENSORS: dict[str, dict[str, float]] = {
     "a good camera": {"shot": 0.02, "read": 0.005, "mosaic": 1.0},
@@ -74,97 +66,86 @@ class Way:
 
     Attributes:
         name: what is changed.
-        condition: it is made anew each time, and holds a scene of its own where it has to.
         text: to what.
-        missing: why it cannot be had; empty where it can.
+        make: makes the condition anew, under its title; it holds a scene of its own where it has to.
         shares: whether it takes the radiance of the first condition, so that it costs no renders beside that.
+        missing: why it cannot be had; empty where it can.
     """
 
     name: str
-    condition: Callable[[], RetrialCondition]
     text: str
-    missing: str = ""
+    make: Callable[[str], RetrialCondition]
     shares: bool = False
+    missing: str = ""
+
+    def condition(self) -> RetrialCondition:
+        """Return the condition."""
+        return self.make(self.text if self.name == OWN else f"{self.name}: {self.text}")
 
 
 def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]) -> Iterator[Way]:
     """Yield every condition of a problem's answer but other models; the first changes nothing.
 
-    Args:
-        problem: as the run had it.
-        spp: samples a pixel of its verification.
-        sized: makes the same problem at another (height, width) in pixels.
+    `spp` is that of the run's verification, and `sized` makes the same problem at another (height, width) in pixels.
     """
     renderer = problem.renderer
     scene, formation = renderer.scene, renderer.formation
 
-    def same(
-        count: int = spp, change: Callable[[Tensor, int], Tensor] = unchanged
-    ) -> Callable[[str], RetrialCondition]:
+    def same(count: int = spp, change: Callable[[Tensor, int], Tensor] = unchanged) -> Callable[..., RetrialCondition]:
         return lambda name: RetrialCondition(name, problem, count, OWN_LIGHT, change, OWN_LIGHT)
 
-    def other(**made: object) -> Callable[[str], RetrialCondition]:
-        def condition(name: str) -> RetrialCondition:
-            changed = renderer.like(scene.like(**made), **({"sampler": made["sampler"]} if "sampler" in made else {}))
-            return RetrialCondition(name, replace(problem, renderer=changed), spp, name)
+    def other(**made: Any) -> Callable[..., RetrialCondition]:
+        sampler = {"sampler": made["sampler"]} if "sampler" in made else {}
+        return lambda name: RetrialCondition(
+            name, replace(problem, renderer=renderer.like(scene.like(**made), **sampler)), spp, name
+        )
 
-        return condition
-
-    def formed(light: str | None = None, **fields: Any) -> Callable[[str], RetrialCondition]:
+    def formed(light: str | None = None, **fields: Any) -> Callable[..., RetrialCondition]:
         changed = replace(problem, renderer=renderer.like(**fields))
         return lambda name: RetrialCondition(name, changed, spp, name, light=light)
 
-    def at(size: tuple[int, int]) -> Callable[[str], RetrialCondition]:
+    def at(size: tuple[int, int]) -> Callable[..., RetrialCondition]:
         return lambda name: RetrialCondition(name, sized(size), spp, name)
 
-    def way(name: str, text: str, make: Callable[[str], RetrialCondition], *, shares: bool = False) -> Way:
-        return Way(name, lambda: make(text if name == OWN else f"{name}: {text}"), text, shares=shares)
-
-    yield way(OWN, OWN, same(), shares=True)
+    yield Way(OWN, OWN, same(), shares=True)
     for count in (max(1, spp // 4), min(MAX_SPP, 4 * spp)):
         if count != spp:
-            yield way("samples", f"{count} a pixel", same(count))
+            yield Way("samples", f"{count} a pixel", same(count))
     height, width = formation.resolution
     for size in ((max(8, height // 2), max(8, width // 2)), (min(4096, 2 * height), min(4096, 2 * width))):
         if size != (height, width):
-            yield way("resolution", f"{size[0]} x {size[1]} pixels", at(size))
+            yield Way("resolution", f"{size[0]} x {size[1]} pixels", at(size))
     for depth in (SHORT, LONG):
         if depth != scene.max_depth:
-            yield way("depth", f"light paths of {depth} segments", other(max_depth=depth))
+            yield Way("depth", f"light paths of {depth} segments", other(max_depth=depth))
     if not scene.volumetric:
-        yield way("integrator", "Mitsuba's path in place of prb", other(integrator="path"))
+        yield Way("integrator", "Mitsuba's path in place of prb", other(integrator="path"))
     sampler = "independent" if formation.sampler != "independent" else "multijitter"
-    yield way("sampler", sampler, other(sampler=sampler))
+    yield Way("sampler", sampler, other(sampler=sampler))
     denoiser = "none" if formation.denoiser != "none" else "oidn"
-    yield way("denoiser", denoiser, formed(denoiser=denoiser))
+    yield Way("denoiser", denoiser, formed(denoiser=denoiser))
     for curve, text in CURVES.items():
-        yield way("curve", f"{curve}, {text}", formed(OWN_LIGHT, transfer=curve), shares=True)
+        yield Way("curve", f"{curve}, {text}", formed(OWN_LIGHT, transfer=curve), shares=True)
     for quality in QUALITIES:
-        yield way("jpeg", f"quality {quality}", same(change=_file(quality)), shares=True)
+        yield Way("jpeg", f"quality {quality}", same(change=_file(quality)), shares=True)
     for name, values in SENSORS.items():
-        yield way("sensor", name, same(change=_sensor(values)), shares=True)
+        yield Way("sensor", name, same(change=_sensor(values)), shares=True)
     yield _by_blender(problem, spp)
 
 
 def _by_blender(problem: Problem, spp: int) -> Way:
-    """The scene rendered by another program."""
-    renderer = problem.renderer
-    formation, text = renderer.formation, "Cycles, Blender's renderer"
+    renderer, text = problem.renderer, "Cycles, Blender's renderer"
 
-    def condition() -> RetrialCondition:
-        rendered = replace(problem, renderer=renderer.rendered_by(made.radiance))
-        return RetrialCondition(f"blender: {text}", rendered, spp, "blender")
+    def condition(name: str) -> RetrialCondition:
+        return RetrialCondition(name, replace(problem, renderer=renderer.rendered_by(made.radiance)), spp, "blender")
 
+    scene, formation = renderer.scene, renderer.formation
+    denoise = formation.denoiser != "none"
     try:
-        made = Cycles(
-            renderer.scene.made[0],
-            formation.resolution,
-            max_depth=renderer.scene.max_depth,
-            denoise=formation.denoiser != "none",
-        )
+        made = Cycles(scene.made[0], formation.resolution, max_depth=scene.max_depth, denoise=denoise)
     except BlenderError as error:
-        return Way("blender", condition, text, str(error))
-    return Way("blender", condition, text)
+        return Way("blender", text, condition, missing=str(error))
+    return Way("blender", text, condition)
 
 
 def _file(quality: int) -> Callable[[Tensor, int], Tensor]:
@@ -191,14 +172,8 @@ def replay(
 ) -> ReplayResult:
     """Render the answer of a run under other conditions, each beside the clean scene (docs/questions.md).
 
-    All other arguments are the settings of `advsearch replay`. The run is kept, in `run` or under runs/.
-
     Args:
         answer: of an attack that was kept and has ended: its result, or name or folder of its run.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     if not isinstance(answer, AttackResult):
         return replay_from_config(configured(ReplayConfig, answer=answer, **settings), progress=watcher(progress))
@@ -221,11 +196,7 @@ def replay_from_config(
     """Render an answer again as a configuration describes; every trial is stored at once, and a run goes on with the
     next.
 
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with.
-        parts: what the attack was asked with; None loads what its run names.
+    `parts` is what the attack was asked with; None loads what its run names.
 
     Raises:
         InputError: the run has no answer, or its scene is another one now.
@@ -271,25 +242,13 @@ def replay_from_config(
             seed=parts.config.seed,
             command_line=config.command_line(),
         )
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 @dataclass
 class _Table:
-    """The rows so far.
-
-    Attributes:
-        ways: the conditions of all rows.
-        u: (d,) the answer.
-        trials: of the answer in each row, and of the clean scene.
-        seed: root of theirs.
-        run: keeps them.
-        progress: told of every trial.
-        rows: by the place of their condition among `ways`.
-        renders: pictures that were rendered.
-    """
+    """The rows so far, by the place of their condition among all ways; the answer (d,), and the pictures that were
+    rendered."""
 
     ways: Sequence[Way]
     u: torch.Tensor
@@ -302,9 +261,7 @@ class _Table:
 
     def fill(self, batch: Sequence[int]) -> None:
         """Add the rows of some conditions that share their renders: the clean scene under all of them, then the answer.
-
-        A condition that cannot be had, or that Blender fails at, gets a row that says why.
-        """
+        A condition that cannot be had, or that Blender fails at, gets a row that says why."""
         ways = [self.ways[number] for number in batch]
         missing = next((way.missing for way in ways if way.missing), "")
         try:
@@ -313,12 +270,14 @@ class _Table:
         except BlenderError as error:
             missing = str(error)
         if missing:
-            self.rows |= {number: _not_done(way, missing) for number, way in zip(batch, ways, strict=True)}
+            self.rows |= {
+                number: ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=missing)
+                for number, way in zip(batch, ways, strict=True)
+            }
 
     def _try(self, batch: Sequence[int], ways: Sequence[Way]) -> None:
-        text = (
-            ", ".join(dict.fromkeys(way.name for way in ways)) if len(ways) > 1 else f"{ways[0].name}: {ways[0].text}"
-        )
+        names = ", ".join(dict.fromkeys(way.name for way in ways))
+        text = names if len(ways) > 1 else f"{names}: {ways[0].text}"
         total = 2 * self.trials * len(ways)
         self.progress.stage(f"replaying, {text}", total, hint="`trials` or `ways` shorten it")
         conditions = [way.condition() for way in ways]
@@ -329,7 +288,14 @@ class _Table:
             for condition in conditions:
                 retrials.clean(condition)
             for number, way, condition in zip(batch, ways, conditions, strict=True):
-                self.rows[number] = _row(way, condition, retrials, self.u)
+                checked = retrials.answer("answer", self.u, condition)
+                self.rows[number] = ReplayRow(
+                    way=way.name,
+                    condition=way.text,
+                    ending=checked.ending.value,
+                    clean=control_group(retrials.clean(condition), condition.spp),
+                    verified=verified_rate(checked),
+                )
         finally:
             self.renders += sum(one.renders for one in renderers) - before
 
@@ -343,9 +309,9 @@ def _batches(ways: Sequence[Way]) -> list[list[int]]:
 def _changed(folder: Path, parts: AttackParts) -> list[str]:
     """What a reader has to know of a file that was another one when the run was made."""
     with Store(folder / NAME, read_only=True) as results:
-        noted = results.noted(made_with.NOTE)
+        noted = results.noted(MADE_WITH)
     before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
-    name = made_with.changed_file(before, parts.config.plain())
+    name = changed_file(before, parts.config.plain())
     return [f"{name} is not what it was when the run was made: what does not hold may come from that."] if name else []
 
 
@@ -380,24 +346,8 @@ def _models(config: ReplayConfig, again: Again, problem: Problem, summary: Attac
         if shares:
             other = replace(other, renderer=problem.renderer)
         source = OWN_LIGHT if shares else name
-        condition = RetrialCondition(f"model: {name}", other, _spp(summary), source, light=source)
-        yield Way("model", partial(_given, condition), name, shares=shares)
 
+        def condition(title: str, other: Problem = other, source: str = source) -> RetrialCondition:
+            return RetrialCondition(title, other, _spp(summary), source, light=source)
 
-def _given(condition: RetrialCondition) -> RetrialCondition:
-    return condition
-
-
-def _not_done(way: Way, reason: str) -> ReplayRow:
-    return ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=reason)
-
-
-def _row(way: Way, condition: RetrialCondition, retrials: Retrials, u: torch.Tensor) -> ReplayRow:
-    checked = retrials.answer("answer", u, condition)
-    return ReplayRow(
-        way=way.name,
-        condition=way.text,
-        ending=checked.ending.value,
-        clean=control_group(retrials.clean(condition), condition.spp),
-        verified=verified_rate(checked),
-    )
+        yield Way("model", name, condition, shares)

@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from pydantic import field_validator
 
 from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 
-WAYS = (
-    "samples",
-    "resolution",
-    "depth",
-    "integrator",
-    "sampler",
-    "denoiser",
-    "curve",
-    "jpeg",
-    "sensor",
-    "blender",
-)
+WAYS = ("samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor", "blender")
 """What a replay may change beside the model."""
 
 REPLAY_TRIALS = 10
@@ -55,17 +44,13 @@ class ReplayConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("answer", "ways", "model", "run", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any, info: Any) -> Any:
-        return as_text(value, several=info.field_name in ("ways", "model"))
+    _named = texts("answer", "run", several=["ways", "model"])
+    _different = each_once("ways")
 
     @field_validator("ways")
     @classmethod
     def _known_ways(cls, value: str | None) -> str | None:
-        names = () if value is None else split_names(value)
-        check_once(names, "ways")
-        if set(names) - set(WAYS):
+        if value is not None and set(split_names(value)) - set(WAYS):
             raise ValueError("an unknown way")
         return value
 

@@ -1,1 +1,62 @@
-"""Runs as evidence for a model card or a safety case."""
+"""`advsearch report`: runs as evidence for a model card or a safety case."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from advsearch.cli import output
+from advsearch.errors import InputError
+
+HELP = "write what runs show, and no more than that, for a model card or a safety case"
+MORE = ": a page, Markdown and JSON"
+EXAMPLES = (
+    "report mug-texture-001 mug-sweep-001 --evidence",
+    "report mug-texture-001 mug-sweep-001 --evidence --out card --json",
+)
+NAME = "evidence"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="names or folders of runs; of a recipe, its parts")
+    parser.add_argument("--evidence", action="store_true", help="claims with what a reader needs to judge them")
+    parser.add_argument("--out", metavar="FOLDER", help="where the three files go (default: %(default)s)", default=NAME)
+    parser.add_argument("--overwrite", action="store_true", help="replace what is there")
+    output.add_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the files."""
+    # late, so that --help answers at once
+    from advsearch.questions.report.answer import evidence_page, markdown
+    from advsearch.questions.report.evidence import collected
+    from advsearch.runs.files import write_text
+    from advsearch.runs.summary import to_json
+
+    if not args.evidence:
+        raise InputError(
+            "report: expected --evidence, which writes the claims of all these runs; the page of one run is "
+            "report.html in its folder"
+        )
+    folder = Path(args.out)
+    names = [folder / f"{NAME}.{suffix}" for suffix in ("html", "md", "json")]
+    there = [one for one in names if one.exists()]
+    if there and not args.overwrite:
+        raise InputError(f"{there[0]}: exists already; add --overwrite or choose another folder with --out")
+    evidence = collected(args.runs)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out: cannot make the folder {folder}: {error.strerror}") from None
+    texts = (evidence_page(evidence), markdown(evidence), to_json(evidence) + "\n")
+    for path, text in zip(names, texts, strict=True):
+        write_text(path, text)
+    if args.json:
+        output.print_json(evidence)
+        return 0
+    for one in evidence.runs:
+        print("\n".join([one.run, *(f"  {claim.kind}: {claim.statement}" for claim in one.claims)]))
+    print("".join(f"\nNote: {text}" for text in evidence.warnings))
+    print("\n".join(map(str, names)))
+    return 0

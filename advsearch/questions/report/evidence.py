@@ -1,25 +1,30 @@
-"""A run as evidence: its claims, what it was about, what varied, how it was measured, what is left out.
-
-For a page and as Markdown.
-"""
+"""Runs as evidence: their claims, what they were about, what varied, how it was measured, what is left out."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
-from advsearch import rooms
-from advsearch.questions.photographs.answer import PhotoAgreement
+from advsearch import __version__, rooms
+from advsearch.errors import AdvsearchError
+from advsearch.options import FROM_RUN
+from advsearch.questions.photographs.answer import FOLDER, PhotoAgreement
 from advsearch.questions.report.answer import Evidence, EvidenceRun
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_text
-from advsearch.report.wording import interval_text
+from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result, VariedValue
 from advsearch.runs.results.sweep import SweepSummary
-from advsearch.viewer.document import again, document, facts_table, heading, study_table
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
+from advsearch.runs.summary import MADE_WITH, read_result
+from advsearch.runs.summary import NAME as SUMMARY
+from advsearch.settings import read_yaml
 
 RULES = (
     "Each claim is about the run's own model, object, environment, label and settings, and about nothing else.",
@@ -30,7 +35,6 @@ RULES = (
     "`nothing claimed`: the run does not carry a claim, for the reason that it gives.",
     "Renderings are not photographs: a claim is about reality only as far as photographs were compared.",
 )
-"""How claims are to be read."""
 
 QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; no result."
 
@@ -40,7 +44,7 @@ def claims_of(result: Result) -> list[Claim]:
     if result.goes_on:
         told = f"; so far: {result.brief}" if result.brief else ""
         return [nothing_claimed(f"the run was stopped before its end{told}")]
-    if own := rooms.in_room(result.command, "words", "claims"):
+    if own := rooms.in_room(result.command, "answer", "claims"):
         return list(own(result)) or [nothing_claimed("nothing in this run came to its end")]
     return [nothing_claimed(f"the command {result.command} measures something else than how often a model is right")]
 
@@ -56,12 +60,8 @@ def photo_claims(photos: PhotoAgreement) -> list[Claim]:
 
 
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
-    """Return what has to be known of runs together.
-
-    Args:
-        models: of each run.
-        digests: of each run's model files, one text a run; empty where none is known.
-    """
+    """Return what has to be known of runs together: their models, and the digests of each run's model files, one text a
+    run; empty where none is known."""
     said = []
     if len(set(models)) > 1:
         names = ", ".join(sorted(set(models)))
@@ -84,16 +84,8 @@ def evidence_of(
     made: Mapping[str, str],
     judged_by: Mapping[str, object] | None = None,
 ) -> EvidenceRun:
-    """Return a run with what a reader needs to judge its claims.
-
-    Args:
-        name: of the run.
-        result: what it answered.
-        claims: what it stands for.
-        settings: as its run.yaml has them.
-        made: versions and digests, as the run noted them; empty of older runs.
-        judged_by: the options of its task by name, such as thresholds.
-    """
+    """Return a run with what a reader needs to judge its claims: settings as its run.yaml has them, versions and
+    digests as it noted them (empty of older runs), and the options of its task, such as thresholds."""
     values = {field: getattr(result, field) for field in type(result).model_fields}
 
     objects = values.get("object") or ", ".join(values.get("objects") or ())
@@ -237,83 +229,104 @@ def _renders(renders: object) -> str:
     return "those of its parts" if renders is None else str(renders)
 
 
-def markdown(evidence: Evidence) -> str:
-    """Return the whole as Markdown, to be put into a model card."""
-    lines = ["# Evidence", "", *(f"> {one}" for one in evidence.warnings), "" if evidence.warnings else None]
-    for one in evidence.runs:
-        lines += [
-            f"## {_plain(one.run)}",
-            "",
-            *(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in one.claims),
-            "",
-        ]
-        for title, facts in sections(one).items():
-            lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
-        lines += (
-            ["To repeat it:", "", "```sh", one.command_line.replace("```", "` ` `"), "```", ""]
-            if one.command_line
-            else []
-        )
-    lines += ["## How to read this", "", *(f"- {text}" for text in evidence.rules), ""]
-    lines.append(f"Written by advsearch {evidence.version}.")
-    return "\n".join(line for line in lines if line is not None) + "\n"
-
-
-def sections(one: EvidenceRun) -> dict[str, list[str]]:
-    """Return what stands beside the claims of a run, in lines under their headings."""
-    found = {
-        "On what": [f"{name}: {text}" for name, text in one.about.items()],
-        "What varied": one.searched,
-        "Measured how": [f"ended as: {one.ending}", *(f"{name}: {text}" for name, text in one.measured.items())],
-        "Excluded, and to be known": one.excluded,
-        "Budget": [f"{name}: {text}" for name, text in one.cost.items()],
-        "Made with": [f"{name}: {text}" for name, text in one.made_with.items()],
-    }
-    return {title: lines for title, lines in found.items() if lines}
-
-
-def _plain(text: str) -> str:
-    """Text that Markdown shows as it is."""
-    one_line = " ".join(text.split())
-    for sign in "\\<>*_[]`|":
-        one_line = one_line.replace(sign, f"\\{sign}")
-    return one_line
-
-
-CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
-
-
-def evidence_page(evidence: Evidence) -> str:
-    """Return the page."""
-    claims = [claim for one in evidence.runs for claim in one.claims]
-    carried = sum(claim.kind != "nothing claimed" for claim in claims)
-    runs = f"{len(evidence.runs)} run{'' if len(evidence.runs) == 1 else 's'}"
-    said = f"What {runs} show{'s' if len(evidence.runs) == 1 else ''}, and no more than that."
-    main = element(
-        "main",
-        *(_run(one) for one in evidence.runs),
-        element("h2", "How to read this"),
-        element("ul", *(element("li", text.replace("`", "")) for text in evidence.rules)),
-    )
-    header = heading(f"evidence; {carried} of {len(claims)} statements carry a claim", said, evidence.warnings)
-    return document("evidence", header, main, footer="evidence. This page needs no other file.")
-
-
-def _run(one: EvidenceRun) -> Html:
-    rows = [
-        [
-            claim.kind,
-            claim.statement,
-            f"{claim.extent.count} of {claim.extent.total}" if claim.extent else "",
-            interval_text(claim.extent.interval) if claim.extent else "",
-        ]
-        for claim in one.claims
+def collected(runs: list[str]) -> Evidence:
+    """Return runs, by their names or folders, as evidence."""
+    folders = {part.resolve(): part for name in runs for part in _with_parts(find_run(name))}
+    found = [_run(folder) for folder in folders.values()]
+    models = [one.about.get("Model", "") for one in found]
+    files = [(model, model.rpartition("@")[2]) for model in models]
+    digests = [
+        " ".join(text for name, text in one.made_with.items() if name in own)
+        for one, own in zip(found, files, strict=True)
     ]
-    facts = {name: "; ".join(lines) for name, lines in sections(one).items()}
-    beside = element("details", element("summary", "On what, how, and what is left out"), facts_table(facts), open="")
-    return join_html(
-        element("h2", f"{one.run} ({one.command})"),
-        study_table(CLAIM_HEADS, rows),
-        beside,
-        again(one.command_line) if one.command_line else None,
-    )
+    warnings = warnings_over([one for one in models if one], [d for d, m in zip(digests, models, strict=True) if m])
+    return Evidence(runs=found, warnings=warnings, rules=list(RULES), version=__version__)
+
+
+def _with_parts(folder: Path) -> Iterator[Path]:
+    """A run; in place of a recipe, the runs that it consists of."""
+    parts = [one for one in sorted((folder / PARTS).glob("*")) if is_run(one)]
+    if parts and _settings(folder).get("command") == "recipe":
+        yield from parts
+    else:
+        yield folder
+
+
+def _of_quick_recipe(folder: Path) -> bool:
+    """Whether a run is a part of a recipe that was made with `quick`."""
+    outer = _settings(folder.resolve().parent.parent)
+    return outer.get("command") == "recipe" and outer.get("quick") is True
+
+
+def _settings(folder: Path) -> Mapping[str, object]:
+    """What its run.yaml says; nothing where there is none that can be read."""
+    with suppress(AdvsearchError):
+        return read_yaml(folder / CONFIG)
+    return {}
+
+
+def _run(folder: Path) -> EvidenceRun:
+    """One run; of one that has no summary, that it claims nothing."""
+    name, settings = typed_name(folder), _settings(folder)
+    made = _made_with(folder)
+    if not (folder / SUMMARY).is_file():
+        facts = {"Object": str(settings.get("object") or ""), "Model": str(settings.get("model") or "")}
+        return EvidenceRun(
+            run=name,
+            command=str(settings.get("command") or "unknown"),
+            ending="none yet",
+            claims=[nothing_claimed("the run has no result; it is at work, or was stopped before its end")],
+            about={key: text for key, text in facts.items() if text},
+            searched=[],
+            measured={},
+            excluded=["The run carries no claim; it is listed so that it is not left out unseen."],
+            cost={},
+            made_with=made or {"versions and files": NOT_NOTED},
+            command_line=f"advsearch run {folder / CONFIG}",
+        )
+    result = read_result(folder)
+    found = evidence_of(name, result, [*claims_of(result), *_photos(folder)], settings, made, _judged_by(settings))
+    few = [QUICK] if _of_quick_recipe(folder) else []
+    return found.model_copy(update={"excluded": [*few, *found.excluded]})
+
+
+def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
+    """The options of the task that a run was judged by; nothing of one that is not to be had here."""
+    given: Any = settings.get("task")
+    if given is None:
+        return {}
+    from advsearch.tasks import make_task  # they bring torch, which takes a second
+    from advsearch.tasks.together import Together
+
+    with suppress(AdvsearchError):
+        task = make_task(given)
+        alone = [("", task)] if not isinstance(task, Together) else [(f"{one.name}.", one) for one in task.parts]
+        return {
+            f"{of}{option.name}": getattr(one, option.name)
+            for of, one in alone
+            for option in fields(one)
+            if option.metadata != FROM_RUN
+        }
+    return {}
+
+
+def _photos(folder: Path) -> list[Claim]:
+    if not (folder / IMAGES / FOLDER).is_dir():
+        return []
+    from advsearch.questions.photographs.carry_out import photo_agreement  # it brings torch, which takes a second
+
+    return photo_claims(photo_agreement(folder))
+
+
+def _made_with(folder: Path) -> dict[str, str]:
+    """What the run noted at each sitting; of several that differ, all."""
+    try:
+        with Store(folder / STORE, read_only=True) as store:
+            noted = store.noted(MADE_WITH)
+    except AdvsearchError:
+        return {}
+    facts: dict[str, dict[str, None]] = {}
+    for sitting in noted if isinstance(noted, list) else []:
+        for name, text in sitting.items() if isinstance(sitting, Mapping) else ():
+            facts.setdefault(str(name), {})[str(text)] = None
+    return {name: ", then ".join(texts) for name, texts in facts.items()}

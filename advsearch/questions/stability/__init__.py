@@ -1,1 +1,71 @@
-"""Extreme scenes, objectives and arithmetic, and whether each of them holds."""
+"""`advsearch stability`: extreme scenes, objectives and arithmetic, and whether each of them holds."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from advsearch.cli import output
+from advsearch.cli.question import QuestionCommand
+
+if TYPE_CHECKING:
+    from advsearch.questions.stability.answer import StabilityResult
+    from advsearch.questions.stability.scene import Case
+
+HELP = "run stiff and extreme cases, and check that each of them holds"
+MORE = ". Exit status 3 if one falls short"
+EXAMPLES = (
+    "stability",
+    "stability --group objective --group stiff",
+    "stability --case hdri-texel-100000 --json",
+    "stability --seconds 120 --run extremes",
+    "resume extremes",
+    "stability --list",
+)
+
+
+class _Stability(QuestionCommand):
+    """The command, which can list its cases too."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the settings and the flag that lists."""
+        super().add_arguments(parser)
+        parser.add_argument("--list", action="store_true", help="list the cases and run none")
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Run the cases, or list them."""
+        if not args.list:
+            return super().run(args)
+        # these take longer to import than `--help` takes
+        from advsearch.cli.flags import config_from
+        from advsearch.cli.output import at_work
+        from advsearch.questions.stability.settings import StabilityConfig
+
+        config = config_from(args, StabilityConfig)
+        with at_work(as_json=args.json, quiet=args.quiet):
+            # late, so that --help answers at once
+            from advsearch.questions.stability.carry_out import (
+                chosen,
+            )  # torch and the renderer, which `--help` leaves out
+
+            cases = chosen(config.cases, config.groups)
+        return _print_cases(cases, as_json=args.json)
+
+
+def _print_cases(cases: Sequence[Case], *, as_json: bool) -> int:
+    listed = [{"case": one.name, "group": one.group, "control": one.control, "holds": one.holds} for one in cases]
+    if as_json:
+        output.print_json({"schema": 1, "command": "stability", "cases": listed})
+    else:
+        rows = [[one.group, one.name, one.holds] for one in cases]
+        print(output.aligned([["group", "case", "what must hold"], *rows]))
+    return 0
+
+
+def has_failed(result: StabilityResult) -> bool:
+    """Whether a case does not hold."""
+    return any(row.status != "ok" for row in result.rows)
+
+
+COMMAND = _Stability("stability", short=has_failed)

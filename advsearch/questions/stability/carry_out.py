@@ -1,8 +1,4 @@
-"""`stability`: extreme scenes, objectives and arithmetic, and whether each of them holds.
-
-A case is data (`Case`): a name, a group, what must hold, what handles it, and a function that returns findings. The
-registry is `CASES`; nothing is found by its name.
-"""
+"""`stability`: extreme scenes, objectives and arithmetic, and whether each of them holds."""
 
 from __future__ import annotations
 
@@ -10,45 +6,27 @@ import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import Names, RunKeywords, asks, configured
-from advsearch.engine.measuring import Results, kept_rows
+from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import AdvsearchError, UnknownNameError
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.stability import (
-    cases_geometry,
-    cases_materials,
-    cases_noise,
-    cases_objective,
-    cases_precision,
-    cases_radiometric,
-    cases_stiff,
-    cases_surface_light,
-    cases_transport,
-)
 from advsearch.questions.stability.answer import CaseRow, DecidingNumber, StabilityResult
-from advsearch.questions.stability.case import Case, Check, Outcome
+from advsearch.questions.stability.geometry import GEOMETRY
+from advsearch.questions.stability.light import MATERIALS, RADIOMETRIC
+from advsearch.questions.stability.precision import PRECISION
+from advsearch.questions.stability.predicted import SURFACE_LIGHT, TRANSPORT
+from advsearch.questions.stability.scene import Case, Check, Outcome
+from advsearch.questions.stability.searches import NOISE, OBJECTIVE
 from advsearch.questions.stability.settings import StabilityConfig
+from advsearch.questions.stability.stiff import STIFF
 from advsearch.runs.directory import RunDirectory
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-_MODULES = (
-    cases_radiometric,
-    cases_materials,
-    cases_geometry,
-    cases_objective,
-    cases_stiff,
-    cases_precision,
-    cases_noise,
-    cases_transport,
-    cases_surface_light,
-)
-GROUPS: tuple[str, ...] = tuple(module.GROUP.name for module in _MODULES)
-"""Every group, in the order in which they run."""
-CASES: tuple[Case, ...] = tuple(case for module in _MODULES for case in module.GROUP.cases)
+_GROUPS = (RADIOMETRIC, MATERIALS, GEOMETRY, OBJECTIVE, STIFF, PRECISION, NOISE, TRANSPORT, SURFACE_LIGHT)
+GROUPS: tuple[str, ...] = tuple(group.name for group in _GROUPS)
+CASES: tuple[Case, ...] = tuple(case for group in _GROUPS for case in group.cases)
 """Every case, in the order in which they run."""
 
 
@@ -62,16 +40,7 @@ class StabilityKeywords(RunKeywords, total=False):
 
 @asks(StabilityConfig, StabilityKeywords)
 def stability(*, progress: Watched = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
-    """Try extreme scenes, objectives and arithmetic, and say whether each of them holds (docs/stability.md).
-
-    All other arguments are the settings of `advsearch stability`. The run is kept, in `run` or under runs/.
-
-    Args:
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Try extreme scenes, objectives and arithmetic, and say whether each of them holds (docs/stability.md)."""
     return stability_from_config(configured(StabilityConfig, **settings), progress=watcher(progress))
 
 
@@ -81,14 +50,6 @@ def stability_from_config(
     """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.
 
     A case that is done is stored at once: a run that was stopped goes on with the case that it was at.
-
-    Args:
-        config: which cases, and where the run is kept.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     cases, begun = chosen(config.cases, config.groups), time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
@@ -131,10 +92,10 @@ def run_case(case: Case) -> CaseRow:
     try:
         outcome = case.find()
     except AdvsearchError as error:
-        outcome = Outcome((Check(f"refused: {error}", 1.0, 0.0, 0.0),), ending="refused")
+        outcome = Outcome(Check(f"refused: {error}", 1.0, 0.0, 0.0), ending="refused")
     except Exception as error:
         what = f"raised {type(error).__name__}: {error}"
-        outcome = Outcome((Check(what, 1.0, 0.0, 0.0),), finite=False, ending="raised")
+        outcome = Outcome(Check(what, 1.0, 0.0, 0.0), finite=False, ending="raised")
     return CaseRow(
         case=case.name,
         group=case.group,
@@ -142,7 +103,7 @@ def run_case(case: Case) -> CaseRow:
         finite=outcome.finite,
         relative_error=outcome.relative_error,
         ending=outcome.ending,
-        rule=outcome.rule or case.rule,
+        rule=case.rule,
         status=outcome.status,
         decides=outcome.decides,
         holds=case.holds,

@@ -1,9 +1,10 @@
-"""Small scenes for the stability suite, and what is asked of each: a picture, a gradient, a reference, a search."""
+"""What a case of the stability suite is, and small scenes and objectives for it: a picture, a gradient, a search."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,19 +13,218 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
+from advsearch.attacks import PGD, Block, Domain, Evaluation, Query, SearchResult, search
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import objective
 from advsearch.engine.gradients import Agreement, Loss, Probe, agreement, estimates, probes, reference, smooth_loss
-from advsearch.questions.stability.case import Check, Outcome, holds
 from advsearch.scene import library
+from advsearch.scene.assembly import Motion
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
 from advsearch.scene.description import describe
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.motion import Motion
 from advsearch.scene.parts import ScenePart
 from advsearch.scene.renderer import Renderer
+
+OK, FELL_SHORT = "ok", "fell short"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One number that decides, and the range that it has to be in (both ends included; NaN is in no range)."""
+
+    what: str
+    value: float
+    least: float = -math.inf
+    most: float = math.inf
+
+    @property
+    def ok(self) -> bool:
+        """Whether the number is in its range."""
+        return self.least <= self.value <= self.most
+
+    def __str__(self) -> str:
+        ends = [
+            f"{sign} {end:.4g}"
+            for sign, end in (("at least", self.least), ("at most", self.most))
+            if not math.isinf(end) and self.least != self.most
+        ]
+        wanted = f"exactly {self.most:.4g}" if self.least == self.most else " and ".join(ends)
+        return f"{self.what}: {self.value:.4g}" + (f" (expected {wanted})" if wanted else "")
+
+
+def holds(what: str, truth: bool) -> Check:
+    """Return the check that something is true: 1, else 0."""
+    return Check(what, float(truth), 1.0, 1.0)
+
+
+class Outcome:
+    """What a case found: the numbers that decide, and whether every picture and gradient was finite, and none had to be
+    made so.
+
+    Attributes:
+        relative_error: of a gradient (or of what the case is about) against the reference; None where there is none.
+        ending: how the case's search ended, "refused" where the input was, or empty.
+        measured: further numbers that are worth printing.
+    """
+
+    def __init__(
+        self,
+        *checks: Check,
+        finite: bool = True,
+        relative_error: float | None = None,
+        ending: str = "",
+        measured: Mapping[str, float] | None = None,
+    ) -> None:
+        self.checks, self.finite, self.relative_error = checks, finite, relative_error
+        self.ending, self.measured = ending, measured or {}
+
+    @property
+    def status(self) -> str:
+        """`OK` where everything was finite and every check holds."""
+        return OK if self.finite and all(check.ok for check in self.checks) else FELL_SHORT
+
+    @property
+    def decides(self) -> str:
+        """The number that decides: of the first check that fails, else of the last one."""
+        bad = [check for check in self.checks if not check.ok]
+        if not self.finite and not bad:
+            return "NaN or infinite values"
+        deciding = bad or list(self.checks[-1:])
+        return str(deciding[0]) if deciding else ""
+
+    def with_checks(self, *more: Check, **known: Any) -> Outcome:
+        """Return it with further checks, and other fields where they are known."""
+        fields = {name: value for name, value in vars(self).items() if name != "checks"}
+        return Outcome(*self.checks, *more, **{**fields, **known})
+
+
+Find = Callable[[], Outcome]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One extreme.
+
+    Attributes:
+        name: unique; what `--case` takes.
+        holds: what must hold, in a sentence.
+        rule: what handles it.
+        control: the controls that it moves; empty where there is no scene.
+        cheap: takes about a second or less on two quiet cores, so the tests run it every time.
+    """
+
+    name: str
+    group: str
+    holds: str
+    rule: str
+    control: str
+    cheap: bool
+    find: Find
+
+
+@dataclass(frozen=True)
+class CaseGroup:
+    """Cases about one thing, in the order in which they run; `name` is what `--group` takes."""
+
+    name: str
+    cases: list[Case] = field(default_factory=list)
+
+    def case(
+        self, name: str, rule: str, control: str = "", *, holds: str = "", cheap: bool = True
+    ) -> Callable[[Find], Find]:
+        """Make a function a case of the group; arguments as the attributes of `Case`.
+
+        Where `holds` is not given, the first sentence of its docstring says what must hold.
+        """
+
+        def added(find: Find) -> Find:
+            said = holds or " ".join((find.__doc__ or "").partition("\n\n")[0].split())
+            self.cases.append(Case(name, self.name, said, rule, control, cheap, find))
+            return find
+
+        return added
+
+
+Value = Callable[[Tensor], Tensor]
+"""From (d,) float64 in [0, 1] to a number with a graph; the larger the better."""
+Disturb = Callable[[Tensor, int], Tensor]
+"""From a gradient (d,) float32 and the number of its evaluation to the gradient that the policy sees."""
+
+
+@dataclass
+class Toy:
+    """An objective without a renderer, as a search wants it.
+
+    Attributes:
+        scale: factor on the objective, as if it were in other units.
+        disturb: what becomes of gradients.
+        broken: numbers of evaluations whose objective is NaN, as is their gradient.
+        threshold: an objective over it is a success.
+    """
+
+    value: Value
+    domain: Domain
+    scale: float = 1.0
+    disturb: Disturb | None = None
+    broken: frozenset[int] = frozenset()
+    threshold: float = math.inf
+
+    def __call__(self, query: Query) -> Evaluation:
+        """Answer a query; gradients cost nothing."""
+        at = query.u.detach().double().requires_grad_()
+        value = self.scale * self.value(at)
+        slope = None
+        if query.gradient:
+            (slope,) = torch.autograd.grad(value, at)
+            slope = slope.float()
+            if self.disturb is not None:
+                slope = self.disturb(slope, query.number)
+        objective = float(value.detach())
+        if query.number in self.broken:
+            objective = math.nan
+            slope = None if slope is None else torch.full_like(slope, math.nan)
+        return Evaluation(objective, slope, objective > self.threshold, cost=query.samples)
+
+
+def box_domain(start: Sequence[float]) -> Domain:
+    """Return a box in which every number is a block of its own, as parameters of controls are."""
+    return Domain(torch.tensor(start), tuple(Block(1, name=f"number {i}") for i in range(len(start))))
+
+
+def quadratic(peak: Sequence[float], curvatures: Sequence[float]) -> Value:
+    """Return minus half the sum of curvature x squared distance from the peak."""
+    middle, weights = torch.tensor(peak, dtype=torch.float64), torch.tensor(curvatures, dtype=torch.float64)
+    return lambda u: -0.5 * (weights * (u - middle).square()).sum()
+
+
+def valley(u: Tensor) -> Tensor:
+    """Rosenbrock's curved valley (1960), turned over: 0 at its peak u = (0.75, 0.75), condition number there 2508.
+
+    x = 4 u - 2, value = -(100 (x_2 - x_1^2)^2 + (1 - x_1)^2).
+    """
+    x, y = 4.0 * u[0] - 2.0, 4.0 * u[1] - 2.0
+    return -(100.0 * (y - x.square()).square() + (1.0 - x).square())
+
+
+def hessian(value: Callable[[Tensor], float], u: Tensor, directions: Tensor, steps: Sequence[float]) -> Tensor:
+    """Estimate the second derivatives (k, k), float64, of an objective at u (d,) along directions (k, d), by
+    differences of k half-widths."""
+    moves = [step * direction for step, direction in zip(steps, directions, strict=True)]
+    here, found = value(u), torch.zeros(len(moves), len(moves), dtype=torch.float64)
+    for i, one in enumerate(moves):
+        found[i, i] = (value(u + one) - 2.0 * here + value(u - one)) / steps[i] ** 2
+        for j, other in enumerate(moves[:i]):
+            crossed = value(u + one + other) - value(u + one - other) - value(u - one + other) + value(u - one - other)
+            found[i, j] = found[j, i] = crossed / (4.0 * steps[i] * steps[j])
+    return found
+
+
+def condition_number(second: Tensor) -> float:
+    """Return the largest over the smallest absolute eigenvalue of a symmetric matrix (k, k); infinite if that is 0."""
+    sizes = torch.linalg.eigvalsh(second.double()).abs()
+    return float(sizes.max() / sizes.min()) if float(sizes.min()) > 0.0 else math.inf
+
 
 BARE = {"ground.size": 0.0}
 """Settings without the ground, so that a dark object has an outline and nothing else."""
@@ -110,7 +310,7 @@ class Examined:
         inside: the picture is in [0, 1].
         compared: gradients beside their references; empty if that was not asked for.
         gradient: largest absolute entry of the gradient.
-        mean: mean of the picture.
+        mean: of the picture.
         result: of the short search.
     """
 
@@ -122,8 +322,8 @@ class Examined:
     mean: float
     result: SearchResult
 
-    def findings(self, *more: Check, rule: str = "") -> Outcome:
-        """Return the findings: the checks that every scene has, and more."""
+    def findings(self, *more: Check, **known: Any) -> Outcome:
+        """Return the findings: the checks that every scene has, and more; `known` are fields in place of its own."""
         checks = [
             holds("the picture is in [0, 1]", self.inside),
             Check("values that were NaN or infinite", float(self.replaced), 0.0, 0.0),
@@ -137,7 +337,8 @@ class Examined:
             checks.append(Check(f"gradient error beyond the noise, {name}", worst.excess, most=ERROR))
             error = worst.error
         measured = {"mean": self.mean, "largest gradient": self.gradient}
-        return Outcome((*checks, *more), self.finite, error, self.result.ending.value, measured, rule)
+        own = {"relative_error": error, "ending": self.result.ending.value, "measured": measured}
+        return Outcome(*checks, *more, finite=self.finite, **{**own, **known})
 
 
 def dark() -> ObjectAsset:
@@ -151,21 +352,11 @@ def examine_gradient(
     *,
     compare: bool = True,
     evaluations: int = 3,
-    policy: Policy[Any] | None = None,
     spp: int = SPP,
     seeds: tuple[int, int] = (3, 12),
 ) -> Examined:
-    """Render a configuration, differentiate it, compare the gradient with differences, and search from there.
-
-    Args:
-        renderer: the scene.
-        u: where; None for the start.
-        compare: whether to take references; they cost most of the time.
-        evaluations: of the search; each takes a gradient.
-        policy: of the search; PGD by default.
-        spp: samples a pixel of the picture and the gradient.
-        seeds: fewest and most seeds of a reference.
-    """
+    """Render a configuration, the start by default, differentiate it, compare the gradient with references of some
+    seeds (which cost most of the time), and search from there."""
     u = renderer.start if u is None else u
     loss = smooth_loss(renderer.formation.resolution)
     with torch.no_grad():
@@ -173,16 +364,10 @@ def examine_gradient(
     _, gradient = renderer.gradient(loss, u, 0, spp)
     finite = bool(torch.isfinite(picture).all()) and bool(torch.isfinite(gradient).all())
     beside = compared(renderer, u, spp=spp, seeds=seeds) if compare else {}
-    result = searched(renderer, u, evaluations, policy or PGD(), spp=spp)
-    return Examined(
-        finite=finite and renderer.non_finite == 0,
-        replaced=renderer.non_finite,
-        inside=float(picture.min()) >= 0.0 and float(picture.max()) <= 1.0,
-        compared=beside,
-        gradient=float(gradient.abs().max()),
-        mean=float(picture.mean()),
-        result=result,
-    )
+    result = searched(renderer, u, evaluations, spp=spp)
+    inside = float(picture.min()) >= 0.0 and float(picture.max()) <= 1.0
+    largest, mean = float(gradient.abs().max()), float(picture.mean())
+    return Examined(finite and renderer.non_finite == 0, renderer.non_finite, inside, beside, largest, mean, result)
 
 
 def compared(
@@ -207,14 +392,13 @@ def compared(
 
 
 def _together(renderer: Renderer, loss: Loss, u: Tensor, spp: int) -> list[list[Probe]]:
-    """Probes that one gradient answers."""
     sets: dict[tuple[str, str], list[Probe]] = {}
     for probe in probes(renderer, loss, u, 0, spp):
         sets.setdefault((probe.group.control, probe.group.estimator), []).append(probe)
     return list(sets.values())
 
 
-def searched(renderer: Renderer, u: Tensor, evaluations: int, policy: Policy[Any], *, spp: int = SPP) -> SearchResult:
+def searched(renderer: Renderer, u: Tensor, evaluations: int, *, spp: int = SPP) -> SearchResult:
     """Search for a picture that a linear model of two classes gets wrong.
 
     Its logits are 0 and `SHARPNESS` times the rise of the smooth linear loss over the configuration u, less 1.
@@ -229,7 +413,7 @@ def searched(renderer: Renderer, u: Tensor, evaluations: int, policy: Policy[Any
     domain = search_domain(renderer, u)
     steps = evaluations * (1 + domain.gradient_cost) + 1
     return search(
-        partial(map, Evaluator(renderer, margin, spp)), domain, policy, steps=steps, seed=0, candidates=1, repeats=1
+        partial(map, Evaluator(renderer, margin, spp)), domain, PGD(), steps=steps, seed=0, candidates=1, repeats=1
     )
 
 

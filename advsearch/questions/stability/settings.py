@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
-
-from pydantic import field_validator
+from typing import ClassVar
 
 from advsearch.config.attack import TimedConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, as_text, check_once, setting, setting_as_in, split_names
+from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 
 
 class StabilityConfig(Config):
@@ -28,17 +26,8 @@ class StabilityConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/stability-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("case", "group", "run", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any, info: Any) -> Any:
-        return as_text(value, several=info.field_name != "run")
-
-    @field_validator("case", "group")
-    @classmethod
-    def _each_once(cls, value: str | None, info: Any) -> str | None:
-        """Refuse a name that is given twice."""
-        check_once(split_names(value or ""), info.field_name)
-        return value
+    _named = texts("run", several=["case", "group"])
+    _different = each_once("case", "group")
 
     @property
     def cases(self) -> tuple[str, ...]:

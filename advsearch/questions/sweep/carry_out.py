@@ -6,38 +6,45 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from typing_extensions import Unpack
 
 from advsearch.api.keywords import SweepKeywords, asks
-from advsearch.cluster.executor import Call
+from advsearch.cluster import Call
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, measured_in
-from advsearch.engine import run_settings
-from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.attack_parts import LOADING, executor_for, is_named
 from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.journal import check_made_of
+from advsearch.engine.journal import answering, check_made_of
+from advsearch.engine.judging import (
+    Metric,
+    check_shared,
+    load_metrics,
+    metrics_as_settings,
+    one_label_for_several,
+    shown,
+)
+from advsearch.engine.judging import only_here as metrics_only_here
 from advsearch.engine.loading import Controls, Scene, load_scene, named_camera, only_here, settings_of
-from advsearch.engine.metrics import Metric, check_shared, load_metrics, metrics_as_settings
-from advsearch.engine.metrics import only_here as metrics_only_here
 from advsearch.engine.naming import (
     AnyModel,
     check_not_of_scene,
     check_not_spread,
+    check_run_settings,
     different,
     exists_here,
+    given_to,
     load_models,
     model_name,
     scene_of,
     several,
 )
-from advsearch.engine.sharing import answering
+from advsearch.engine.sweeps import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
 from advsearch.engine.sweeps.drives import with_frames
-from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
 from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.engine.sweeps.swept_scene import Scenes
@@ -50,13 +57,10 @@ from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, fi
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import attack_of, read_answer
 from advsearch.scene.description import ENVIRONMENT
-from advsearch.scene.parameters import Parameter
+from advsearch.scene.settings import Parameter
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
@@ -105,10 +109,6 @@ def sweep(
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
             truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
-        progress: True shows a bar, False none, None one on a terminal; or told how far it is.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
     if not isinstance(grid, (Mapping, type(None))):
@@ -175,16 +175,7 @@ def sweep(
 def sweep_from_config(
     config: SweepConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> SweepResult:
-    """Do what a configuration describes and keep it in a run directory; see `sweep`.
-
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with: what is stored is not rendered again.
-
-    Raises:
-        InputError: anything that the caller can put right; nothing is written then.
-    """
+    """Do what a configuration describes and keep it in a run directory; see `sweep`."""
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
@@ -196,11 +187,7 @@ def sweep_from_config(
 
 
 def _folder(answer: str | Path | AttackResult | None) -> str | None:
-    """The run of an answer.
-
-    Raises:
-        InputError: the attack was not kept.
-    """
+    """The run of an answer; an InputError where the attack was not kept."""
     if isinstance(answer, AttackResult) and answer.run is None:
         raise InputError("answer_of: expected an attack that was kept, got one that was not; give it a `run`")
     kept = answer.run if isinstance(answer, AttackResult) else answer
@@ -230,7 +217,7 @@ def _beside_answer(
     summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
     if summary.adversarial is None:
         raise InputError(f"answer_of: {folder} ended with {summary.ending!r}, so that there is no answer to sweep")
-    held = run_settings.given_to(theirs, theirs.controls)
+    held = given_to(theirs, theirs.controls)
     varied = {control.name for control in drawn} | {axis.instance for axis in axes}
     if twice := sorted(varied & {control.name for control in held}):
         raise InputError(
@@ -272,11 +259,18 @@ def job_of(config: SweepConfig) -> Job:
     return replace(job, metrics=load_metrics(config.metrics))
 
 
+def scenes_of(config: SweepConfig) -> Scenes:
+    """Return what renders pictures of a sweep again; everything that it names is looked at first."""
+    job = job_of(config)
+    check_all(job)
+    return Scenes(job)
+
+
 def _job(
     config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:
-    run_settings.check(config.model_copy(update={"path": None}))  # where no control travels, one is added
-    drawn, grid = run_settings.given_to(config, controls), config.grid
+    check_run_settings(config.model_copy(update={"path": None}))  # where no control travels, one is added
+    drawn, grid = given_to(config, controls), config.grid
     if config.path is not None:
         drawn, grid = with_frames(config, drawn)
     axes = read_axes(grid, drawn)
@@ -347,9 +341,6 @@ def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tupl
     return load_models(models, task, config)
 
 
-# ---- where it is kept -----------------------------------------------------------------------------------------------
-
-
 def _stopped(config: SweepConfig) -> Path | None:
     """The folder of a sweep of the same settings that was stopped, if `run` names one."""
     if config.run is None or config.overwrite or not is_run(run_path(config.run)):
@@ -366,9 +357,6 @@ def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | Non
         functions = {f"metric {name}": one for name, one in job.metrics.items()}
         check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
         return carry_out(job, run, progress, executor)
-
-
-# ---- who does it ----------------------------------------------------------------------------------------------------
 
 
 def sweep_answers(settings: JsonObject) -> Call:

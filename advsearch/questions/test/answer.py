@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import ClassVar
+from urllib.parse import quote
+from xml.etree import ElementTree
 
 from pydantic import Field
 
+from advsearch import __version__
+from advsearch.config.attack import AttackConfig
+from advsearch.config.scene import SceneConfig
+from advsearch.questions.test.settings import AnyClaim, NoWorseClaim, RightClaim
 from advsearch.report.markup import InNotebook
+from advsearch.report.phrases import percent, with_article
+from advsearch.report.shown import AnswerPart, Claim, Kind, Picture, ShownAnswer
+from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Fields, Interval, JsonFloat, RunResult
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
@@ -80,3 +94,264 @@ def verdict(claims: list[ClaimAnswer]) -> str:
 
 
 RESULT = SuiteResult
+
+
+TABLE_HEADS = ("claim", "answer", "pictures", "why")
+
+NOTE = (
+    "Held and failed are shown at the stated confidence, by an interval that holds however often it is looked at. A "
+    "search that finds nothing is no proof."
+)
+
+TIME_OVER = "the time of the suite was over"
+STOPPED = "it was interrupted"
+NOT_TRIED = "not tried, since a counterexample failed"
+
+
+def shown(result: SuiteResult) -> ShownAnswer:
+    """Return what the suite says, a table of its claims, and what repeats those that are not held."""
+    runs = [one.part for one in result.claims]
+    sections = [AnswerPart("The claims", heads=TABLE_HEADS, rows=table_rows(result), note=NOTE, parts=runs)]
+    for one in result.claims:
+        if one.answer != HELD and one.reason != NOT_TRIED:
+            caption = f"{one.statement}: {one.answer}. {one.reason}."
+            pictures = [[Picture(one.picture, caption)]] if one.picture else []
+            sections.append(AnswerPart(one.name, rows=[["repeat", one.repeat]], pictures=pictures))
+    sections.append(AnswerPart("Expected from now on", result.changes))
+    about = [Path(result.suite).name, result.object, result.model]
+    return ShownAnswer(f"{result.title}. {suite_text(result)}", sections, facts(result), about)
+
+
+def statement(claim: AnyClaim, config: SceneConfig) -> str:
+    """Return what is claimed."""
+    what = f"{short_name(config.object)}, {', '.join(config.controls)}"
+    if isinstance(claim, RightClaim):
+        spanned = "the frames" if "path" in config.controls else "the pictures"
+        share = f"at least {percent(claim.at_least)} of {spanned} that the ranges span"
+        return f"{short_name(config.model)} is right in {share}: {what}"
+    if isinstance(claim, NoWorseClaim):
+        points = f"{number_text(claim.points)} points"
+        models = f"{short_name(config.model)} is right at most {points} less often than {short_name(claim.than)}"
+        return f"{models} on the same pictures of {what}"
+    epsilon = getattr(config, "epsilon", None)
+    within = "" if epsilon is None else f" within {number_text(epsilon) if isinstance(epsilon, float) else epsilon}"
+    return f"no search finds a picture that {short_name(config.model)} gets wrong: {what}{within}"
+
+
+def right_reason(answer: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
+    """Return why a claim about a share is held, failed or undecided, with the interval at all times together. `worst`
+    is what was seen where it was most wrong; empty where it never was."""
+    said = f"right in {right} of {pictures} (interval {interval_text(interval)})" if pictures else "no picture"
+    more = f"; not decided after {count(pictures, 'picture')}" if answer == UNDECIDED else ""
+    return said + more + (f"; {worst}" if worst else "")
+
+
+def difference_reason(answer: str, counts: tuple[int, int, int], interval: tuple[float, float], than: str) -> str:
+    """Return why a claim about two models is held, failed or undecided. The counts are pictures; those in which only
+    the model is right, and those in which only the other one is."""
+    pictures, ours, theirs = counts
+    if not pictures:
+        return "no picture"
+    ends = " to ".join(f"{100.0 * end:+.1f}" for end in interval)
+    said = (
+        f"of {count(pictures, 'picture')} it alone is right in {ours}, {short_name(than)} alone in {theirs} "
+        f"(difference {100.0 * (ours - theirs) / pictures:+.1f} points, interval {ends})"
+    )
+    return said + (f"; not decided after {count(pictures, 'picture')}" if answer == UNDECIDED else "")
+
+
+def search_answer(summary: AttackSummary, config: AttackConfig) -> tuple[str, str]:
+    """Return what a search says of a claim that there is nothing to find, and why."""
+    verified, clean = summary.verified, summary.clean.control
+    if summary.ending == "already wrong":
+        right = "" if clean is None else f": right in {clean.correct} of {clean.trials} trials"
+        return FAILED, f"wrong on the clean scene already{right}"
+    if summary.ending == "found" and verified is not None:
+        label = next(iter(verified.labels), "")
+        called = f", most often {with_article(label)}" if label else ""
+        return FAILED, f"a verified counterexample: wrong in {verified.successes} of {verified.trials} trials{called}"
+    if summary.goes_on:
+        return UNDECIDED, STOPPED
+    if verified is not None and verified.successes:
+        return UNDECIDED, f"its answer is wrong in {verified.successes} of {verified.trials} trials, by noise"
+    asked = config.steps
+    if config.seconds is not None and asked is not None and summary.steps < asked:
+        return UNDECIDED, f"{TIME_OVER} after {summary.steps} of {asked} steps"
+    beside = "" if summary.baseline is None else ", nor by as many random renders"
+    return HELD, f"not broken by {count(summary.steps, 'step')} of {summary.policy}{beside}; this is no proof"
+
+
+def tried_reason(right: int, wrong: int, label: str) -> tuple[str, str]:
+    """Return what trials of a counterexample say, and why."""
+    if not wrong:
+        return HELD, f"right in {right} of {right} trials"
+    said = f"wrong in {wrong} of {right + wrong} trials, {with_article(label)}"
+    return (UNDECIDED, f"{said}: it depends on the noise") if right else (FAILED, said)
+
+
+def table_rows(result: SuiteResult) -> list[list[str]]:
+    """Return a row for each claim, under `TABLE_HEADS`."""
+    return [[one.name, answer_text(one), str(one.pictures or ""), one.reason] for one in result.claims]
+
+
+def answer_text(one: ClaimAnswer) -> str:
+    """Return the answer, with what was expected where that is another one."""
+    if one.expected == HELD:
+        return one.answer
+    return f"{one.answer} ({'as expected' if one.answer == one.expected else f'expected: {one.expected}'})"
+
+
+def suite_text(result: SuiteResult) -> str:
+    """Return what a suite says as a whole, in a sentence."""
+    if result.added is not None:
+        return f"Kept as {result.added}."
+    known = sum(one.answer != HELD and one.accepted for one in result.claims)
+    beside = f", {known} of them as expected" if known else ""
+    return f"{result.answer[:1].upper()}{result.answer[1:]}: {result.brief or 'no claims'}{beside}."
+
+
+def facts(result: SuiteResult) -> dict[str, str]:
+    """Return what it was done with."""
+    return {
+        "model": result.model,
+        "confidence": f"{percent(result.confidence)} for each claim that pictures decide",
+        "pictures": str(sum(one.pictures for one in result.claims)),
+        "seed": str(result.seed),
+        "time": seconds_text(result.seconds["total"]),
+    }
+
+
+def claims(result: SuiteResult) -> Iterator[Claim]:
+    """Yield what the run stands for: what each claim of the suite came to, by its own test."""
+    for one in result.claims:
+        said = f"{one.name}: that {one.statement} is {one.answer}: {one.reason}."
+        if one.kind in ("not_broken", "counterexample"):
+            kind: Kind = "found" if one.answer == FAILED else "not found" if one.answer == HELD else "nothing claimed"
+            yield Claim(kind=kind, statement=said, extent=None)
+        elif one.answer == UNDECIDED:
+            yield Claim(kind="nothing claimed", statement=said, extent=None)
+        else:
+            sure = percent(result.confidence)
+            more = f" The interval is a confidence sequence at {sure}, in place of Clopper-Pearson's."
+            yield Claim(kind="measured", statement=said + more, extent=None)
+
+
+SARIF_SCHEMA = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json"
+
+MEANINGS = {
+    "right": "The model is right in at least a share of the pictures that some controls span.",
+    "not_broken": "No search finds a configuration within a budget that the model gets wrong.",
+    "no_worse": "The model is right at most so many points less often than another one, on the same pictures.",
+    "counterexample": "The model is right on the answer of an earlier search.",
+}
+"""What a claim of each kind says; the rules of SARIF."""
+
+
+def junit(result: SuiteResult) -> str:
+    """Return JUnit XML: a test case for each claim. What failed is a failure, what is undecided an error, and what is
+    so as expected is skipped."""
+    cases = result.claims
+    bad = [one for one in cases if not one.accepted]
+    counts = {
+        "tests": len(cases),
+        "failures": sum(one.answer == FAILED for one in bad),
+        "errors": sum(one.answer == UNDECIDED for one in bad),
+        "skipped": sum(one.accepted and one.answer != HELD for one in cases),
+    }
+    given = {name: str(count) for name, count in counts.items()}
+    time = f"{result.seconds['total']:.3f}"
+    root = ElementTree.Element("testsuites", {"name": "advsearch", **given, "time": time})
+    suite = ElementTree.SubElement(root, "testsuite", {"name": _xml(result.title), **given, "time": time})
+    properties = ElementTree.SubElement(suite, "properties")
+    for name, value in {**facts(result), "run": result.run or ""}.items():
+        ElementTree.SubElement(properties, "property", {"name": name, "value": _xml(value)})
+    for one in cases:
+        case = ElementTree.SubElement(
+            suite,
+            "testcase",
+            {"name": one.name, "classname": _xml(f"{result.title}.{one.kind}"), "time": f"{one.seconds:.3f}"},
+        )
+        if one.answer != HELD:
+            tag = "skipped" if one.accepted else "failure" if one.answer == FAILED else "error"
+            said = ElementTree.SubElement(case, tag, {"message": _xml(f"{one.answer}: {one.reason}")})
+            if tag != "skipped":
+                said.set("type", one.answer)
+            said.text = _xml("\n".join(filter(None, [one.statement, _picture(result, one), one.repeat])))
+        else:
+            ElementTree.SubElement(case, "system-out").text = _xml(f"{one.statement}\n{one.reason}")
+    ElementTree.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def sarif(result: SuiteResult) -> str:
+    """Return SARIF 2.1.0: a rule for each kind of claim, and a result for each claim that is not held, at the suite's
+    file. What is so as expected is `unchanged`, all else `new`."""
+    kinds = list(dict.fromkeys(one.kind for one in result.claims))
+    rules = [
+        {"id": kind, "shortDescription": {"text": MEANINGS[kind]}, "defaultConfiguration": {"level": "error"}}
+        for kind in kinds
+    ]
+    lines = Path(result.suite).read_text("utf-8").splitlines() if Path(result.suite).is_file() else []
+    results = [
+        {
+            "ruleId": one.kind,
+            "ruleIndex": kinds.index(one.kind),
+            "level": "error" if one.answer == FAILED else "warning",
+            "message": {"text": f"{one.name}: {one.answer}: {one.reason}. Claimed: {one.statement}."},
+            "locations": [
+                {
+                    "physicalLocation": {
+                        "artifactLocation": {"uri": quote(result.suite)},
+                        "region": {"startLine": _line_of(one.name, lines)},
+                    }
+                }
+            ],
+            "partialFingerprints": {"claim/v1": one.name},
+            "baselineState": "unchanged" if one.accepted else "new",
+            "properties": {name: value for name, value in _properties(result, one).items() if value},
+        }
+        for one in result.claims
+        if one.answer != HELD
+    ]
+    driver = {"name": "advsearch", "version": __version__, "rules": rules}
+    invocation = {"executionSuccessful": not result.goes_on, "commandLine": result.command_line}
+    run = {"tool": {"driver": driver}, "invocations": [invocation], "results": results}
+    return json.dumps({"$schema": SARIF_SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2, ensure_ascii=False) + "\n"
+
+
+def markdown(result: SuiteResult) -> str:
+    """Return a heading, a table of the claims, and how to repeat what is not held."""
+    lines = [f"### {_plain(result.title)}", "", _plain(suite_text(result)), ""]
+    lines += [_line(TABLE_HEADS), _line(["---"] * len(TABLE_HEADS)), *map(_line, table_rows(result))]
+    lines += ["", ", ".join(f"{name} {_plain(value)}" for name, value in facts(result).items())]
+    again = [one.repeat for one in result.claims if one.answer != HELD and one.repeat]
+    lines += ["", "```sh", *again, "```"] if again else []
+    return "\n".join(lines) + "\n"
+
+
+def _properties(result: SuiteResult, one: ClaimAnswer) -> dict[str, object]:
+    return {"picture": _picture(result, one), "repeat": one.repeat, "pictures": one.pictures}
+
+
+def _picture(result: SuiteResult, one: ClaimAnswer) -> str:
+    return f"{result.run}/{one.picture}" if one.picture else ""
+
+
+def _xml(text: str) -> str:
+    """What XML can hold of a text."""
+    return re.sub(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
+
+
+def _line_of(name: str, lines: Sequence[str]) -> int:
+    """The line of a suite's file, from 1, in which a claim begins; the first for what stands elsewhere."""
+    begins = re.compile(rf"\s+{re.escape(name)}\s*:")
+    return next((number for number, line in enumerate(lines, start=1) if begins.match(line)), 1)
+
+
+def _plain(text: str) -> str:
+    """A text in which Markdown has nothing to read."""
+    return re.sub(r"([\\`*_{}\[\]<>#|])", r"\\\1", " ".join(text.split()))
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(one if one == "---" else _plain(one) for one in cells) + " |"

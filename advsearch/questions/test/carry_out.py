@@ -12,12 +12,21 @@ from pathlib import Path
 
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.attack_parts import check_from_config
-from advsearch.engine.measuring import Results
+from advsearch.engine.record import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.test import words
-from advsearch.questions.test.answer import FAILED, UNDECIDED, ClaimAnswer, SuiteResult, verdict
+from advsearch.questions.test.answer import (
+    FAILED,
+    NOT_TRIED,
+    STOPPED,
+    TIME_OVER,
+    UNDECIDED,
+    ClaimAnswer,
+    SuiteResult,
+    statement,
+    verdict,
+)
 from advsearch.questions.test.claims import Trial
 from advsearch.questions.test.counterexamples import (
     Counterexample,
@@ -40,7 +49,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
-from advsearch.viewer.pages import write_page
+from advsearch.viewer.pages import keep_answer
 
 NOTE = "suite"
 """Under which a run's store keeps the suite with its seed, so that it goes on as it began."""
@@ -59,13 +68,7 @@ class PlannedClaim:
 def test_from_config(
     config: SuiteConfig, *, progress: Progress | None = None, resumed: Path | None = None, suite: Suite | None = None
 ) -> SuiteResult:
-    """Try the claims of the suite that a configuration names; what is decided is not tried again.
-
-    Args:
-        config: what.
-        progress: told how far it is.
-        resumed: folder of the run to go on with.
-        suite: in place of the file's.
+    """Try the claims of the suite that a configuration names, or of another one; what is decided is not tried again.
 
     Raises:
         InputError: the suite names something that is not there, contradicts itself, or could not be judged; nothing is
@@ -105,9 +108,7 @@ def test_from_config(
             remove(added)
             raise InputError(f"add: the answer of {config.add} is not kept: {suite_run.answers[0].reason}")
         result = suite_run.result(ending, time.perf_counter() - begun, added)
-        run.write_summary(result)
-        write_page(run.path, result)
-        return result
+        return keep_answer(run, result)
 
 
 @dataclass
@@ -137,11 +138,11 @@ class _SuiteRun:
                         self.trial.run.write_summary(self.result(INTERRUPTED, seconds, None))  # what a kill leaves
         except KeyboardInterrupt:
             for one in self.planned[len(self.answers) :]:
-                self._add(one, self._not_tried(one, words.STOPPED))
+                self._add(one, self._not_tried(one, STOPPED))
             return INTERRUPTED
-        if any(one.reason == words.NOT_TRIED for one in self.answers):
+        if any(one.reason == NOT_TRIED for one in self.answers):
             self.trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
-        return OUT_OF_TIME if any(words.TIME_OVER in one.reason for one in self.answers) else "done"
+        return OUT_OF_TIME if any(TIME_OVER in one.reason for one in self.answers) else "done"
 
     def _tried(self, one: PlannedClaim, results: Results) -> ClaimAnswer:
         """What a claim says; what is decided, or has used its pictures, is stored."""
@@ -150,23 +151,23 @@ class _SuiteRun:
             return ClaimAnswer.of(stored)
         failed = [known for known in self.answers if known.kind == "counterexample" and not known.accepted]
         if failed and one.one is None and not self.config.all:
-            return self._not_tried(one, words.NOT_TRIED)
+            return self._not_tried(one, NOT_TRIED)
         if self.trial.late():
-            return self._not_tried(one, f"{words.TIME_OVER} before it began")
+            return self._not_tried(one, f"{TIME_OVER} before it began")
         if one.one is None:
             found = self.trial.claim(one.name, self.suite.claims[one.name], one.config)
         else:
             assert isinstance(one.config, AttackConfig)
             found = self.trial.counterexample(one.one, one.config)
-        if words.TIME_OVER not in found.reason and found.reason != words.STOPPED:
+        if TIME_OVER not in found.reason and found.reason != STOPPED:
             results.put(key, found.to_dict())
-        if found.reason == words.STOPPED:
+        if found.reason == STOPPED:
             raise KeyboardInterrupt
         return found
 
     def _not_tried(self, one: PlannedClaim, reason: str) -> ClaimAnswer:
         claim = self.suite.claims.get(one.name)
-        said = "" if claim is None or one.one is not None else words.statement(claim, one.config)
+        said = "" if claim is None or one.one is not None else statement(claim, one.config)
         return ClaimAnswer(name=one.name, kind=one.kind, statement=said, answer=UNDECIDED, reason=reason)
 
     def _add(self, one: PlannedClaim, found: ClaimAnswer) -> None:
@@ -182,7 +183,7 @@ class _SuiteRun:
         changes: list[str] = []
         answers = self.answers
         if self.config.update and ending == "done":
-            now = {one.name: one.answer for one in answers if words.NOT_TRIED not in one.reason}
+            now = {one.name: one.answer for one in answers if NOT_TRIED not in one.reason}
             changes = write_expected(self.config.suite, now)
             answers = [one.model_copy(update={"expected": now.get(one.name, one.expected)}) for one in answers]
         return SuiteResult(
@@ -218,13 +219,11 @@ def _noted(path: Path) -> Suite | None:
 
 
 def _seeded(suite: Suite, config: SuiteConfig) -> Suite:
-    """The suite with the seed that the command says, or a fresh one."""
     seed = secrets.randbelow(2**31) if config.fresh else suite.seed if config.seed is None else config.seed
     return suite.model_copy(update={"seed": seed})
 
 
 def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[PlannedClaim]:
-    """What is tried, counterexamples first."""
     changes = {"model": config.model, "threads": config.threads, "deterministic": config.deterministic or None}
     kept = counterexamples(config.suite) if added is None else [added]
     first = [PlannedClaim(one.name, "counterexample", one.config_for(suite, changes), one) for one in kept]
@@ -247,11 +246,8 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
 
 
 def _check(planned: Sequence[PlannedClaim], suite: Suite) -> None:
-    """Load everything that claims name; a wrong name would end minutes of rendering.
-
-    Raises:
-        InputError: something is not there, contradicts itself, or could not be judged.
-    """
+    """Load everything that claims name, and refuse what could not be judged; a wrong name would end minutes of
+    rendering."""
     known: list[AttackConfig] = []
     for one in planned:
         if one.one is not None:

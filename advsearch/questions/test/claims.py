@@ -19,14 +19,23 @@ from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.attack_parts import executor_for, parts_of, problem_of
-from advsearch.engine.journal import Journal
+from advsearch.engine.journal import Journal, Shared, answering
 from advsearch.engine.problem import Problem
-from advsearch.engine.sharing import Shared, answering
 from advsearch.engine.verifier import ladder_of
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.questions.test import words
-from advsearch.questions.test.answer import FAILED, HELD, UNDECIDED, ClaimAnswer
+from advsearch.questions.test.answer import (
+    FAILED,
+    HELD,
+    TIME_OVER,
+    UNDECIDED,
+    ClaimAnswer,
+    difference_reason,
+    right_reason,
+    search_answer,
+    statement,
+    tried_reason,
+)
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
 from advsearch.questions.test.settings import AnyClaim, DrawnConfig, NoWorseClaim, RightClaim
 from advsearch.report.wording import number_text
@@ -71,7 +80,7 @@ class Trial:
         """Try a claim; what was asked before is read back."""
         begun = time.perf_counter()
         asked = ClaimAnswer(
-            name=name, kind=claim.claim, statement=words.statement(claim, config), answer=UNDECIDED, reason=""
+            name=name, kind=claim.claim, statement=statement(claim, config), answer=UNDECIDED, reason=""
         )
         if isinstance(claim, RightClaim):
             found = self._right(asked, claim, config)
@@ -81,8 +90,6 @@ class Trial:
             assert isinstance(config, AttackConfig)
             found = self._not_broken(asked, config)
         return found.model_copy(update={"seconds": time.perf_counter() - begun})
-
-    # ---- a share ----------------------------------------------------------------------------------------------------
 
     def _right(self, asked: ClaimAnswer, claim: RightClaim, config: SceneConfig) -> ClaimAnswer:
         problem, shared = self._problem(config), self._shared(config)
@@ -108,10 +115,8 @@ class Trial:
             _, query, label = wrong[0]
             worst = f"most wrong where it says {label}: {self._described(problem, query)}"
             picture = self._picture(asked.name, problem, query)
-        reason = words.right_reason(answer, right, sequence.count, sequence.interval, worst)
+        reason = right_reason(answer, right, sequence.count, sequence.interval, worst)
         return self._decided(asked, answer, reason, sequence, config, picture, (0.0, 1.0))
-
-    # ---- two models -------------------------------------------------------------------------------------------------
 
     def _no_worse(self, asked: ClaimAnswer, claim: NoWorseClaim, config: SceneConfig) -> ClaimAnswer:
         problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
@@ -156,11 +161,9 @@ class Trial:
                     break
         low, high = sequence.interval
         counts = (sequence.count, ours, theirs)
-        reason = words.difference_reason(answer, counts, (2 * low - 1, 2 * high - 1), claim.than)
+        reason = difference_reason(answer, counts, (2 * low - 1, 2 * high - 1), claim.than)
         picture = None if first is None else self._picture(asked.name, problem, first)
         return self._decided(asked, answer, reason, sequence, config, picture, (-1.0, 2.0))
-
-    # ---- a search ---------------------------------------------------------------------------------------------------
 
     def _not_broken(self, asked: ClaimAnswer, config: AttackConfig) -> ClaimAnswer:
         seconds = min(self.left(), config.seconds or math.inf)
@@ -175,7 +178,7 @@ class Trial:
         summary = carry_out_part(path, own, self.progress)
         assert isinstance(summary, AttackSummary)
         self.warnings += summary.warnings
-        answer, reason = words.search_answer(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
+        answer, reason = search_answer(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
         shown = "clean" if summary.ending == "already wrong" else "adversarial"
         file = f"{PARTS}/{asked.name}/{IMAGES}/{shown}.png"
         return asked.model_copy(
@@ -187,8 +190,6 @@ class Trial:
                 "part": asked.name,
             }
         )
-
-    # ---- a counterexample -------------------------------------------------------------------------------------------
 
     def counterexample(self, one: Counterexample, config: AttackConfig) -> ClaimAnswer:
         """Try a counterexample: the model should be right on it."""
@@ -219,9 +220,9 @@ class Trial:
                 label, picture = evaluation.said.answer.label, self._picture(one.name, problem, query)
             if 0 < right < tried:
                 break  # it depends on the noise, whatever comes
-        answer, reason = words.tried_reason(right, tried - right, label)
+        answer, reason = tried_reason(right, tried - right, label)
         if tried < count and not 0 < right < tried:
-            answer, reason = UNDECIDED, words.TIME_OVER
+            answer, reason = UNDECIDED, TIME_OVER
         return asked.model_copy(
             update={
                 "answer": answer,
@@ -232,8 +233,6 @@ class Trial:
                 "seconds": time.perf_counter() - begun,
             }
         )
-
-    # ---- parts ------------------------------------------------------------------------------------------------------
 
     def _problem(self, config: SceneConfig) -> Problem:
         whole = AttackConfig.of(config)
@@ -258,7 +257,6 @@ class Trial:
         return 1 if journal.traced.executor is None else AHEAD * (self.workers or 8)
 
     def _picture(self, name: str, problem: Problem, query: Query) -> str:
-        """Render the picture of a query again, and return its file in the run."""
         self.run.save_image(name, problem.picture(query.u, query.seed, query.spp, drawn=query.drawn))
         return f"{IMAGES}/{name}.png"
 
@@ -282,7 +280,7 @@ class Trial:
     ) -> ClaimAnswer:
         """What drawn pictures say; `scale` has the value of a mean of 0, and how much more that of 1 is."""
         if answer == UNDECIDED and self.late():
-            reason = f"{reason}; {words.TIME_OVER}"
+            reason = f"{reason}; {TIME_OVER}"
         begin, wide = scale
         low, high = sequence.interval
         return asked.model_copy(

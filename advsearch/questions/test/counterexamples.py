@@ -23,7 +23,7 @@ from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.attack_parts import parts_in, problem_of_parts
 from advsearch.engine.loading import Scene
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import kept_answer
+from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
 from advsearch.questions.test.answer import ANSWERS, HELD
@@ -93,12 +93,7 @@ class _Block(BaseModel):
         return cls(numbers=numbers, step=step or 1.0, signs=not few and signs, square=square, offsets=packed)
 
     def moved(self) -> Floats:
-        """Return the numbers, (n,) float32.
-
-        Raises:
-            ValueError: they are damaged.
-            LZMAError: likewise.
-        """
+        """Return the numbers, (n,) float32; a ValueError or an LZMAError where they are damaged."""
         size, side = self.numbers // self.square**2, isqrt(self.numbers // 3)
         unpack = lzma.LZMADecompressor(memlimit=MEMORY)
         data = unpack.decompress(base64.b85decode(self.offsets), 2 * size + 1)
@@ -140,7 +135,6 @@ class Counterexample:
     """The answer of a run.
 
     Attributes:
-        name: of its file.
         path: of its file; the picture is beside it.
         config: what it was found with.
         said: what the model said of it.
@@ -255,11 +249,7 @@ def _settings(config: AttackConfig) -> dict[str, Any]:
 
 
 def counterexamples(suite: str) -> list[Counterexample]:
-    """Return those of a suite, by name.
-
-    Raises:
-        FileFormatError: a file is damaged.
-    """
+    """Return those of a suite, by name; a FileFormatError where one is damaged."""
     folder = folder_of(suite)
     return [_read(path) for path in sorted(folder.glob("*.json")) if path.name != EXPECTED]
 
@@ -288,11 +278,8 @@ EXPECTED = "expected.json"
 
 
 def read_expected(suite: str) -> dict[str, str]:
-    """Return what is expected of each claim that is not expected to be held.
-
-    Raises:
-        FileFormatError: the file is damaged.
-    """
+    """Return what is expected of each claim that is not expected to be held; a FileFormatError where the file is
+    damaged."""
     path = folder_of(suite) / EXPECTED
     if not path.is_file():
         return {}

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, resembling
-from advsearch.settings import Clash, Config, as_text, check_once, read_yaml, setting, setting_as_in, shown, split_names
+from advsearch.settings import Clash, Config, each_once, read_yaml, setting, setting_as_in, shown, split_names, texts
 from advsearch.settings.configuration import PLACE
 
 
@@ -86,16 +86,8 @@ class SuiteConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/SUITE-test-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("suite", "only", "add", "model", "junit", "sarif", "markdown", "run", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any, info: Any) -> Any:
-        return as_text(value, several=info.field_name == "only")
-
-    @field_validator("only")
-    @classmethod
-    def _once(cls, value: str | None) -> str | None:
-        check_once(() if value is None else split_names(value), "only")
-        return value
+    _named = texts("suite", "add", "model", "junit", "sarif", "markdown", "run", several=["only"])
+    _different = each_once("only")
 
     @property
     def chosen(self) -> tuple[str, ...]:
@@ -146,14 +138,11 @@ EXPECTED = {
     "settings": "settings with their values, such as `object: mug`",
     "title": "a text of 1 to 200 letters",
 }
-"""What each name of a suite takes."""
 
 A_CLAIM = "a claim such as {claim: right, at_least: 0.9}"
-"""What a name among the claims takes."""
 
 
 NUMBERS = ("at_least", "points", "pictures", "confidence", "seconds", "seed")
-"""Names that take numbers."""
 
 
 class _Described(BaseModel):
@@ -272,20 +261,12 @@ class Suite(_Described):
 
 
 def read_suite(path: str | Path) -> Suite:
-    """Return the suite in a YAML file.
-
-    Raises:
-        FileFormatError: the file is missing or no YAML, or as for `suite_of`.
-    """
+    """Return the suite in a YAML file; a FileFormatError where it is missing or no YAML, or as for `suite_of`."""
     return suite_of(read_yaml(path), str(path))
 
 
 def suite_of(data: Mapping[str, object], where: str) -> Suite:
-    """Return the suite that a mapping describes.
-
-    Args:
-        data: as it stands in a YAML file.
-        where: that file, for messages.
+    """Return the suite that a mapping describes, as it stands in the file `where`.
 
     Raises:
         FileFormatError: something is missing, unknown, or of another kind; one sentence says what.

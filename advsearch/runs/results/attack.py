@@ -250,7 +250,7 @@ class LinearTransport(Fields):
     entries: int | None = Field(default=None, description="of the matrix")
     bytes: int | None = Field(default=None, description="of its memory")
     seconds: float | None = Field(default=None, description="that it and the comparisons took")
-    renewed: int | None = Field(default=None, description="how often it was made anew")
+    renewed: int | None = Field(default=None, description="how often it was made again")
     error: PredictionError | None = Field(default=None, description="of the last comparison")
 
 

@@ -1,6 +1,6 @@
 """What every result is made of: named fields, checked when they are put in, written as JSON and read back.
 
-And what several questions answer with: studies, how derivatives are obtained, how long light paths are.
+And what several questions answer with: studies, how derivatives are obtained, how long light paths are, pictures.
 """
 
 from __future__ import annotations
@@ -90,7 +90,6 @@ class Result(Fields):
     command: ClassVar[str]
 
     def to_dict(self) -> JsonObject:
-        """Return `schema`, `command` and the fields as JSON values; NaN and infinity are None."""
         return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
 
     def facts(self) -> dict[str, str]:
@@ -294,3 +293,46 @@ class CosineRow(Fields):
     converged: JsonFloat = Field(description="smallest cosine of two converged gradients")
     seconds: float = Field(description="of one working gradient, median")
     status: GradientStatus = Field(description="whether it is good enough to search by")
+
+
+class ClassAnswer(Fields):
+    """One answer to a picture."""
+
+    label: str = Field(description="in words")
+    index: int | None = Field(description="its number among the model's classes; null where there are none")
+    probability: float | None = Field(description="null where the model gives none")
+
+
+class ViewAnswers(Fields):
+    """What the model says of one view."""
+
+    azimuth: float = Field(description="of the camera, degrees")
+    answers: list[ClassAnswer] = Field(description="the likeliest first")
+
+
+class MeshUp(Fields):
+    """The axis of a mesh file that was taken for up, and why."""
+
+    axis: str
+    reason: str
+
+
+class RenderResult(Result):
+    """A picture of a scene, and what the model says of it."""
+
+    command: ClassVar[str] = "render"
+
+    out: str = Field(description="the file that was written")
+    answered: str | None = Field(
+        default=None, description="that with boxes and masks drawn in; absent where the task draws none"
+    )
+    size: tuple[int, int] = Field(description="of the file, [height, width] in pixels")
+    object: str
+    environment: str
+    model: str
+    task: str = Field(description="what judges the answers")
+    spp: int = Field(description="samples a pixel")
+    image_formation: Formation
+    up: MeshUp | None = Field(description="null for an object without a mesh file")
+    views: list[ViewAnswers]
+    warnings: list[str] = Field(description="sentences that a reader has to know")

@@ -191,7 +191,7 @@ class SweepSummary(CountedAnswers, RunResult):
     )
     beside: BesideAnswer | None = Field(
         default=None,
-        description="the clean scene beside [an answer](#an-answer-beside-the-clean-scene); absent without",
+        description="the clean scene beside [an answer](sweeps.md#an-answer-beside-the-clean-scene); absent without",
     )
     worst: WorstConfiguration | None
     drives: list[DriveRates] | None = Field(
@@ -217,7 +217,8 @@ class SweepSummary(CountedAnswers, RunResult):
     )
     surface: SurfaceMap | None = Field(
         default=None,
-        description="which parts of the [surface](#the-surface), when seen, go with wrong answers; absent unless asked",
+        description="which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong answers; absent "
+        "unless asked",
     )
     shared: SharedWork | None = Field(
         default=None, description="how [workers](cluster.md) did that shared the work; absent without"

@@ -10,17 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Mesh
-from advsearch.scene.importing.imported_part import ImportedPart
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from advsearch.scene.assets import Bools, Doubles, Ints, Mesh
+from advsearch.scene.importing.parts import ImportedPart
 
 WELD = 1e-6
 """Points closer than this share of the largest extent are one point; text and 32-bit files round to about that."""
@@ -49,12 +44,12 @@ class Soup:
         flat: (F,) the faces that are flat where they have no normals; None where none are.
     """
 
-    points: Array
+    points: Doubles
     faces: Ints
     part: Ints
-    normals: Array
-    uvs: Array
-    colors: Array
+    normals: Doubles
+    uvs: Doubles
+    colors: Doubles
     flat: Bools | None = None
 
     def only(self, keep: Bools) -> Soup:
@@ -76,7 +71,7 @@ class Soup:
             colors=self.colors[rows, order],
         )
 
-    def face_vectors(self) -> Array:
+    def face_vectors(self) -> Doubles:
         """Return (F, 3) vectors along the face normals, as long as twice the faces' areas."""
         a, b, c = (self.points[self.faces[:, k]] for k in range(3))
         return np.cross(b - a, c - a)
@@ -176,7 +171,8 @@ def _wound(soup: Soup) -> tuple[Soup, list[str]]:
     if twisted:
         notes.append("has a one-sided surface (a Moebius strip), so some faces show their backs")
     soup = soup.reversed(turn)
-    inside_out = _inside_out(soup, shell, _closed(soup.faces, shell))
+    paired = np.bincount(shell[neighbours(soup.faces)[0] // 3], minlength=int(shell.max()) + 1) * 2
+    inside_out = _inside_out(soup, shell, np.equal(paired, 3 * np.bincount(shell)))
     if inside_out.any():
         notes.append(f"{int(inside_out[shell].sum())} faces were inside out and have been turned over")
     return soup.reversed(inside_out[shell]), notes
@@ -197,7 +193,7 @@ def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
     return left, right, start[left] == start[right]
 
 
-def _agreement(area: Array, left: Ints, right: Ints, same_way: Bools) -> tuple[Bools, Ints, bool]:
+def _agreement(area: Doubles, left: Ints, right: Ints, same_way: Bools) -> tuple[Bools, Ints, bool]:
     """Decide which faces to turn over so that neighbours agree, keeping the way of most of each shell's area.
 
     Every face stands for two nodes of a graph, "as it is" and "turned"; neighbours that agree are linked like to like,
@@ -217,23 +213,17 @@ def _agreement(area: Array, left: Ints, right: Ints, same_way: Bools) -> tuple[B
     return turn, shell.astype(np.int64), bool((kept == turned).any())
 
 
-def _closed(faces: Ints, shell: Ints) -> Bools:
-    """Return, for each shell, whether all its edges belong to exactly two faces of it."""
-    left, _, _ = neighbours(faces)
-    paired = np.bincount(shell[left // 3], minlength=int(shell.max()) + 1) * 2
-    return np.equal(paired, 3 * np.bincount(shell))
-
-
 def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
     """Return, for each shell, whether it must be turned over.
 
-    A closed shell must when its signed volume is negative, unless it lies within another closed shell (then it is the
-    wall of a hollow) and the file's normals do not object. An open sheet must when the file's normals point away from
-    its front.
+    A closed shell, all of whose edges belong to exactly two faces of it, must when its signed volume is negative,
+    unless it lies within another closed shell (then it is the wall of a hollow) and the file's normals do not object.
+    An open sheet must when the file's normals point away from its front.
     """
     count, vectors = len(closed), soup.face_vectors()
     corners = soup.points[soup.faces]
-    middle = _per_shell(corners.mean(axis=1), shell) / np.bincount(shell)[:, None]
+    sums = [np.bincount(shell, weights=one) for one in corners.mean(axis=1).T]
+    middle = np.stack(sums, axis=1) / np.bincount(shell)[:, None]
     volume = np.bincount(shell, weights=((corners[:, 0] - middle[shell]) * vectors).sum(axis=1), minlength=count)
     toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
     agreement = np.bincount(shell, weights=toward, minlength=count)  # with the file's normals; 0 where it has none
@@ -246,11 +236,6 @@ def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
         around = closed & (low < low[number]).all(axis=1) & (high > high[number]).all(axis=1)
         negative[number] = not around.any() or (agreement[number] > 0.0 if mostly else agreement[number] < 0.0)
     return np.where(closed, negative ^ mostly, agreement < 0.0)
-
-
-def _per_shell(values: Array, shell: Ints) -> Array:
-    """Sum (F, 3) values over the faces of each shell."""
-    return np.stack([np.bincount(shell, weights=values[:, k]) for k in range(3)], axis=1)
 
 
 # --- normals ----------------------------------------
@@ -280,7 +265,7 @@ def _shaded(soup: Soup) -> tuple[Soup, list[str]]:
     return replace(soup, normals=normals), notes
 
 
-def smooth_normals(soup: Soup) -> Array:
+def smooth_normals(soup: Soup) -> Doubles:
     """Compute corner normals, smooth except across creases.
 
     At each point, the faces that can be reached from one another over edges with less than the crease angle share one
@@ -298,9 +283,9 @@ def smooth_normals(soup: Soup) -> Array:
     group = connected(soup.faces.size, a, b)
     corners = soup.points[soup.faces]
     ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-    angles: Array = np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2))
+    angles: Doubles = np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2))
     weighted = unit[:, None] * angles[:, :, None]
-    sums: Array = np.stack([np.bincount(group, weighted[:, :, k].ravel()) for k in range(3)], axis=1)
+    sums: Doubles = np.stack([np.bincount(group, weighted[:, :, k].ravel()) for k in range(3)], axis=1)
     smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
     sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0  # NaN, where normals cancel, is not
     return np.where(sound, smooth, unit[:, None])
@@ -309,7 +294,7 @@ def smooth_normals(soup: Soup) -> Array:
 # --- small pieces ----------------------------------------
 
 
-def _welded(points: Array) -> tuple[Array, Ints]:
+def _welded(points: Doubles) -> tuple[Doubles, Ints]:
     """Merge points closer than `WELD`; return the merged points, and for each old point its new index."""
     unique, index = np.unique(points + 0.0, axis=0, return_inverse=True)
     pairs = cKDTree(unique).query_pairs(WELD, output_type="ndarray")
@@ -320,12 +305,12 @@ def _welded(points: Array) -> tuple[Array, Ints]:
     return unique[first], merged[index.reshape(-1)].astype(np.int64)
 
 
-def _corners(values: Array | None, faces: Ints, width: int) -> Array:
+def _corners(values: Doubles | None, faces: Ints, width: int) -> Doubles:
     """Spread per-vertex values to the corners of faces; NaN where there are none."""
     return np.full((len(faces), 3, width), np.nan) if values is None else values[faces]
 
 
-def unit_vectors(vectors: Array) -> Array:
+def unit_vectors(vectors: Doubles) -> Doubles:
     """Scale vectors, along the last axis, to unit length; NaN where they have no direction."""
     with np.errstate(all="ignore"):
         largest = np.abs(vectors).max(axis=-1, keepdims=True)

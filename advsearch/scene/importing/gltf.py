@@ -1,4 +1,8 @@
-"""glTF files: the header, read strictly and held to limits, and the numbers in their buffers."""
+"""glTF files: the header, read strictly and held to limits, and the numbers in their buffers.
+
+And what a file has and a scene of ours has not, in sentences: nothing is dropped in silence. Each of them begins with
+the name of the file, which the caller puts before it.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +10,30 @@ import base64
 import binascii
 import json
 import struct
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
-from advsearch.scene.importing.files import References, check_faces, damaged, looks_like, plain_name, shown, text_of
-from advsearch.scene.importing.gltf_entries import Asset, Header, Primitive
+from advsearch.scene.assets import Doubles, Ints
+from advsearch.scene.importing.files import (
+    Inventory,
+    References,
+    check_faces,
+    damaged,
+    looks_like,
+    plain_name,
+    shown,
+    text_of,
+)
+from advsearch.scene.importing.gltf_entries import CUT_OUTS, Asset, Header, Primitive, TextureUse
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
@@ -57,8 +72,10 @@ def read_header(path: Path, data: bytes) -> Header:
         if isinstance(entry, list):
             level.extend(entry)
         elif isinstance(entry, dict):
-            held = entry.get("extensions")
-            found.update(held if isinstance(held, dict) else ())
+            held = entry.get("extensions") or {}
+            if not isinstance(held, dict) or not all(isinstance(held.get(name) or {}, dict) for name in READ):
+                raise damaged(path, "glTF whose extensions are objects", shown(json.dumps(held)))
+            found.update(held)
             level.extend(value for key, value in entry.items() if key != "extras")
     header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *found})})
     check_header(path, header)
@@ -131,27 +148,9 @@ def check_header(path: Path, header: Header) -> None:
     if needed:
         names = shown(", ".join(needed), quoted=False)
         raise FileFormatError(f"{path}: needs {names}, which is not supported; export it without that option")
-    for view in header.bufferViews:
-        _check_index(path, "buffers", view.buffer, header.buffers)
-    for accessor in header.accessors:
-        _check_index(path, "bufferViews", accessor.bufferView, header.bufferViews)
-        if accessor.sparse is not None:
-            _check_index(path, "bufferViews", accessor.sparse.indices.bufferView, header.bufferViews)
-            _check_index(path, "bufferViews", accessor.sparse.values.bufferView, header.bufferViews)
-    for texture in header.textures:
-        _check_index(path, "images", texture.image, header.images)
-        _check_index(path, "samplers", texture.sampler, header.samplers)
-    for image in header.images:
-        _check_index(path, "bufferViews", image.bufferView, header.bufferViews)
-    for material in header.materials:
-        surface = material.surface
-        for use in (
-            surface.baseColorTexture,
-            surface.metallicRoughnessTexture,
-            material.normalTexture,
-            material.emissiveTexture,
-        ):
-            _check_index(path, "textures", None if use is None else use.index, header.textures)
+    for kind, index, entries in _references(header):
+        if index is not None and index >= len(entries):
+            raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{len(entries)}")
     sizes = (sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
     if max(sizes) > files.scaled(LARGEST_VALUES):
         most = f"geometry and pictures of at most {files.scaled(LARGEST_VALUES):,} bytes"
@@ -162,16 +161,37 @@ def check_header(path: Path, header: Header) -> None:
     _check_tree(path, header)
 
 
-def _check_index(path: Path, kind: str, index: int | None, entries: list[Any]) -> None:
-    if index is not None and index >= len(entries):
-        raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{len(entries)}")
+def _references(header: Header) -> Iterator[tuple[str, int | None, Sequence[object]]]:
+    """Yield every number by which the header refers to another entry: the kind, the number and what there is."""
+    for view in header.bufferViews:
+        yield "buffers", view.buffer, header.buffers
+    sparse = [part for one in header.accessors if one.sparse for part in (one.sparse.indices, one.sparse.values)]
+    for held in (*header.accessors, *sparse, *header.images):
+        yield "bufferViews", held.bufferView, header.bufferViews
+    for texture in header.textures:
+        yield "images", texture.image, header.images
+        yield "samplers", texture.sampler, header.samplers
+    for one in header.materials:
+        for use in (*vars(one.surface).values(), one.normalTexture, one.emissiveTexture):
+            if isinstance(use, TextureUse):
+                yield "textures", use.index, header.textures
+    for primitive in (primitive for mesh in header.meshes for primitive in mesh.primitives):
+        for index in (*primitive.attributes.values(), primitive.indices):
+            yield "accessors", index, header.accessors
+        yield "materials", primitive.material, header.materials
+    for node in header.nodes:
+        yield "meshes", node.mesh, header.meshes
+        yield "cameras", node.camera, header.cameras
+        yield "lights", node.lamp, header.lights
+    for child in (child for one in header.nodes for child in one.children):
+        yield "nodes", child, header.nodes
+    for child in (root for scene in header.scenes for root in scene.nodes):
+        yield "nodes", child, header.nodes
+    yield "scenes", header.scene, header.scenes
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     """Refuse attributes that are not what their names say, or of different lengths."""
-    for index in (*primitive.attributes.values(), primitive.indices):
-        _check_index(path, "accessors", index, header.accessors)
-    _check_index(path, "materials", primitive.material, header.materials)
     held = {name: header.accessors[index] for name, index in primitive.attributes.items()}
     coordinates = "TEXCOORD_0" if primitive.material is None else header.materials[primitive.material].attribute
     kinds_of = {"POSITION": ("VEC3",), "NORMAL": ("VEC3",), "COLOR_0": ("VEC3", "VEC4"), coordinates: ("VEC2",)}
@@ -198,21 +218,13 @@ def _triangles(header: Header, primitive: Primitive) -> int:
 
 def _check_tree(path: Path, header: Header) -> None:
     """Check that the nodes form trees, as glTF demands, and neither too large nor too deep ones."""
-    for scene in header.scenes:
-        for root in scene.nodes:
-            _check_index(path, "nodes", root, header.nodes)
-    _check_index(path, "scenes", header.scene, header.scenes)
     parents: set[int] = set()
     triangles = [sum(_triangles(header, primitive) for primitive in mesh.primitives) for mesh in header.meshes]
     pieces, drawn = 0, 0
     for node in header.nodes:
-        _check_index(path, "meshes", node.mesh, header.meshes)
-        _check_index(path, "cameras", node.camera, header.cameras)
-        _check_index(path, "lights", node.lamp, header.lights)
         if node.mesh is not None:
             pieces, drawn = pieces + len(header.meshes[node.mesh].primitives), drawn + triangles[node.mesh]
         for child in node.children:
-            _check_index(path, "nodes", child, header.nodes)
             if child in parents:
                 raise damaged(path, "nodes with one parent each", f"two for node {child}")
             parents.add(child)
@@ -231,8 +243,6 @@ def _check_tree(path: Path, header: Header) -> None:
     if reached < len(header.nodes):
         raise damaged(path, "nodes that form trees", "a cycle")
 
-
-Array = npt.NDArray[np.float64]
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 
@@ -334,10 +344,150 @@ class Buffers:
         found: npt.NDArray[Any] = np.ndarray(shape, kind, data, offset, (step, kind.itemsize))
         return found
 
-    def numbers(self, index: int, rows: npt.NDArray[np.int64]) -> Array:
+    def numbers(self, index: int, rows: Ints) -> Doubles:
         """Return rows (N,) of an accessor as (N, width), normalised integers as the numbers that they stand for."""
         values = self.values(index)[rows]
-        numbers: Array = values.astype(np.float64)
+        numbers: Doubles = values.astype(np.float64)
         if not self._header.accessors[index].normalized or values.dtype.kind == "f":
             return numbers
         return np.asarray(numbers / np.iinfo(values.dtype).max).clip(-1.0)
+
+
+_OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
+
+EXTENSIONS = {
+    "EXT_mesh_gpu_instancing": " repeats meshes with {name}; each is there once",
+    "KHR_materials_diffuse_transmission": _OPAQUE,
+    "KHR_materials_pbrSpecularGlossiness": " has {name}, of which only diffuse colour and glossiness are read",
+    "KHR_materials_transmission": _OPAQUE,
+    "KHR_materials_unlit": " has surfaces that keep their colour in any light ({name}); here they are lit as others",
+    "KHR_materials_variants": " has variants of its materials ({name}); those that it shows by itself are taken",
+}
+"""What becomes of a file with an extension; of all that are not named here, nor understood, `UNKNOWN`."""
+
+UNKNOWN = " uses {name}, which is not understood and left out"
+
+FAR = 1000.0
+"""Distance of a directional light, in object sizes."""
+
+
+def left_out(header: Header) -> Iterator[str]:
+    """Yield what the file has that is not carried over, whether one node or all of it is the object."""
+    used = {*header.extensionsUsed, *header.extensionsRequired}
+    for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
+        yield EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False))
+    drawn = in_the_scene(header)
+    absent = sum(node.mesh is not None for index, node in enumerate(header.nodes) if index not in drawn)
+    found = {
+        "occlusion map{s}: left out": sum(one.occlusionTexture is not None for one in header.materials),
+        "mesh{es} with morph targets, which are left out": sum(
+            any(primitive.targets for primitive in mesh.primitives) for mesh in header.meshes
+        ),
+        "normal map{s} with other texture coordinates than the base colour: left out": sum(
+            not one.reads(one.normalTexture) for one in header.materials
+        ),
+        "emission texture{s} with other coordinates than the base colour: left out, with the emission": sum(
+            any(one.emission) and not one.reads(one.emissiveTexture) for one in header.materials
+        ),
+        "material{s} with an alphaMode that glTF does not have: opaque": sum(
+            one.alphaMode not in ("OPAQUE", *CUT_OUTS) for one in header.materials
+        ),
+        "skin{s}: what is bound to bones stays as it was drawn": _length(header.skins),
+        "animation{s}: left out": _length(header.animations),
+        "further scene{s}: left out": max(0, len(header.scenes) - 1),
+        "node{s} with a mesh outside of its scene: left out": absent,
+    }
+    for what, count in found.items():
+        if count:
+            yield f": {counted(count, what)}"
+    yield from (f": {clause}" for clause in _unread(header))
+
+
+WORDS = {
+    "Header": "entry",
+    "MaterialEntry": "entry of a material",
+    "MetallicRoughness": "entry of a material",
+    "TextureUse": "entry of a material's texture",
+    "NormalUse": "entry of a material's texture",
+    "MeshEntry": "entry of a mesh",
+    "Primitive": "entry of a primitive",
+    "Node": "entry of a node",
+    "Sampler": "entry of a sampler",
+    "Texture": "entry of a texture",
+    "Image": "entry of an image",
+    "LightEntry": "entry of a light",
+}
+"""What is left out of entries whose contents are seen."""
+
+PLAIN = frozenset(("name", "weights", "skin", "extensions"))
+"""Keys without a field that make no difference, or are named with what they belong to."""
+
+
+def _unread(header: Header) -> Iterator[str]:
+    """Yield a clause for every key, extras of materials among them, and every attribute that is not read."""
+    found = Inventory()
+    level: list[object] = [header]
+    for entry in level:  # which grows
+        if isinstance(entry, list):
+            level.extend(one for one in entry if isinstance(one, BaseModel))
+        elif isinstance(entry, BaseModel):
+            kind = WORDS.get(type(entry).__name__)
+            for key in (entry.model_extra or {}) if kind else ():
+                found.has(str(kind), key)
+            level.extend(getattr(entry, name) for name in type(entry).model_fields)
+    for kind in set(WORDS.values()):
+        for key in PLAIN if "material" in kind or "texture" in kind else {*PLAIN, "extras"}:  # notes of applications
+            found.take(kind, key)
+    for mesh in header.meshes:
+        for primitive in mesh.primitives:
+            material = None if primitive.material is None else header.materials[primitive.material]
+            read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0", material.attribute if material else ""}
+            for name in primitive.attributes:
+                if name not in read and not (header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))):
+                    found.has("attribute", name)
+    return found.left()
+
+
+def beside(header: Header) -> str | None:
+    """Return what a file read as one object leaves out of its scene; None if nothing."""
+    lights = sum(node.lamp is not None for node in header.nodes)
+    cameras = sum(node.camera is not None for node in header.nodes)
+    found = [counted(count, what) for count, what in ((lights, "light{s}"), (cameras, "camera{s}")) if count]
+    if not found:
+        return None
+    verb = "is" if lights + cameras == 1 else "are"
+    what_to_do = "name one node as the object, FILE#NODE, to keep the rest around it"
+    return f": {' and '.join(found)} {verb} left out of the object; {what_to_do}"
+
+
+def lights_and_cameras(header: Header) -> Iterator[str]:
+    """Yield what becomes of lights and cameras that are not what they are in the file."""
+    distant = [light.type == "directional" for light in header.lights]
+    found = {
+        f"directional light{{s}}, here as lamps {FAR:g} object sizes away": sum(distant),
+        "light{s} with a range, which is left out: light reaches beyond it": sum(
+            light.range is not None for light in header.lights
+        ),
+        "camera{s} without perspective: left out": sum(one.perspective is None for one in header.cameras),
+    }
+    yield from (f": {counted(count, what)}" for what, count in found.items() if count)
+
+
+def counted(count: int, what: str) -> str:
+    return f"{count} {what.format(s='' if count == 1 else 's', es='' if count == 1 else 'es')}"
+
+
+def _length(entries: object) -> int:
+    return len(entries) if isinstance(entries, list) else 0
+
+
+def in_the_scene(header: Header) -> set[int]:
+    """The nodes of the scene that is read."""
+    if not header.scenes:
+        return set(range(len(header.nodes)))
+    found: set[int] = set()
+    level = list(header.scenes[header.scene or 0].nodes)
+    while level:
+        found.update(level)
+        level = [child for index in level for child in header.nodes[index].children]
+    return found

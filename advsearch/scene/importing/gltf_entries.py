@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, FailFast, Field, JsonValue
+from pydantic import AliasPath, BaseModel, ConfigDict, FailFast, Field, JsonValue
 
 T = TypeVar("T")
 
@@ -27,10 +27,9 @@ class _Entry(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False, frozen=True)
 
 
-class _Extensions(BaseModel):
-    """Extensions of an entry; those that are not understood are named by `gltf_notes`."""
-
-    model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False, frozen=True)
+def _extension(*path: str, default: Any = None) -> Any:
+    """A field that an extension of the entry holds; those that are not understood are named by `gltf.left_out`."""
+    return Field(default=default, validation_alias=AliasPath("extensions", *path))
 
 
 class Asset(_Entry):
@@ -100,30 +99,17 @@ class MeshEntry(_Entry):
     name: str | None = None
 
 
-class _LightUse(_Entry):
-    light: Index
-
-
-class _NodeExtensions(_Extensions):
-    punctual: _LightUse | None = Field(default=None, alias="KHR_lights_punctual")
-
-
 class Node(_Entry):
     children: List[Index] = []
     mesh: Index | None = None
     camera: Index | None = None
-    extensions: _NodeExtensions | None = None
+    lamp: Index | None = _extension("KHR_lights_punctual", "light")
+    """Number of the light that the node carries."""
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
     scale: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     name: str | None = None
-
-    @property
-    def lamp(self) -> int | None:
-        """Number of the light that the node carries."""
-        carried = self.extensions.punctual if self.extensions else None
-        return None if carried is None else carried.light
 
 
 class SceneEntry(_Entry):
@@ -159,14 +145,6 @@ class LightEntry(_Entry):
     name: str | None = None
 
 
-class _Lights(_Entry):
-    lights: List[LightEntry] = []
-
-
-class _FileExtensions(_Extensions):
-    punctual: _Lights | None = Field(default=None, alias="KHR_lights_punctual")
-
-
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 Map = Annotated[int, Field(ge=0, lt=256)]
 
@@ -180,23 +158,11 @@ class TextureTransform(_Entry):
     texCoord: Map | None = None
 
 
-UNMOVED = TextureTransform()
-
-
-class _TextureUseExtensions(_Extensions):
-    transform: TextureTransform | None = Field(default=None, alias="KHR_texture_transform")
-
-
 class TextureUse(_Entry):
     index: Index
     texCoord: Map = 0
-    extensions: _TextureUseExtensions | None = None
-
-    @property
-    def transform(self) -> TextureTransform:
-        """What is done to the texture coordinates before it is looked up."""
-        given = self.extensions.transform if self.extensions else None
-        return given or UNMOVED
+    transform: TextureTransform = _extension("KHR_texture_transform", default=TextureTransform())
+    """What is done to the texture coordinates before it is looked up."""
 
     @property
     def attribute(self) -> str:
@@ -206,12 +172,10 @@ class TextureUse(_Entry):
 
     def looked_up_as(self, other: TextureUse) -> bool:
         """Whether another texture is looked up at the same places."""
-        ours, theirs = self.transform, other.transform
-        return self.attribute == other.attribute and (ours.offset, ours.rotation, ours.scale) == (
-            theirs.offset,
-            theirs.rotation,
-            theirs.scale,
+        ours, theirs = (
+            (one.attribute, one.transform.offset, one.transform.rotation, one.transform.scale) for one in (self, other)
         )
+        return ours == theirs
 
 
 class NormalUse(TextureUse):
@@ -235,15 +199,6 @@ class SpecularGlossiness(_Entry):
     glossinessFactor: float = 1.0
 
 
-class EmissiveStrength(_Entry):
-    emissiveStrength: Annotated[float, Field(ge=0.0)] = 1.0
-
-
-class _MaterialExtensions(_Extensions):
-    strength: EmissiveStrength | None = Field(default=None, alias="KHR_materials_emissive_strength")
-    glossiness: SpecularGlossiness | None = Field(default=None, alias="KHR_materials_pbrSpecularGlossiness")
-
-
 CUT_OUTS = ("MASK", "BLEND")
 """Modes in which the alpha of the base colour counts."""
 CUTOFF = 0.5
@@ -260,13 +215,16 @@ class MaterialEntry(_Entry):
     alphaCutoff: float = CUTOFF
     doubleSided: Unread = None
     occlusionTexture: Unread = None
-    extensions: _MaterialExtensions | None = None
+    strength: Annotated[float, Field(ge=0.0)] = _extension(
+        "KHR_materials_emissive_strength", "emissiveStrength", default=1.0
+    )
+    glossiness: SpecularGlossiness | None = _extension("KHR_materials_pbrSpecularGlossiness")
 
     @property
     def surface(self) -> MetallicRoughness:
         """Its base colour, roughness and metallic: the format's where it says none, and those of an old extension,
         whose diffuse colour is the base colour."""
-        old = self.extensions.glossiness if self.extensions else None
+        old = self.glossiness
         if old is None:
             return self.pbrMetallicRoughness or MetallicRoughness()
         return MetallicRoughness(
@@ -299,16 +257,7 @@ class MaterialEntry(_Entry):
     @property
     def emission(self) -> list[float]:
         """(3,) linear radiance, where there is a texture that times its colour."""
-        given = self.extensions.strength if self.extensions else None
-        return [one * (1.0 if given is None else given.emissiveStrength) for one in self.emissiveFactor]
-
-
-class _WebpSource(_Entry):
-    source: Index | None = None
-
-
-class _TextureExtensions(_Extensions):
-    webp: _WebpSource | None = Field(default=None, alias="EXT_texture_webp")
+        return [one * self.strength for one in self.emissiveFactor]
 
 
 REPEAT, MIRRORED, CLAMPED = 10497, 33648, 33071
@@ -327,13 +276,12 @@ class Sampler(_Entry):
 class Texture(_Entry):
     source: Index | None = None
     sampler: Index | None = None
-    extensions: _TextureExtensions | None = None
+    webp: Index | None = _extension("EXT_texture_webp", "source")
 
     @property
     def image(self) -> int | None:
         """Number of its picture; None where only an extension that is not understood has one."""
-        webp = self.extensions.webp if self.extensions else None
-        return self.source if webp is None or webp.source is None else webp.source
+        return self.source if self.webp is None else self.webp
 
 
 class Image(_Entry):
@@ -360,15 +308,10 @@ class Header(_Entry):
     cameras: List[CameraEntry] = []
     skins: Unread = None
     animations: Unread = None
-    extensions: _FileExtensions | None = None
+    lights: List[LightEntry] = _extension("KHR_lights_punctual", "lights", default=[])
+    """The lights that nodes may carry."""
     extensionsUsed: List[str] = []
     extensionsRequired: List[str] = []
-
-    @property
-    def lights(self) -> list[LightEntry]:
-        """The lights that nodes may carry."""
-        found = self.extensions.punctual if self.extensions else None
-        return [] if found is None else found.lights
 
     def label(self, index: int) -> str:
         """Return what a node is called: by its name, its mesh's, or its number."""

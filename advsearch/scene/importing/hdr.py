@@ -23,6 +23,7 @@ import OpenEXR
 from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.pictures import LARGEST_PIXELS, check_pixels
+from advsearch.scene.assets import Floats
 from advsearch.scene.importing.files import damaged, looks_like, shown
 
 Plane = npt.NDArray[np.floating]
@@ -200,7 +201,6 @@ def _displayed(header: Mapping[str, Any], planes: Planes, notes: list[str]) -> P
     return found[0], found[1], found[2]
 
 
-Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
 _RESOLUTION = re.compile(rb"([-+])([YX]) +(\d{1,6}) +([-+])([YX]) +(\d{1,6})\r?\n")

@@ -10,9 +10,9 @@ import re
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float32]
+from advsearch.scene.assets import Doubles, Floats
+
 Pair = tuple[float, float]
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -151,7 +151,7 @@ def color_of(rest: str) -> Floats | None:
     return color
 
 
-def radiance_of(rest: str) -> npt.NDArray[np.float64] | None:
+def radiance_of(rest: str) -> Doubles | None:
     """Return one or three numbers of at least 0 as a colour (3,), black where there are none; None for other words."""
     values = numbers_of(rest or "0")
     return np.broadcast_to(values, (3,)) if values is not None and len(values) in (1, 3) and min(values) >= 0 else None

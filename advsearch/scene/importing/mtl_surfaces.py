@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from advsearch.scene.assets import Floats
 from advsearch.scene.importing.files import Inventory, References, plain_name, shown, text_of
 from advsearch.scene.importing.mtl import (
     MapUse,
@@ -22,11 +22,15 @@ from advsearch.scene.importing.mtl import (
     share_of,
     without_comment,
 )
-from advsearch.scene.importing.normal_maps import holds_normals, normal_map
+from advsearch.scene.importing.parts import (
+    NEUTRAL,
+    ImportedSurface,
+    holds_normals,
+    limited_radiance,
+    normal_map,
+    with_opacity,
+)
 from advsearch.scene.importing.pictures import Kind, Pictures
-from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface, limited_radiance, with_opacity
-
-Floats = npt.NDArray[np.float32]
 
 STATEMENT = "material statement"
 READ = frozenset("kd ke d tr pr pm map_kd map_ke map_d map_pr map_pm norm map_kn map_bump bump illum".split())

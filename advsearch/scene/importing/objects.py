@@ -1,11 +1,13 @@
 """Objects from mesh files: ``--object path.obj`` and the other endings of `advsearch.files.MESHES`.
 
 A file is a list of parts: one piece of geometry with one surface each, in the file's own coordinates. The formats have
-readers of our own: those that there are drop without a word what they do not know.
+readers of our own: those that there are drop without a word what they do not know. That of STL is here.
 """
 
 from __future__ import annotations
 
+import re
+import struct
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,21 +20,112 @@ import numpy.typing as npt
 from PIL import Image
 from scipy.spatial import ConvexHull, QhullError
 
-from advsearch.errors import InputError
+from advsearch.errors import FileFormatError, InputError
 from advsearch.files import MESHES
 from advsearch.pictures import without_pillows_limit
-from advsearch.scene.assets import Material, Mesh, ObjectAsset, UpAxis, normalised
-from advsearch.scene.importing import gltf, gltf_notes
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.importing import gltf
 from advsearch.scene.importing.blender import read_mesh_bytes
-from advsearch.scene.importing.files import safe_name, shown
+from advsearch.scene.importing.files import Inventory, check_faces, damaged, looks_like, safe_name, shown, text_of
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
 from advsearch.scene.importing.gltf_parts import read_gltf
-from advsearch.scene.importing.imported_part import ImportedPart, visible
+from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, visible
 from advsearch.scene.importing.ply import read_ply
-from advsearch.scene.importing.stl import read_stl
-from advsearch.scene.importing.surfaces import ImportedSurface
 from advsearch.scene.importing.texture import by_material, textured
 from advsearch.scene.importing.wavefront import read_obj
+
+Attributes = npt.NDArray[np.uint16]
+
+_FACET = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])
+_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+_NAMED = re.compile(rb"^[ \t]*(?:end[ \t]?)?solid\b(?:(?!facet\s+normal)[^\n])*", re.IGNORECASE | re.MULTILINE)
+_WORDS = frozenset("facet outer vertex endloop endfacet end".split())
+_OWN = 0x8000
+
+
+def read_stl(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
+    """Read an STL file; its facet normals are made anew, as every program does.
+
+    Args:
+        path: the file.
+        data: its content.
+
+    Returns:
+        One part, and the warnings.
+
+    Raises:
+        FileFormatError: it is damaged, or has no facets.
+    """
+    inventory = Inventory()
+    promised = 84 + 50 * struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 84
+    colors = None
+    if len(data) == promised:
+        check_faces(path, (promised - 84) // 50)
+        facets = np.frombuffer(data, _FACET, offset=84)
+        points = facets["vertices"].astype(np.float64).reshape(-1, 3)
+        colors = _colors(data[:80], facets["attribute"], inventory)
+    elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
+        points = _of_text(path, data, inventory)
+    else:
+        kind = looks_like(data)
+        got = f"{len(data)} bytes, which is neither ASCII nor that long" if "another" in kind else kind
+        raise damaged(path, f"an STL file (in binary, {promised} bytes for its number of facets)", got)
+    if not len(points):
+        raise FileFormatError(f"{path}: expected a mesh with faces, got none; export triangles")
+    faces = np.arange(len(points)).reshape(-1, 3)
+    surface = ImportedSurface() if colors is None else ImportedSurface(color=np.ones(3, np.float32))
+    corners = None if colors is None else np.repeat(colors[:, None], 3, axis=1)
+    part = ImportedPart(points, faces, None, None, corners, surface)
+    return [part], [f"{path.name}: {clause}" for clause in inventory.left()]
+
+
+def _of_text(path: Path, data: bytes, inventory: Inventory) -> Doubles:
+    """Return the corners (3 F, 3) of the facets of an ASCII file."""
+    if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
+        raise damaged(path, "an ASCII STL file that ends in 'endsolid'", "one that is cut short")
+    data = _NAMED.sub(b"", data.replace(b"\r", b"\n"))
+    found = _VERTEX.findall(data)
+    check_faces(path, len(found) // 3)
+    if len(found) % 3 or len(found) != 3 * len(re.findall(rb"\bouter\s+loop\b", data, re.IGNORECASE)):
+        raise damaged(path, "facets with 3 vertices", f"{len(found):,} vertices in all")
+    try:
+        points = np.array(found).astype(np.float64)
+    except ValueError:
+        raise damaged(path, "three numbers after each 'vertex'", "something else") from None
+    for word in re.findall(rb"^[ \t]*([^\s\d]\S*)", data, re.MULTILINE):
+        if text_of(word).lower() not in _WORDS:
+            inventory.has("statement", text_of(word))
+    return points.reshape(-1, 3)
+
+
+def _colors(head: bytes, attributes: Attributes, inventory: Inventory) -> Doubles | None:
+    """Return the linear colours (F, 3) of facets, or None.
+
+    Two programs have their own ways, with 5 bits a channel. Magics writes ``COLOR=`` and four bytes, the colour of all,
+    into the header, and red in the lowest bits of a facet whose highest bit is not set. VisCAM has blue in the lowest
+    bits, and sets the highest where a facet has a colour.
+    """
+    magics = head.find(b"COLOR=")
+    bits = np.stack([(attributes >> shift) & 31 for shift in (10, 5, 0)], axis=1).astype(np.float32) / np.float32(31.0)
+    if 0 <= magics <= 70:
+        if b"MATERIAL=" in head:
+            inventory.has("header entry", "MATERIAL")
+        own = (attributes & _OWN == 0) & bool(attributes.any())
+        bits, plain = bits[:, ::-1], np.frombuffer(head, np.uint8, 3, magics + 6) / np.float32(255.0)
+        if head[magics + 9] < 255 and head[magics + 9] > 0:
+            inventory.has("opacity of its header entry", "COLOR")
+    else:
+        own, plain = attributes & _OWN != 0, np.full(3, NEUTRAL, np.float32)
+        if not own.any():
+            if attributes.any():
+                inventory.has(
+                    "attribute bytes of its facets, which are no colours known here,", f"{attributes.max():#06x}"
+                )
+            return None
+    found = np.where(own[:, None], bits, plain).astype(np.float32)
+    return np.asarray(srgb_to_linear(found), dtype=np.float64)
+
 
 GLTF = (".glb", ".gltf", ".blend")
 """Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
@@ -60,8 +153,6 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         warnings.simplefilter("ignore")
         return READERS[path.suffix.lower()](path, data)
 
-
-Floats = npt.NDArray[np.float32]
 
 MOST_WARNINGS = 20
 """Warnings about one file."""
@@ -107,7 +198,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     file = Path(path)
     data = read_mesh_bytes(file, "object", MESHES)
     parts, notes = read_parts(file, data)
-    rest = gltf_notes.beside(gltf.read_header(file, data)) if file.suffix.lower() in GLTF else None
+    rest = gltf.beside(gltf.read_header(file, data)) if file.suffix.lower() in GLTF else None
     notes += [] if rest is None else [file.name + rest]
     return object_of(parts, notes, file, safe_name(file), up)
 
@@ -126,7 +217,9 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         InputError: the geometry has NaN, infinite, or coincident vertices only.
     """
     seen = visible(parts)
-    cleared, parts = _cleared(parts, seen), seen
+    clear = ", ".join(dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in seen))
+    cleared = [f"all light passes through {clear} (opacity 0): left out; give it an opacity to see it"] if clear else []
+    parts = seen
     soup, axis = _upright(parts, file, up)
     soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
@@ -150,14 +243,6 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         normal_map=maps.normals,
         emission=_let_out(maps.emission, opacity),
     )
-
-
-def _cleared(parts: list[ImportedPart], kept: list[ImportedPart]) -> list[str]:
-    """Return a warning that names the materials of what was left out."""
-    names = dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in kept)
-    if not names:
-        return []
-    return [f"all light passes through {', '.join(names)} (opacity 0): left out; give it an opacity to see it"]
 
 
 def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path) -> Mesh:
@@ -213,15 +298,13 @@ def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, li
     return Material(roughness=float(roughness), metallic=float(metallic)), notes
 
 
-Array = npt.NDArray[np.float64]
-
 TOUCHING = 0.02
 """Height, as a share of the largest extent, up to which a vertex touches the ground: feet and scans are uneven."""
 CLEAR = 1.1
 """The shares of two axes differ by more than this factor, or the shape does not tell which one is up."""
 
 
-def guess_up(points: Array, name: str) -> UpAxis:
+def guess_up(points: Doubles, name: str) -> UpAxis:
     """Return the axis that points up, y or z, by the shape alone; z where that does not tell.
 
     What stands on a table touches it with a large part of what it covers, seen from above: the foot of a vase, the four
@@ -242,7 +325,7 @@ def guess_up(points: Array, name: str) -> UpAxis:
     return UpAxis(axis, f"{name}: {axis} is taken for up, because {why}; if it lies on its side, give `up={other}`")
 
 
-def touching_share(points: Array) -> float:
+def touching_share(points: Doubles) -> float:
     """Return which share, in [0, 1], of what an object covers from above (along its third axis) touches the ground.
 
     Both are areas of convex hulls.
@@ -253,7 +336,7 @@ def touching_share(points: Array) -> float:
     return _hull_area(points[touching, :2]) / covered if covered > 0.0 else 0.0
 
 
-def _hull_area(points: Array) -> float:
+def _hull_area(points: Doubles) -> float:
     """Area of the convex hull of (N, 2) points; 0 where they lie on a line."""
     if len(points) < 3:
         return 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +12,222 @@ import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import MOST_CORNERS, Inventory, References, check_faces, damaged, shown
-from advsearch.scene.importing.imported_part import ImportedPart, Looked, split_at_corners
+from advsearch.scene.importing.files import (
+    MOST_CORNERS,
+    Inventory,
+    References,
+    check_faces,
+    damaged,
+    is_number,
+    looks_like,
+    numbers_in,
+    shown,
+    text_of,
+)
+from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
 from advsearch.scene.importing.pictures import Pictures
-from advsearch.scene.importing.ply_elements import Element, Lists, read_elements
 from advsearch.scene.importing.polygons import triangulated
-from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+Numbers = npt.NDArray[np.generic]
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"},
+}
+_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_END = re.compile(rb"^end_header[ \t]*(?:\r\n|\n|\r)", re.MULTILINE)
+
+
+@dataclass(frozen=True, eq=False)
+class Lists:
+    """A property with several values in each row.
+
+    Attributes:
+        counts: (N,) how many.
+        values: those of all rows, one after the other.
+    """
+
+    counts: Ints
+    values: Numbers
+
+
+@dataclass
+class Element:
+    """A table of a file.
+
+    Attributes:
+        name: in the file.
+        count: of its rows.
+        types: of its properties, as the header has them, in the order of the file; of a list, that of its values.
+        lists: the types of the counts of those that are lists.
+        scalars: the values (N,) of properties with one a row.
+        listed: those with several.
+    """
+
+    name: str
+    count: int
+    types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
+    lists: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
+    scalars: dict[str, Numbers] = field(default_factory=dict)
+    listed: dict[str, Lists] = field(default_factory=dict)
+
+
+def read_elements(path: Path, data: bytes) -> tuple[dict[str, Element], list[str]]:
+    """Return the elements of a file by their names, and its comments.
+
+    Raises:
+        FileFormatError: it is no PLY file, its header is odd, or it is shorter than that says.
+    """
+    end = _END.search(
+        data.replace(b"\r", b"\n") if data.startswith(b"ply\r") and not data.startswith(b"ply\r\n") else data
+    )
+    if not data.startswith(b"ply") or end is None:
+        raise damaged(
+            path, "a PLY file with a complete header", "half of one" if data.startswith(b"ply") else looks_like(data)
+        )
+    elements, comments, order = _header(path, text_of(data[: end.start()]))
+    cells = _Words(data[end.end() :]) if order == "" else _Bytes(data[end.end() :])
+    at = 0
+    for element in elements.values():
+        at = _fill(path, element, cells, at)
+    return elements, comments
+
+
+def _header(path: Path, text: str) -> tuple[dict[str, Element], list[str], str]:
+    """Return the elements without values, the comments, and the order of bytes, empty for text."""
+    elements: dict[str, Element] = {}
+    comments, order = [], None
+    current = None
+    for line in text.splitlines()[1:]:
+        match line.split():
+            case ["format", kind, *_] if kind in _FORMATS:
+                order = _FORMATS[kind]
+            case ["comment" | "obj_info", *_]:
+                comments.append(line.split(None, 1)[1].strip() if len(line.split(None, 1)) == 2 else "")
+            case ["element", name, count] if count.isdecimal() and len(count) < 20 and name not in elements:
+                current = elements[name] = Element(name, int(count))
+            case ["property", "list", counts, kind, name] if current and {counts, kind} <= set(_TYPES):
+                current.types[name] = np.dtype((order or "") + _TYPES[kind])
+                current.lists[name] = np.dtype((order or "") + _TYPES[counts])
+            case ["property", kind, name] if current and kind in _TYPES and name not in current.types:
+                current.types[name] = np.dtype((order or "") + _TYPES[kind])
+            case []:
+                pass
+            case _:
+                raise damaged(path, "a PLY header of elements and their properties", f"the line {shown(line)}")
+    if order is None:
+        raise damaged(path, f"a PLY header with a format of {', '.join(_FORMATS)}", "none of these")
+    check_faces(path, elements["face"].count if "face" in elements else 0)
+    return elements, comments, order
+
+
+class _Words:
+    """The numbers of a text, one a cell."""
+
+    def __init__(self, data: bytes) -> None:
+        self.values = numbers_in(data, np.float64)
+        self.end, self.data = len(self.values), data
+
+    def width(self, kind: np.dtype[np.generic]) -> int:
+        return 1
+
+    def taken(self, places: Ints, kind: np.dtype[np.generic]) -> Numbers:
+        return self.values[places]
+
+    def number(self, place: int, kind: np.dtype[np.generic]) -> float:
+        return float(self.values.item(place))
+
+    def odd(self) -> str | None:
+        """The first word that is no number, if there is one."""
+        return next((word for word in map(text_of, self.data.split()) if not is_number(word)), None)
+
+
+class _Bytes:
+    """The bytes of a binary file, one a cell."""
+
+    def __init__(self, data: bytes) -> None:
+        self.values, self.end, self.data = np.frombuffer(data, np.uint8), len(data), data
+
+    def width(self, kind: np.dtype[np.generic]) -> int:
+        return kind.itemsize
+
+    def taken(self, places: Ints, kind: np.dtype[np.generic]) -> Numbers:
+        found: Numbers = self.values[places[:, None] + np.arange(kind.itemsize)].reshape(-1).view(kind)
+        return found
+
+    def number(self, place: int, kind: np.dtype[np.generic]) -> float:
+        if kind.kind == "f":
+            return float(np.frombuffer(self.data, kind, 1, place)[0])
+        part, signed = self.data[place : place + kind.itemsize], kind.kind == "i"
+        return int.from_bytes(part, "big" if kind.str[0] == ">" else "little", signed=signed)
+
+    def odd(self) -> str | None:
+        return None
+
+
+def _fill(path: Path, element: Element, cells: _Words | _Bytes, at: int) -> int:
+    """Read the rows of an element that begin at a cell; return the cell after them."""
+    widths = {name: cells.width(element.lists.get(name, kind)) for name, kind in element.types.items()}
+    if not element.count or not widths:
+        return at
+    if element.count * sum(widths.values()) > cells.end - at:
+        raise _cut(path, element, cells)
+    places, after = _rows(path, element, cells, at, widths, 1)
+    last = at + (after - at) * element.count
+    steps = (after - at) * np.arange(element.count if last <= cells.end else 0)
+    even = {name: one + steps for name, one in places.items()}
+    counts = [cells.taken(even[name], kind) for name, kind in element.lists.items()]
+    if last <= cells.end and all((some == some[0]).all() for some in counts):
+        places, at = even, last
+    else:  # the lists differ in length
+        places, at = _rows(path, element, cells, at, widths, element.count)
+    for name, kind in element.types.items():
+        if name not in element.lists:
+            element.scalars[name] = cells.taken(places[name], kind)
+            continue
+        sizes = cells.taken(places[name], element.lists[name]).astype(np.int64)
+        width = cells.width(kind)
+        skipped = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        inside = np.repeat(places[name] + widths[name], sizes) + width * skipped
+        element.listed[name] = Lists(sizes, cells.taken(inside, kind))
+    return at
+
+
+def _rows(
+    path: Path, element: Element, cells: _Words | _Bytes, at: int, widths: dict[str, int], count: int
+) -> tuple[dict[str, Ints], int]:
+    """Go through rows one by one; return the cells at which each property begins, and the cell after them."""
+    places: dict[str, list[int]] = {name: [] for name in widths}
+    steps = [
+        (places[name].append, widths[name], element.lists.get(name), cells.width(kind))
+        for name, kind in element.types.items()
+    ]
+    for _ in range(count):
+        for note, width, counted, size in steps:
+            note(at)
+            if at + width > cells.end:
+                raise _cut(path, element, cells)
+            if counted is not None:
+                number = cells.number(at, counted)
+                if not 0 <= number <= cells.end:
+                    raise damaged(path, f"lists in the PLY element {shown(element.name)}", f"one of {number:g} values")
+                at += size * int(number)
+            at += width
+    if at > cells.end:
+        raise _cut(path, element, cells)
+    return {name: np.array(one, dtype=np.int64) for name, one in places.items()}, at
+
+
+def _cut(path: Path, element: Element, cells: _Words | _Bytes) -> FileFormatError:
+    expected = f"{element.count:,} rows of {shown(element.name)}, as the PLY header says"
+    odd = cells.odd()
+    return damaged(
+        path, expected, "fewer; the file is cut short" if odd is None else f"{shown(odd)} among their numbers"
+    )
+
 
 COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 ALPHAS = ("alpha", "a", "diffuse_alpha")
@@ -113,7 +319,7 @@ class _Reader:
         """Return the warnings, each as what follows the file's name."""
         return [note if note.startswith(" ") else f": {note}" for note in [*self.notes, *self.inventory.left()]]
 
-    def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Array | None:
+    def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Doubles | None:
         """Return the values (N, C) of the first of several groups of properties that an element has; None for none."""
         table = self.elements.get(element)
         for group in names:
@@ -178,7 +384,7 @@ class _Reader:
         index[np.repeat(whole, counts)] = same.reshape(-1)
         return Looked(values.view(np.float64).reshape(-1, 2), index[triangles])
 
-    def colors(self, at: Ints, face: Ints) -> Array | None:
+    def colors(self, at: Ints, face: Ints) -> Doubles | None:
         """Return the linear colours (T, 3, 3) of the corners of triangles, or None: those of vertices, unless these are
         all the same and those of faces are not."""
         found = {}
@@ -260,7 +466,7 @@ def _whole(values: npt.NDArray[np.generic]) -> Ints:
     return values.astype(np.int64)
 
 
-def _scale(values: Array, kind: np.dtype[np.generic]) -> float:
+def _scale(values: Doubles, kind: np.dtype[np.generic]) -> float:
     """Return what full brightness is in colours of a type: 1 for floats, unless they are those of bytes."""
     most = float(np.nan_to_num(values).max(initial=0.0))
     if kind.kind == "f":

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from advsearch.scene.assets import Bools, Doubles, Ints
 
 MOST_WORK = 50_000_000
 """Points that are compared with ears, in all; then the polygons that are left are cut up as fans."""
@@ -14,7 +12,7 @@ MOST_WORK = 50_000_000
 _FLAT = 1e-9  # twice the area of a triangle, as a share of that of its polygon, up to which it has none
 
 
-def triangulated(points: Array, counts: Ints) -> tuple[Ints, Ints, int]:
+def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
     """Cut polygons up into triangles.
 
     Where the triangles from a polygon's first corner all face as the polygon does (it is convex, mostly), these are
@@ -55,7 +53,7 @@ def triangulated(points: Array, counts: Ints) -> tuple[Ints, Ints, int]:
     return np.concatenate(triangles)[order], owner[order], wrong
 
 
-def _flattened(corners: Array) -> Array:
+def _flattened(corners: Doubles) -> Doubles:
     """Return polygons (P, n, 3) in their planes, (P, n, 2), counter-clockwise and about 1 large."""
     corners = corners - corners.mean(axis=1, keepdims=True)
     corners = corners / np.maximum(np.abs(corners).max(axis=(1, 2), keepdims=True), 1e-300)
@@ -68,13 +66,13 @@ def _flattened(corners: Array) -> Array:
     return np.asarray(corners @ plane)
 
 
-def _doubled_areas(a: Array, b: Array, c: Array) -> Array:
+def _doubled_areas(a: Doubles, b: Doubles, c: Doubles) -> Doubles:
     """Return twice the signed areas of triangles in the plane, (..., 2) each."""
     ahead, aside = b - a, c - a
     return np.asarray(ahead[..., 0] * aside[..., 1] - ahead[..., 1] * aside[..., 0])
 
 
-def _ears(flat: Array, budget: int) -> tuple[Ints, int, int]:
+def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
     """Cut the ears off polygons with the same number of corners, all at once, each in turns of its own.
 
     Args:
@@ -122,9 +120,9 @@ def _ears(flat: Array, budget: int) -> tuple[Ints, int, int]:
     return triangles, int((failed & (size > _FLAT)).sum()), used
 
 
-def _is_ear(ends: list[Array], places: Array, there: npt.NDArray[np.bool_], least: Array) -> npt.NDArray[np.bool_]:
+def _is_ear(ends: list[Doubles], places: Doubles, there: Bools, least: Doubles) -> Bools:
     """Tell of triangles, three times (P, 2), whether they have an area and hold no place (P, n, 2) that is there."""
-    ear: npt.NDArray[np.bool_] = _doubled_areas(*ends) > least
+    ear: Bools = _doubled_areas(*ends) > least
     x, y, inside = places[ear, :, 0], places[ear, :, 1], there[ear]
     for one, other in zip(ends, [*ends[1:], ends[0]], strict=True):
         (x0, y0), (x1, y1) = one[ear, :, None].swapaxes(0, 1), other[ear, :, None].swapaxes(0, 1)

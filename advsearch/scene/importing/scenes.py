@@ -14,22 +14,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import MESHES
-from advsearch.scene.assets import ObjectAsset
-from advsearch.scene.importing import gltf, gltf_notes
+from advsearch.scene.assets import Doubles, ObjectAsset
+from advsearch.scene.importing import gltf
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, LightEntry
 from advsearch.scene.importing.gltf_parts import poses
-from advsearch.scene.importing.imported_part import ImportedPart, visible
 from advsearch.scene.importing.objects import GLTF, object_of, read_parts
+from advsearch.scene.importing.parts import ImportedPart, visible
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
-
-Doubles = npt.NDArray[np.float64]
 
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From y up to z up."""
@@ -293,7 +290,7 @@ def _lamp(name: str, light: LightEntry, pose: Doubles, frame: FileFrame) -> Poin
     power = np.array(light.color) * light.intensity / LUMENS
     if light.type == "directional":
         way = UPRIGHT @ pose[:3, 2]  # it shines along its -z
-        place, power = gltf_notes.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf_notes.FAR**2
+        place, power = gltf.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf.FAR**2
     else:
         place, power = frame.inside(UPRIGHT @ pose[:3, 3]), power / frame.size**2
     x, y, z = map(float, place)
@@ -314,7 +311,7 @@ def _lamp(name: str, light: LightEntry, pose: Doubles, frame: FileFrame) -> Poin
 
 
 def _changed(path: Path, header: Header) -> list[str]:
-    return [path.name + what for what in gltf_notes.lights_and_cameras(header)]
+    return [path.name + what for what in gltf.lights_and_cameras(header)]
 
 
 def _check_lamp(path: Path, lamp: PointLamp | SpotLamp) -> None:

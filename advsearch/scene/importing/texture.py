@@ -13,16 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
+from advsearch.scene.assets import Bools, Doubles, Floats, Ints
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.geometry import Array, Bools, Ints, Soup, connected, unit_vectors
-from advsearch.scene.importing.images import TEXTURE_LIMIT
-from advsearch.scene.importing.normal_maps import FLAT, texels_of
-from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
-from advsearch.scene.importing.unwrap import unwrapped
-from advsearch.scene.raster import doubled_areas, pixels_in
-from advsearch.scene.surface_map import looked_up
-
-Floats = npt.NDArray[np.float32]
+from advsearch.scene.importing.geometry import Soup, connected, unit_vectors
+from advsearch.scene.importing.parts import FLAT, NEUTRAL, ImportedSurface, texels_of
+from advsearch.scene.importing.pictures import TEXTURE_LIMIT
+from advsearch.scene.raster import doubled_areas, looked_up, pixels_in
+from advsearch.scene.surface_parts import unwrapped
 
 PLAIN_SIZE = 8
 """Width and height, in texels, of the base colour map of an object of one colour."""
@@ -47,7 +44,7 @@ class SurfaceMaps:
     Attributes:
         color: (H, W, 3) float32 display-referred base colour in [0, 1]; (H, W, 4) with the opacity where light passes
             through a part.
-        normals: (H', W', 3) float32 of `advsearch.scene.importing.normal_maps`; None where there is no normal map.
+        normals: (H', W', 3) float32 of `advsearch.scene.importing.parts`; None where there is no normal map.
         emission: (H", W", 3) float32 linear radiance; (1, 1, 3) where it is the same everywhere, None where there is
             none.
     """
@@ -91,7 +88,7 @@ def by_material(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[list[s
     return list(numbers), np.array([numbers[surface.name] for surface in surfaces])[soup.part]
 
 
-def _overlap(uvs: Array, material: Ints) -> bool:
+def _overlap(uvs: Doubles, material: Ints) -> bool:
     """Whether places of different materials (F,) lie at the same texture coordinates (F, 3, 2)."""
     if material.min() == material.max():
         return False
@@ -108,7 +105,7 @@ def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
     return np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32)
 
 
-def _kept(soup: Soup, uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats]) -> tuple[Soup, SurfaceMaps]:
+def _kept(soup: Soup, uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats]) -> tuple[Soup, SurfaceMaps]:
     """Return the soup with the file's own UVs, and its pictures, as `ImportedSurface.pictures` has them, as maps."""
     left = list(pictures)
     color = _of_one_color(soup, surface) if surface.texture is None else left.pop(0)
@@ -119,7 +116,7 @@ def _kept(soup: Soup, uvs: Array, surface: ImportedSurface, pictures: Sequence[F
     return replace(soup, uvs=uvs), SurfaceMaps(color, normals, emission)
 
 
-def _lit_twice(uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats]) -> bool:
+def _lit_twice(uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats]) -> bool:
     """Whether a texel that emits light lies on several faces: Mitsuba would send light from one of them only."""
     if surface.emission is None or surface.emission.shape == (1, 1, 3):
         return False
@@ -164,7 +161,7 @@ def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -
 # --- the file's UVs ----------------------------------------
 
 
-def _usable(soup: Soup, uvs: Array) -> bool:
+def _usable(soup: Soup, uvs: Doubles) -> bool:
     """Tell whether UVs are known, inside the unit square, not squashed to lines, and use the square."""
     if not np.isfinite(uvs).all() or uvs.min() < -_SLACK or uvs.max() > 1.0 + _SLACK:
         return False
@@ -172,7 +169,7 @@ def _usable(soup: Soup, uvs: Array) -> bool:
     return bool(surface[flat < 1e-12].sum() <= _SQUASHED * surface.sum() and flat.sum() >= _CRAMPED)
 
 
-def _into_unit_square(soup: Soup) -> Array:
+def _into_unit_square(soup: Soup) -> Doubles:
     """Move each chart by whole textures so that it starts in the unit square; a repeating texture looks the same."""
     corners = np.column_stack([soup.faces.reshape(-1), soup.uvs.reshape(-1, 2)])
     _, vertex = np.unique(corners, axis=0, return_inverse=True)
@@ -181,11 +178,11 @@ def _into_unit_square(soup: Soup) -> Array:
     chart = connected(int(vertex.max()) + 1, a, b)
     low = np.full((int(chart.max()) + 1, 2), np.inf)
     np.minimum.at(low, chart[vertex.reshape(-1)], soup.uvs.reshape(-1, 2))
-    moved: Array = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
+    moved: Doubles = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
     return moved
 
 
-def _windowed(uvs: Array, pictures: Sequence[Floats], colors: Floats | None) -> tuple[Array, Sequence[Floats]]:
+def _windowed(uvs: Doubles, pictures: Sequence[Floats], colors: Floats | None) -> tuple[Doubles, Sequence[Floats]]:
     """Cut pictures to the window that UVs span where they overstep the unit square a little or use a corner of it.
 
     The layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the textures repeat.
@@ -202,7 +199,7 @@ def _windowed(uvs: Array, pictures: Sequence[Floats], colors: Floats | None) -> 
     return (uvs - low) / size, [_cut(one, low, high, filtered if one is colors else sampled) for one in pictures]
 
 
-def _cut(picture: Floats, low: Array, high: Array, look_up: Callable[[Floats, Array], Floats]) -> Floats:
+def _cut(picture: Floats, low: Doubles, high: Doubles, look_up: Callable[[Floats, Doubles], Floats]) -> Floats:
     """Return the window of a repeating picture (H, W, C) between two corners (u, v), with texels of the same size."""
     size = high - low
     width, height = np.clip(np.ceil(size * np.array(picture.shape[1::-1])), 1, TEXTURE_LIMIT).astype(int)
@@ -215,7 +212,7 @@ def _cut(picture: Floats, low: Array, high: Array, look_up: Callable[[Floats, Ar
 # --- baking ----------------------------------------
 
 
-def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
+def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
     """Paint the colours and the normals of a soup into maps for new UVs.
 
     Args:
@@ -224,9 +221,12 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
         surfaces: the surface of each part.
 
     Returns:
-        Maps (N, N, ...). Texels outside every chart repeat the nearest one inside, so that filtering finds no seam.
+        Maps (N, N, ...) with room for the texels that the object shows. Texels outside every chart repeat the nearest
+        one inside, so that filtering finds no seam.
     """
-    size = _baked_size(_texels(soup, surfaces))
+    size, texels = BAKED_SIZE, _texels(soup, surfaces)
+    while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
+        size *= 2
     corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
     face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
     through = any(int((_plain(one) if one.texture is None else one.texture).shape[-1]) == 4 for one in surfaces)
@@ -244,8 +244,8 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
         color = _looked_up(surface, at)
         image[rows[here], columns[here], : color.shape[1]] = _tinted(color, factor[here])
         if normals is not None and surface.normal_map is not None and np.isfinite(at).all():
-            texels = sampled(surface.normal_map, at)
-            normals[rows[here], columns[here]] = turned(texels, soup, uvs, face[here], weights[here])
+            bumps = sampled(surface.normal_map, at)
+            normals[rows[here], columns[here]] = turned(bumps, soup, uvs, face[here], weights[here])
         if emission is not None and surface.emission is not None and np.isfinite(at).all():
             emission[rows[here], columns[here]] = sampled(surface.emission, at)
     inside[rows, columns] = True
@@ -256,7 +256,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
     return SurfaceMaps(image[whole], None if normals is None else normals[whole], emission)
 
 
-def _looked_up(surface: ImportedSurface, at: Array) -> Floats:
+def _looked_up(surface: ImportedSurface, at: Doubles) -> Floats:
     """Return the base colour (T, 3 or 4) of a surface at UVs (T, 2)."""
     if surface.texture is not None and np.isfinite(at).all():
         return filtered(surface.texture, at)
@@ -272,21 +272,13 @@ def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     return texels
 
 
-def _baked_size(texels: float) -> int:
-    """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
-    size = BAKED_SIZE
-    while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
-        size *= 2
-    return size
-
-
 def _mean(texture: Floats) -> Floats:
     """Return the mean colour (1, 3 or 4) of a texture, taken in linear light."""
     mean = _in_display(_in_linear(texture).mean(axis=(0, 1), dtype=np.float64).astype(np.float32))
     return mean[None]
 
 
-def filtered(colors: Floats, uvs: Array) -> Floats:
+def filtered(colors: Floats, uvs: Doubles) -> Floats:
     """Look a repeating texture of display-referred colours up with bilinear interpolation in linear light; what is
     transparent does not count. Arguments and result as for `sampled`."""
     return _in_display(sampled(_in_linear(colors), uvs))
@@ -306,7 +298,7 @@ def _in_display(colors: Floats) -> Floats:
     return np.concatenate([linear_to_srgb(linear), opacity], axis=-1)
 
 
-def sampled(texture: Floats, uvs: Array) -> Floats:
+def sampled(texture: Floats, uvs: Doubles) -> Floats:
     """Look a repeating texture up with bilinear interpolation of its values, as they are.
 
     Args:
@@ -330,7 +322,7 @@ FEW = 1e-3
 """Share of the surface whose texture coordinates may be mirrored without anything being done about it."""
 
 
-def mirrored(soup: Soup, uvs: Array) -> Bools:
+def mirrored(soup: Soup, uvs: Doubles) -> Bools:
     """Return (F,) which faces have their texture mirrored; where these, or the others, are `FEW`, none or all have."""
     turned = doubled_areas(uvs) < 0.0
     area = np.linalg.norm(soup.face_vectors(), axis=1)
@@ -339,8 +331,8 @@ def mirrored(soup: Soup, uvs: Array) -> Bools:
 
 
 def unmirrored(
-    uvs: Array, over: Bools, color: Floats, normals: Floats, emission: Floats | None
-) -> tuple[Array, tuple[Floats, Floats, Floats | None]]:
+    uvs: Doubles, over: Bools, color: Floats, normals: Floats, emission: Floats | None
+) -> tuple[Doubles, tuple[Floats, Floats, Floats | None]]:
     """Return texture coordinates that mirror no face, and the maps for them; no texel is resampled.
 
     The maps get a second half, which is the first one mirrored, and there the faces go.
@@ -368,7 +360,7 @@ def _beside(left: Floats, right: Floats) -> Floats:
     return np.concatenate([left, right], axis=1)
 
 
-def turned(texels: Floats, before: Soup, after: Array, face: Ints, weights: Array) -> Floats:
+def turned(texels: Floats, before: Soup, after: Doubles, face: Ints, weights: Doubles) -> Floats:
     """Return texels of a normal map for other texture coordinates.
 
     Args:
@@ -387,7 +379,7 @@ def turned(texels: Floats, before: Soup, after: Array, face: Ints, weights: Arra
     return texels_of(np.where(np.isfinite(found).all(axis=1, keepdims=True), found, [0.0, 0.0, 1.0]))
 
 
-def _tangents(soup: Soup, normal: Array, face: Ints) -> Array:
+def _tangents(soup: Soup, normal: Doubles, face: Ints) -> Doubles:
     """Unit directions (T, 3) along u in the plane across the normals (T, 3); NaN where there is none."""
     used, at = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used, k]] for k in range(3))

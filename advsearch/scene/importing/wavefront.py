@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
@@ -28,14 +29,10 @@ from advsearch.scene.importing.files import (
     shown,
     text_of,
 )
-from advsearch.scene.importing.imported_part import ImportedPart, Looked, split_at_corners
 from advsearch.scene.importing.mtl import without_comment
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
+from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
 from advsearch.scene.importing.polygons import triangulated
-from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 GROUPING = frozenset(("g", "o"))
 """Statements that only name parts; all parts are joined."""
@@ -98,7 +95,8 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         uvs = Looked(tables["vt"], mapped).at(chosen)
         if uvs is not None:
             uvs = replace(uvs, values=uvs.values * painted.scale + painted.offset)
-            if painted.clamped and _beyond(uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]):
+            used = uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]
+            if painted.clamped and len(used) and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND):
                 reader.note(
                     f"{path.name} has textures that are not to repeat beyond their edges (-clamp); here they do"
                 )
@@ -114,13 +112,7 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
 
 @dataclass(frozen=True)
 class _Said:
-    """Statements with the rows that they are in.
-
-    Attributes:
-        libraries: what stands after ``mtllib``.
-        materials: names after ``usemtl``.
-        smoothing: words after ``s``.
-    """
+    """What stands after ``mtllib``, names after ``usemtl`` and words after ``s``, with the rows that they are in."""
 
     libraries: list[str]
     materials: list[tuple[int, str]]
@@ -166,7 +158,7 @@ def _note_unknown(reader: MtlReader, said: _Said, name: str, instead: str) -> No
 # --- colours of vertices ----------------------------------------
 
 
-def _colors(lines: Lines, table: Array, inventory: Inventory) -> Array | None:
+def _colors(lines: Lines, table: Doubles, inventory: Inventory) -> Doubles | None:
     """Return the linear colour (V, 3) of every vertex; neutral grey where a file with colours has none.
 
     A vertex is three coordinates, then perhaps a weight, or a colour, or a colour and its opacity; or ZBrush has put
@@ -188,7 +180,9 @@ def _colors(lines: Lines, table: Array, inventory: Inventory) -> Array | None:
     return np.asarray(srgb_to_linear(np.clip(colors, 0.0, 1.0).astype(np.float32)), dtype=np.float64)
 
 
-def _tinted(reader: MtlReader, surface: ImportedSurface, tint: Array | None) -> tuple[ImportedSurface, Array | None]:
+def _tinted(
+    reader: MtlReader, surface: ImportedSurface, tint: Doubles | None
+) -> tuple[ImportedSurface, Doubles | None]:
     """Return a surface and the colours (F, 3, 3) of its corners that multiply it: all but those of a texture."""
     if tint is None:
         return surface, None
@@ -201,11 +195,6 @@ def _tinted(reader: MtlReader, surface: ImportedSurface, tint: Array | None) -> 
     if surface.color[:3].min() < 0.999 and tint.min() < 1.0:
         reader.note(f"{reader.source}: colours of vertices are multiplied by the Kd of their material")
     return surface, tint
-
-
-def _beyond(uvs: Array) -> bool:
-    """Whether texture coordinates (N, 2) leave the texture by more than `BEYOND`."""
-    return bool(len(uvs)) and not (uvs.min() >= -BEYOND and uvs.max() <= 1.0 + BEYOND)
 
 
 Bytes = npt.NDArray[np.uint8]
@@ -260,7 +249,7 @@ class Lines:
             key, _, rest = line.partition(" ")
             yield int(row), key, rest.strip()
 
-    def table(self, kind: str) -> Array:
+    def table(self, kind: str) -> Doubles:
         """Return the numbers of all lines of a kind in a table; where one has fewer, 0 for ``vt``, else NaN.
 
         Raises:
@@ -275,7 +264,7 @@ class Lines:
         begins[1:] &= blank[:-1]
         ends = np.flatnonzero(data == _NEWLINE)
         counts = np.add.reduceat(begins, np.concatenate([[0], ends[:-1] + 1]), dtype=np.int64)
-        values: Array = numbers_in(data.tobytes(), np.float64).astype(np.float64, copy=False)
+        values: Doubles = numbers_in(data.tobytes(), np.float64).astype(np.float64, copy=False)
         if counts.min() < fewest or len(values) != counts.sum():
             self._blame_numbers(kind, fewest, rows)
         if (counts == counts[0]).all():
@@ -333,7 +322,7 @@ class Lines:
                 raise damaged(self.path, f"at least {index.max()} {kind!r} lines", f"{got} (is the file cut short?)")
         return corners - 1, sizes, rows
 
-    def zbrush_colors(self, count: int) -> Array | None:
+    def zbrush_colors(self, count: int) -> Doubles | None:
         """Return the colours (N, 3) in [0, 255] that ZBrush writes into comments (``#MRGB``), or None."""
         if b"#MRGB" not in self.text:
             return None

@@ -11,7 +11,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.parts import color, number
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import mi
 from advsearch.scene.parts import PluginNumber
 from advsearch.scene.settings import CHANNELS
 
@@ -60,7 +60,7 @@ def _named(one: PluginNumber, name: str) -> PluginNumber:
 def _all(description: SceneDescription) -> tuple[dict[str, PluginNumber], dict[str, str]]:
     """Every number and colour of a scene by its key, without inputs but for those that it has; and the type of the
     rest."""
-    mi, scene = mitsuba(), MitsubaScene(description, SMALL)
+    scene = MitsubaScene(description, SMALL)
     own = {key: name for name, (key, one) in scene.declared.items() if one.write in (number, color)}
     found: dict[str, PluginNumber] = {}
     others: dict[str, str] = {}
@@ -78,7 +78,6 @@ def _all(description: SceneDescription) -> tuple[dict[str, PluginNumber], dict[s
 
 def _values(value: Any) -> tuple[float, ...] | None:
     """The numbers of a parameter; None where it is neither one number nor a colour."""
-    mi = mitsuba()
     if isinstance(value, float):
         return (value,)
     if (isinstance(value, mi.Float) and len(value) == 1) or isinstance(value, mi.Color3f):

@@ -9,14 +9,12 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.assets import Doubles, Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.mitsuba_backend.plugins import loadable
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, MeshPart
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
@@ -88,7 +86,6 @@ def matt(reflectance: Floats) -> Plugin:
 
 
 def _texture(linear: Floats) -> Plugin:
-    mi = mitsuba()
     bitmap = mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear"}
 
@@ -137,14 +134,11 @@ def repeating(uv: Tensor, options: Mapping[str, object], size: tuple[int, int]) 
     return (torch.floor(uv * texels) + 0.5) / texels if options.get("filter_type") == "nearest" else uv
 
 
-def mitsuba_mesh(
-    name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: Plugin, light: Plugin | None = None
-) -> Any:
+def mitsuba_mesh(name: str, mesh: Mesh, to_world: Doubles, bsdf: Plugin, light: Plugin | None = None) -> Any:
     """Return a Mitsuba mesh of the given geometry under a pose, with shading normals and texture coordinates.
 
     Mitsuba's bitmaps have row 0 at v = 0 while ours have it at v = 1, hence the flip.
     """
-    mi = mitsuba()
     vertices = mesh.vertices.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
     normals = mesh.normals.astype(np.float64) @ np.linalg.inv(to_world[:3, :3])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -170,3 +164,33 @@ def mitsuba_mesh(
     for key, values in mesh.attributes.items():
         result.add_attribute(key, values.shape[1], np.ascontiguousarray(values, np.float32).ravel())
     return result
+
+
+def loadable(plugin: Mapping[str, object]) -> Plugin:
+    """Return a dictionary with Mitsuba's transforms for arrays (4, 4) and (3, 3), and its bitmaps for pictures
+    (H, W, C)."""
+
+    def made(value: object) -> object:
+        if isinstance(value, Mapping):
+            return loadable(value)
+        if isinstance(value, np.ndarray):
+            transform = {(4, 4): mi.ScalarTransform4f, (3, 3): mi.ScalarTransform3f}.get(value.shape)
+            return transform(value) if transform else mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
+        return value
+
+    return {key: made(value) for key, value in plugin.items()}
+
+
+def plain(plugin: Mapping[str, object]) -> Plugin:
+    """Return a dictionary with arrays (4, 4), of texture coordinates (3, 3), for Mitsuba's transforms."""
+
+    def made(value: object) -> object:
+        if isinstance(value, Mapping):
+            return plain(value)
+        matrix = getattr(value, "matrix", None)
+        if matrix is None:
+            return value
+        side = len(matrix)
+        return np.array(matrix, dtype=np.float64).reshape(side, side)
+
+    return {key: made(value) for key, value in plugin.items()}

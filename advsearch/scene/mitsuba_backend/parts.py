@@ -1,29 +1,39 @@
-"""What each part of a described scene is inside Mitsuba: its plugins, its inputs, and the integrator that it needs."""
+"""What a described scene is inside Mitsuba: plugins and inputs of each part, of camera, environment and ground."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import singledispatch
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from advsearch.errors import InputError
+from advsearch.scene.camera_model import NUMBERS
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.grounds import paved
 from advsearch.scene.mitsuba_backend.meshes import (
     NORMALS,
     POSITIONS,
     base_texture,
     emitter,
+    loadable,
+    matt,
     mitsuba_mesh,
     own_surface,
     principled,
     textured_emission,
 )
-from advsearch.scene.mitsuba_backend.plugins import loadable
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba, population
+from advsearch.scene.mitsuba_backend.variant import Plugin, dr, fewer_warnings, mi, population
 from advsearch.scene.parts import (
     BallLamp,
     HazePart,
@@ -53,34 +63,22 @@ def plain_number(value: Any) -> float:
 
 def color(value: Any) -> Any:
     """Three numbers: an RGB colour."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import mitsuba as mi
-
     return mi.Color3f(*_entries(value, 3))
 
 
 def point(value: Any) -> Any:
     """Three numbers: a place."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import mitsuba as mi
-
     return mi.Point3f(*_entries(value, 3))
 
 
 def transform(value: Any) -> Any:
     """A 4 x 4 matrix, row by row."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import mitsuba as mi
-
     found = _entries(value, 16)
     return mi.Transform4f(mi.Matrix4f([found[4 * row : 4 * row + 4] for row in range(4)]))
 
 
 def as_torch(value: Any) -> Tensor:
     """Return a Dr.Jit value as a torch tensor with memory of its own."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import mitsuba as mi
-
     if isinstance(value, (mi.Color3f, mi.Point3f)):  # Dr.Jit's own conversion gives a colour six entries
         return torch.cat([as_torch(component) for component in value])
     value = getattr(value, "matrix", value)
@@ -91,10 +89,6 @@ def as_torch(value: Any) -> Tensor:
 
 
 def _entries(value: Any, count: int) -> list[Any]:
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit as dr
-    import mitsuba as mi
-
     return [dr.gather(mi.Float, value.array, mi.UInt32(entry)) for entry in range(count)]
 
 
@@ -190,7 +184,7 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
         textures = []
 
         def fill(options: Mapping[str, object]) -> object:
-            textures.append(mitsuba().load_dict(base_texture(part.base_color, options)))
+            textures.append(mi.load_dict(base_texture(part.base_color, options)))
             return textures[-1]
 
         surface = own_surface(part.surface, fill)
@@ -247,7 +241,7 @@ def _spot(part: SpotLamp) -> Translation:
     inputs = (SceneInput(f"{name}.intensity", f"{name}.intensity.value", color, interior=True, shape=(3,)),)
     lamp = {
         "type": "spot",
-        "to_world": mitsuba().ScalarTransform4f(part.to_world),
+        "to_world": mi.ScalarTransform4f(part.to_world),
         "intensity": _rgb(part.intensity),
         "cutoff_angle": cutoff,
         "beam_width": beam,
@@ -260,7 +254,7 @@ def _ball(part: BallLamp) -> Translation:
     name = part.name
     ball = {
         "type": "sphere",
-        "to_world": mitsuba().ScalarTransform4f().translate(list(part.place)).scale(part.radius),
+        "to_world": mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius),
         "bsdf": {"type": "null"},
         "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
     }
@@ -274,10 +268,8 @@ def _ball(part: BallLamp) -> Translation:
 @translation.register
 def _haze(part: HazePart) -> Translation:
     """Mitsuba's medium only holds density and albedo for the integrator: no shape refers to it."""
-    import advsearch.scene.mitsuba_backend.haze_path  # noqa: F401  (registers the integrator)
-
     name, albedo = part.name, _rgb(part.albedo)
-    medium = mitsuba().load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": part.density})
+    medium = mi.load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": part.density})
     population.keep(medium)
     inputs = (
         SceneInput(f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)),
@@ -304,3 +296,123 @@ def leave_dark_lamps_out(plugins: Plugin, parts: Sequence[ScenePart]) -> None:
         if isinstance(part, Lamp) and part.dark:
             plugin = plugins[part.name]
             plugin.get("emitter", plugin)["sampling_weight"] = 0.0
+
+
+GROUND = "ground"
+GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True)
+"""(h, w, 3): the texture of a ground that shows the environment's photograph (`advsearch.scene.grounds`)."""
+
+
+def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
+    """Mitsuba's dictionary of a scene: its camera, its environment and the ground; objects come as parts."""
+    place = mi.ScalarTransform4f
+    number = description.number
+    scene: Plugin = {"type": "scene", "camera": _camera(description, resolution, filter, sampler)}
+    if description.environment is not None:
+        scene["environment"] = {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(np.ascontiguousarray(description.environment.radiance, dtype=np.float32)),
+            "scale": 2.0 ** number("environment.exposure"),
+            "to_world": place().rotate([0, 0, 1], number("environment.rotation")).rotate([1, 0, 0], 90),
+        }
+    photograph = description.photograph
+    if photograph is not None:
+        scene[GROUND] = mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), matt(photograph.base.numpy()))
+    elif number("ground.size") > 0.0 and not paved(description):
+        reflectance = srgb_to_linear(np.array(description.ground_color, np.float32)).tolist()
+        scene[GROUND] = {
+            "type": "rectangle",
+            "to_world": place().scale(number("ground.size") / 2.0),
+            "bsdf": {
+                "type": "twosided",
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}},
+            },
+        }
+    return scene
+
+
+def loaded(plugins: Plugin, description: SceneDescription) -> Any:
+    """Return Mitsuba's scene of a dictionary.
+
+    Raises:
+        InputError: Mitsuba refuses plugins of the user's.
+    """
+    try:
+        with fewer_warnings():
+            return mi.load_dict(plugins, optimize=False)
+    except RuntimeError as error:
+        if not any(isinstance(part, PluginPart) for part in description.parts):
+            raise
+        raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {error}; change it there") from error
+
+
+def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
+    height, width = resolution
+    camera: Plugin = {
+        **_lens(description),
+        "near_clip": 0.01,
+        "far_clip": 1e5,
+        "to_world": mi.ScalarTransform4f(camera_to_world(description, width / height)),
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "rgba" if description.backdrop else "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": filter},
+        },
+        "sampler": {"type": sampler},
+    }
+    return camera
+
+
+def _lens(description: SceneDescription) -> Plugin:
+    """The plugin of a camera, with what is before its place and its film."""
+    model = description.camera_model
+    if model is not None:
+        if description.backdrop and (model.black > 0.0 or not model.name):  # a searched lens may fold
+            raise InputError(
+                "background: it would show where the camera's lens sees nothing as well; leave the plain background "
+                "out, or take a lens that fills the picture"
+            )
+        return {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values}
+    pinhole: Plugin = {"type": "perspective", "fov": description.number("camera.fov"), "fov_axis": "larger"}
+    if description.thin_lens:
+        pinhole |= {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
+    return pinhole
+
+
+def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
+    """The camera's inputs. Our field of view is along the larger side, Mitsuba's parameter along the width."""
+    height, width = resolution
+
+    def along_width(value: Any) -> Any:
+        half = dr.deg2rad(value.array) / 2.0
+        return mi.Float(2.0 * dr.rad2deg(dr.atan(dr.tan(half) * min(1.0, width / height))))
+
+    return (
+        SceneInput("camera.to_world", "camera.to_world", transform, shape=(4, 4)),
+        SceneInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
+        SceneInput("camera.shift_x", "camera.principal_point_offset_x", number, shape=(1,)),
+        SceneInput("camera.shift_y", "camera.principal_point_offset_y", number, shape=(1,)),
+        SceneInput("camera.aperture", "camera.aperture_radius", number, shape=(1,)),
+        SceneInput("camera.lens", "camera.lens", shape=(len(NUMBERS),)),
+        SceneInput("camera.focus", "camera.focus_distance", number, shape=(1,)),
+    )
+
+
+def sunsky_tables() -> tuple[Tensor, Tensor, Tensor]:
+    """Read the RGB coefficients of Hosek and Wilkie's sky and sun that Mitsuba ships for its `sunsky` plugin.
+
+    Returns:
+        (10 turbidities, 2 ground albedos, 6 control points, 3 channels, 9) shape of the dome; (10, 2, 6, 3) its mean
+        radiance; and (10, 45 pieces, 3 channels, 4 powers of the elevation, 6 powers of the cosine at the limb)
+        radiance of the sun. All float32.
+    """
+    path = Path(str(mi.__file__)).parent / "data" / "sunsky" / "sunsky_datasets.bin"
+    with contextlib.redirect_stdout(io.StringIO()):  # the reader prints what it loads
+        tables = mi.tensor_io.read(str(path))
+    shape, level, sun = (
+        torch.from_numpy(tables[name]).float() for name in ("sky_params_rgb", "sky_rad_rgb", "sun_rad_rgb")
+    )
+    return shape, level, sun

@@ -18,31 +18,24 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import SAMPLER, next_count
-from advsearch.scene.leaving_out import EVERYTHING
-from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, loaded, scene_dict
-from advsearch.scene.mitsuba_backend.first_hit import first_hits
+from advsearch.scene.formation import EVERYTHING, SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
 from advsearch.scene.mitsuba_backend.parts import (
+    GROUND_INPUT,
     IDLE_LOBES,
     SceneInput,
     as_torch,
+    camera_inputs,
     key_of,
     leave_dark_lamps_out,
+    loaded,
     mesh_translation,
     plain_number,
+    scene_dict,
     translation,
 )
-from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import (
-    Plugin,
-    media_in,
-    mitsuba,
-    mitsuba_and_drjit,
-    one_at_a_time,
-    population,
-    recorded,
-)
+from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
+from advsearch.scene.mitsuba_backend.variant import Plugin, dr, media_in, mi, one_at_a_time, population, recorded
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -77,7 +70,7 @@ class MitsubaScene:
         description: what to build.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
-        leave_out: names from `advsearch.scene.leaving_out.ITEMS`; less than everything only to measure what it brings.
+        leave_out: names from `advsearch.scene.formation.ITEMS`; less than everything only to measure what it brings.
         max_depth: longest light path in segments.
         sampler: Mitsuba's name of the sampler; some round sample counts up, see `scene.samplers`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
@@ -95,7 +88,8 @@ class MitsubaScene:
         integrator: str = "prb",
     ) -> None:
         with one_at_a_time:
-            mi = mitsuba()
+            import advsearch.scene.mitsuba_backend.own_plugins  # noqa: F401  (registers them; it needs the variant)
+
             if population.unused:  # first: kernels are compiled for the numbers of their objects, which it sets free
                 population.bury()
             self.made = (description, filter)
@@ -116,8 +110,6 @@ class MitsubaScene:
                 )
             self._guides: Plugin = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
             if description.cut_out:
-                import advsearch.scene.mitsuba_backend.guides  # noqa: F401  (registers the integrator)
-
                 self._guides = {"type": "advsearch_guides"}
             self.volumetric = any(part.volumetric for part in description.parts)
             plugins = scene_dict(description, resolution, filter, sampler)
@@ -201,9 +193,6 @@ class MitsubaScene:
             surfaces; of "guides" (H, W, 6), the first hit's albedo in [0, 1] and its shading normal.
         """
         with one_at_a_time:
-            # not before `mitsuba()`, which sees to libLLVM
-            import drjit as dr
-            import mitsuba as mi
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
                 image = integrator.render(scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=False)
@@ -287,10 +276,6 @@ class MitsubaScene:
             For each of `wrt` a float32 tensor of the input's shape.
         """
         with one_at_a_time:
-            # not before `mitsuba()`, which sees to libLLVM
-            import drjit as dr
-            import mitsuba as mi
-
             wanted = tuple(inputs if wrt is None else wrt)
             beside = set() if "gradients" in self._leave_out else set(self.interior)
             plain = method == "path" and self._pinhole and not self.volumetric
@@ -308,11 +293,11 @@ class MitsubaScene:
                     own = self.parameters[key]
                     held[key] = type(own)(own)
                     value = inputs[name] if name in inputs else as_torch(own)
-                    tracked[name] = mi.TensorXf(value.detach().to(torch.float32).contiguous())  # type: ignore[call-overload]
+                    tracked[name] = mi.TensorXf(value.detach().to(torch.float32).contiguous())
                     dr.enable_grad(tracked[name])
                     self.parameters[key] = one.write(tracked[name]) if one.write else tracked[name]
                 self.parameters.update()
-                spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)  # type: ignore[call-overload]
+                spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)
                 mi.set_log_level(mi.LogLevel.Error)  # it warns at every call of a film that samples beyond its border
                 integrator = self._integrators.get((method, self._depth)) or self._integrator(method)
                 integrator.render_backward(
@@ -341,7 +326,7 @@ class MitsubaScene:
         """
         with one_at_a_time:
             # few scenes search a material
-            from advsearch.scene.mitsuba_backend.material_form.adjoint import material_adjoint
+            from advsearch.scene.mitsuba_backend.material_adjoint import material_adjoint
 
             self._set(inputs)
             names = list(meshes)
@@ -349,7 +334,7 @@ class MitsubaScene:
                 self._scene,
                 self._sensor,
                 self.parameters,
-                mesh_key=names,
+                names=names,
                 vertices=[inputs[f"{name}.vertices"] for name in names],
                 normals=[inputs[f"{name}.normals"] for name in names],
                 cotangent=cotangent,
@@ -373,8 +358,6 @@ class MitsubaScene:
             spp: samples a pixel.
         """
         with one_at_a_time:
-            mi, dr = mitsuba_and_drjit()
-
             self._set(inputs)
             key, spp = self.declared[name][0], next_count(self.sampler, spp)
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
@@ -398,10 +381,6 @@ class MitsubaScene:
         Vertices are written into the memory where they are: recordings hold on to it. Numbers that Mitsuba takes for
         constants are part of a recording, so that every change makes all recordings stale.
         """
-        mi = mitsuba()  # somebody else may have taken another variant since
-        # not before `mitsuba()`, which sees to libLLVM
-        import drjit as dr
-
         unknown = [name for name in inputs if name not in self.declared]
         if any(name.endswith(".base_color") for name in unknown):
             raise InputError(
@@ -446,7 +425,6 @@ class MitsubaScene:
         """Return the integrator of one method for the paths that are rendered now, made on first use."""
         key = method, self._depth
         if key not in self._integrators:
-            mi = mitsuba()
             path = {"type": "prb", "max_depth": self._depth, "rr_depth": NO_ROULETTE, **self._path}
             recipes: dict[str, Plugin] = {
                 "path": path,

@@ -16,12 +16,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.scene.cameras.model import CameraModel
-from advsearch.scene.mitsuba_backend.lobes import ANGLES, TABLES, Lobes
+from advsearch.scene.assets import Floats
+from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.texel_rays import (
+    ANGLES,
     SHIFT,
-    Floats,
+    TABLES,
+    Lobes,
     TexelGrid,
     grid_place,
     layers_of,
@@ -31,7 +33,7 @@ from advsearch.scene.mitsuba_backend.texel_rays import (
     stopped,
     to_map,
 )
-from advsearch.scene.mitsuba_backend.variant import mitsuba, mitsuba_and_drjit, one_at_a_time, population, recorded
+from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time, population, recorded
 
 SHARP, WIDE = 0.15, 0.4
 """Spreads of gloss between which what one ray meets on the ground gives way to what surrounds the object."""
@@ -77,7 +79,6 @@ def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
         padded: (H, W + 2, 3).
         blurred: (widths, h, w, 3).
     """
-    mi = mitsuba()
     arrays = [mi.Float(functional.pad(one, (0, 1)).numpy().ravel()) for one in (texels, padded, blurred)]
     shapes = [(one.shape[-3], one.shape[-2]) for one in (padded, blurred)]
     return Lit(arrays[0], arrays[1], shapes[0], arrays[2], shapes[1])
@@ -146,8 +147,6 @@ class Views:
             lit: what it looks like.
         """
         with one_at_a_time:
-            mi, dr = mitsuba_and_drjit()
-
             height, width = self._scene.resolution
             count = len(cameras)
             rows = np.stack([_camera(one, height, width) for one in cameras]).astype(np.float32)
@@ -172,8 +171,6 @@ class Views:
 
     def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, lit: Lit) -> list[Any]:
         """The kernel: radiance but for the searched texture, coverage, and where and how much each ray sees of it."""
-        mi, dr = mitsuba_and_drjit()
-
         height, width = self._scene.resolution
         pixel, number = lane // RAYS, lane % RAYS
         view, pixel = pixel // (height * width), pixel % (height * width)
@@ -209,8 +206,6 @@ class Views:
     def _shaded(self, held: Any, hit: Any, valid: Any, way: Any, tables: Any, lit: Lit) -> tuple[Any, Any, Any]:
         """What was hit: its radiance, but for what the searched texture reflects diffusely; its diffuse share; and 1 on
         the front of the searched texture, -1 on its back, 0 elsewhere."""
-        mi, dr = mitsuba_and_drjit()
-
         to_local, layers = to_map(self._scene), layers_of(self._scene)
         ons = [on & valid for on in on_grids(held, self._grids, hit, way)]
         normal = dr.select(dr.dot(hit.sh_frame.n, way) > 0.0, -hit.sh_frame.n, hit.sh_frame.n)
@@ -246,8 +241,6 @@ class Views:
 
     def _measured(self, tables: Any, first: Any, cosine: Any) -> list[Any]:
         """The entries of the tables at a cosine."""
-        mi, dr = mitsuba_and_drjit()
-
         place = dr.clip(cosine * ANGLES - 0.5, 0.0, ANGLES - 1.0)
         low = dr.minimum(mi.UInt32(place), ANGLES - 2)
         share = place - mi.Float(low)
@@ -259,8 +252,6 @@ class Views:
 
     def _from_middle(self, place: Any, way: Any) -> Any:
         """The direction in which the middle of the object sees the ground that a place sees in a direction."""
-        mi, dr = mitsuba_and_drjit()
-
         if all(grid.warp is None for grid in self._grids):
             return way
         far = place.z / dr.maximum(-way.z, 1e-3)
@@ -268,8 +259,6 @@ class Views:
 
     def _shown(self, hit: Any, ons: Sequence[Any], lit: Lit, to_local: Any) -> Any:
         """Diffuse radiance of what was hit."""
-        mi, dr = mitsuba_and_drjit()
-
         found = self._texel(hit, ons, lit)
         if self._photographed is not None:
             below = dr.normalize(hit.p - mi.Point3f(0.0, 0.0, self._photographed))
@@ -279,8 +268,6 @@ class Views:
 
     def _texel(self, hit: Any, ons: Sequence[Any], lit: Lit) -> Any:
         """What the texels say of what was hit; 0 where it has none."""
-        mi, dr = mitsuba_and_drjit()
-
         first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
         y, x, known = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
         for grid, on in zip(self._grids, ons, strict=True):
@@ -320,7 +307,14 @@ def _through(model: CameraModel, height: int, width: int) -> Floats:
 def _seen(found: Sequence[Any], size: tuple[int, int, int]) -> Seen:
     """What the kernel has found, in memory of torch's own; `size` in cameras, rows and columns."""
     with one_at_a_time:
-        rest, covered, (u, v, weight) = found[:3], found[3], (_by_ray(found[k::3]) for k in (4, 5, 6))
+        rest, covered, (u, v, weight) = (
+            found[:3],
+            found[3],
+            (
+                np.stack([one.numpy() for one in found[k::3]], axis=1).ravel()  # all layers of a ray, ray by ray
+                for k in (4, 5, 6)
+            ),
+        )
         (met,) = np.nonzero(weight)
         return Seen(
             rest=torch.from_numpy(np.stack([one.numpy() for one in rest], axis=-1)).reshape(*size, 3),
@@ -332,15 +326,8 @@ def _seen(found: Sequence[Any], size: tuple[int, int, int]) -> Seen:
         )
 
 
-def _by_ray(layers: Sequence[Any]) -> Floats:
-    """Arrays (n,) of all layers as one (n x layers,), ray by ray."""
-    return np.stack([one.numpy() for one in layers], axis=1).ravel()
-
-
 def _chosen(number: Any, values: Sequence[float]) -> Any:
     """The value with a number."""
-    mi, dr = mitsuba_and_drjit()
-
     found = mi.Float(values[0])
     for index, value in enumerate(values[1:], 1):
         found = dr.select(number == index, value, found)
@@ -349,8 +336,6 @@ def _chosen(number: Any, values: Sequence[float]) -> Any:
 
 def _bilinear(values: Any, first: Any, rows: Any, columns: Any, y: Any, x: Any, *, wraps: bool = False) -> Any:
     """Look three numbers up in a grid of a flat array, which ends at its border or goes round in its columns."""
-    mi, dr = mitsuba_and_drjit()
-
     y = dr.clip(y, 0.0, mi.Float(rows) - 1.0)
     upper, share = mi.UInt32(y), y - dr.floor(y)
     lower = dr.minimum(upper + 1, rows - 1)
@@ -372,15 +357,11 @@ def _bilinear(values: Any, first: Any, rows: Any, columns: Any, y: Any, x: Any, 
 
 def _gathered(values: Any, number: Any) -> Any:
     """The three numbers with a number; four at once is what the processor reads fastest."""
-    mi, dr = mitsuba_and_drjit()
-
     return mi.Color3f(*dr.gather(mi.Vector4f, values, number)[:3])
 
 
 def _sky(lit: Lit, way: Any, to_local: Any) -> Any:
     """The environment in a direction, as Mitsuba has it: rows from pole to pole, columns with a copy at both ends."""
-    mi = mitsuba()
-
     rows, columns = lit.sky_shape
     across, down = map_place(way, to_local)
     x, y = across * (columns - 2) + 0.5, down * (rows - 1)
@@ -389,8 +370,6 @@ def _sky(lit: Lit, way: Any, to_local: Any) -> Any:
 
 def _blurred(lit: Lit, way: Any, to_local: Any, spread: Any, widths: Sequence[float]) -> Any:
     """The environment in a direction, blurred by an angle (root mean square)."""
-    mi, dr = mitsuba_and_drjit()
-
     rows, columns = lit.blurred_shape
     level = dr.clip(dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0)
     low = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))

@@ -1,22 +1,26 @@
 """Rays from texels: what they see of each other and of the environment; and where in grids and its map things lie.
 
 A grid of texels is laid over each surface (`TexelGrid`). Nothing here depends on the light.
+
+And what a surface does to light, as tables over the angle of view (`Lobes`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
+from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import mitsuba, mitsuba_and_drjit
+from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time
 
-Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 
 SHIFT = 1e-4
@@ -75,8 +79,6 @@ def gather(
         rays: of each texel; the same well-spread points for all, shifted by chance.
         seed: number of the shifts.
     """
-    mi, dr = mitsuba_and_drjit()
-
     held, to_local, layers = scene._scene, to_map(scene), layers_of(scene)
     count, texels = len(places), grids[-1].first + grids[-1].count
     steps = (np.arange(1, rays + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])) % 1.0
@@ -115,8 +117,6 @@ def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) 
         places, normals: (n, 3), as of `gather`.
         ways: (k, 3) unit directions, in the axes of the environment's map.
     """
-    mi, dr = mitsuba_and_drjit()
-
     world = (ways @ np.array(to_map(scene))).astype(np.float32)  # the transpose turns back
     lane = dr.arange(mi.UInt32, len(places) * len(world))
     texel, number = lane // len(world), lane % len(world)
@@ -142,8 +142,6 @@ def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
         name: of the shape.
         places: (n, 3) on it.
     """
-    mi, dr = mitsuba_and_drjit()
-
     generator = np.random.default_rng(0)
     ways = generator.standard_normal((PASS >> 7, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -177,8 +175,6 @@ def stopped(held: Any, ray: Any, layers: int, chance: Any = 0.5, active: Any = T
         chance: in [0, 1]; a ray goes on as long as the share of light that passes all it has met is larger.
         active: which lanes count.
     """
-    mi, dr = mitsuba_and_drjit()
-
     hit = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
     share = mi.Float(1.0)
     for _ in range(layers):
@@ -191,16 +187,11 @@ def stopped(held: Any, ray: Any, layers: int, chance: Any = 0.5, active: Any = T
 
 def passed(hit: Any, active: Any) -> Any:
     """The share of light that passes what was hit."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit as dr
-
     return dr.mean(hit.bsdf().eval_null_transmission(hit, active & hit.is_valid()))
 
 
 def _passing(held: Any, ray: Any, layers: int, active: Any) -> Any:
     """The share of light that passes all that is in the way of rays."""
-    mi, dr = mitsuba_and_drjit()
-
     share = mi.Float(1.0)
     for _ in range(layers):
         hit = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
@@ -213,7 +204,6 @@ def _passing(held: Any, ray: Any, layers: int, active: Any) -> Any:
 
 def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
     """A number in [0, 1] for each ray."""
-    mi = mitsuba()
     if not layers:
         return 0.5
     return mi.Float(np.random.default_rng([*seed, 1]).random(count, dtype=np.float32))
@@ -222,20 +212,12 @@ def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
 # ---- places ---------------------------------------------------------------------------------------------------------
 
 
-def shapes_of(held: Any, grids: Sequence[TexelGrid]) -> list[Any]:
-    """Mitsuba's shapes of grids."""
-    by_name = {one.id(): one for one in held.shapes()}
-    return [by_name[grid.name] for grid in grids]
-
-
 def on_grids(held: Any, grids: Sequence[TexelGrid], hit: Any, way: Any) -> list[Any]:
     """Whether hits of rays in a direction lie on each grid."""
-    mi, dr = mitsuba_and_drjit()
-
-    front = dr.dot(hit.n, way) < 0.0
+    front, shapes = dr.dot(hit.n, way) < 0.0, {one.id(): one for one in held.shapes()}
     found = []
-    for grid, shape in zip(grids, shapes_of(held, grids), strict=True):
-        on = hit.is_valid() & (hit.shape == mi.ShapePtr(shape))
+    for grid in grids:
+        on = hit.is_valid() & (hit.shape == mi.ShapePtr(shapes[grid.name]))
         found.append(on & (front if grid.side > 0 else ~front) if grid.side else on)
     return found
 
@@ -248,9 +230,6 @@ def to_map(scene: MitsubaScene) -> Any:
 
 def map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
     """Where in the environment's map a direction lies: shares of its width and of its height."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit as dr
-
     x, y, z = (row[0] * way.x + row[1] * way.y + row[2] * way.z for row in to_local)
     across = dr.atan2(x, -z) / (2.0 * math.pi)
     return across - dr.floor(across), dr.safe_acos(y) / math.pi
@@ -258,9 +237,6 @@ def map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
 
 def grid_place(grid: TexelGrid, place: Any, uv: Any) -> tuple[Any, Any]:
     """Where in a grid something lies: shares of its height and of its width."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit as dr
-
     if grid.warp is None:
         return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
     middle_x, middle_y, scale, rate = grid.warp
@@ -272,12 +248,107 @@ def grid_place(grid: TexelGrid, place: Any, uv: Any) -> tuple[Any, Any]:
 
 
 def _cell(share: Any, count: int) -> Any:
-    mi, dr = mitsuba_and_drjit()
-
     return mi.Int32(dr.minimum(share * count, count - 1.0))
 
 
 def _points(kind: Any, values: Floats) -> Any:
     """Rows of numbers as Dr.Jit's points, vectors or normals."""
-    mi = mitsuba()
     return kind(*(mi.Float(np.ascontiguousarray(values[:, k], dtype=np.float32)) for k in range(values.shape[1])))
+
+
+ANGLES = 32
+"""Entries of a table over the cosine of the angle of view."""
+LOBE_SAMPLES = 4096
+TABLES = ("diffuse", "gloss", "up", "along", "core", "tail")
+"""The tables of `Lobes`, in their order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lobes:
+    """What a surface does to light, by the cosine of the angle of view (`ANGLES` entries, the first at grazing).
+
+    Attributes:
+        diffuse: (k,) share of even light that it reflects for a base colour of one, without the gloss.
+        gloss: (k,) share of even light that it reflects whatever the base colour.
+        up, along: (k,) of the gloss's mean direction: its parts along the normal, and away from the viewer.
+        core, tail: (k,) root mean square angle about that direction, radians, of the half of the gloss that is nearest
+            to it and of the other half: a lobe has longer tails than a normal distribution.
+    """
+
+    diffuse: Floats
+    gloss: Floats
+    up: Floats
+    along: Floats
+    core: Floats
+    tail: Floats
+
+    @classmethod
+    def matt(cls) -> Lobes:
+        """Those of a diffuse surface."""
+        one, none = np.ones(ANGLES, dtype=np.float32), np.zeros(ANGLES, dtype=np.float32)
+        return cls(one, none, one, none, none, none)
+
+    @property
+    def mean_shares(self) -> tuple[float, float]:
+        """Both shares under even light from everywhere, over all angles of view."""
+        weight = (np.arange(ANGLES) + 0.5) * 2.0 / ANGLES**2
+        return float((weight * self.diffuse).sum()), float((weight * self.gloss).sum())
+
+
+def measured(
+    scene: MitsubaScene, inputs: Mapping[str, Tensor], grid: TexelGrid, place: Floats, normal: Floats
+) -> Lobes:
+    """Measure the BSDF of a shape, by sampling it, at one of its texels: a (3,) place and the unit normal there."""
+    key = f"{grid.name}.base_color"
+    with one_at_a_time:
+        middle = (np.arange(ANGLES) + 0.5) / ANGLES
+        cosine = dr.repeat(mi.Float(middle.astype(np.float32)), LOBE_SAMPLES)
+        towards = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
+        noise = mi.load_dict({"type": "independent"})
+        noise.seed(0, ANGLES * LOBE_SAMPLES)
+        one, two = noise.next_1d(), noise.next_2d()
+        even = mi.warp.square_to_cosine_hemisphere(two)
+        found = []
+        for level in (0.5, 0.0):
+            changed = {key: torch.full_like(scene.base(key), level)} if key in scene.names else {}
+            held = scene.held({**inputs, **changed})
+            start = mi.Point3f([float(x) for x in place + 1e-3 * normal])
+            ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
+            hit = held.ray_intersect(dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, ANGLES * LOBE_SAMPLES)))
+            bsdf = hit.bsdf()
+            hit.wi = towards
+            opaque = dr.maximum(1.0 - passed(hit, True), 1e-3)  # of cut-outs, what stops light
+            value = bsdf.eval(mi.BSDFContext(), hit, even) / opaque
+            if level:
+                found.append(dr.mean(value))
+                continue
+            sampled, weight = bsdf.sample(mi.BSDFContext(), hit, one, two)
+            back = dr.select((sampled.pdf > 0.0) & (sampled.wo.z > 0.0), dr.mean(weight) / opaque, 0.0)
+            back = dr.select(dr.isfinite(back), back, 0.0)
+            found += [dr.mean(value), back, sampled.wo.x, sampled.wo.z]
+    lit, dark = (_rows(one.numpy()) / _rows(even.z.numpy() / math.pi) for one in found[:2])
+    weight, x, z = (_rows(one.numpy()) for one in found[2:])
+    share = weight.mean(axis=1)
+    mean = np.stack([(weight * x).mean(axis=1), (weight * z).mean(axis=1)])
+    length = np.linalg.norm(mean, axis=0)
+    mirrored = share < 1e-6
+    along = np.where(mirrored, -np.sqrt(1.0 - middle**2), mean[0] / np.maximum(length, 1e-12))
+    up = np.where(mirrored, middle, mean[1] / np.maximum(length, 1e-12))
+    core, tail = _spreads(weight, 2.0 * np.maximum(0.0, 1.0 - x * along[:, None] - z * up[:, None]))
+    diffuse = np.maximum(lit.mean(axis=1) - dark.mean(axis=1), 0.0) / 0.5
+    return Lobes(*(part.astype(np.float32) for part in (diffuse, share, up, -along, core, tail)))
+
+
+def _spreads(weight: Doubles, apart: Doubles) -> tuple[Doubles, Doubles]:
+    """Root mean squares (k,) of the nearer and of the farther half of weighted samples (k, n), by squares of angles."""
+    order = np.argsort(apart, axis=1)
+    weight, apart = (np.take_along_axis(one, order, axis=1) for one in (weight, apart))
+    total = weight.sum(axis=1, keepdims=True)
+    near = np.clip(0.5 * total - (weight.cumsum(axis=1) - weight), 0.0, weight)
+    half = np.maximum(0.5 * total[:, 0], 1e-12)
+    return np.sqrt((near * apart).sum(axis=1) / half), np.sqrt(((weight - near) * apart).sum(axis=1) / half)
+
+
+def _rows(values: npt.NDArray[Any]) -> Doubles:
+    """Of each angle its samples."""
+    return np.asarray(values, dtype=np.float64).reshape(ANGLES, LOBE_SAMPLES)

@@ -10,6 +10,8 @@ vertex. The derivative of the BSDF is a difference: it is evaluated with all tex
 in which the BSDF is affine (the diffuse and the metallic lobe of the principled BSDF) that is exact. Dr.Jit's forward
 mode finds the same, at the price of more kernels. The whole path is one kernel, which also makes the picture itself and
 what guides its denoiser.
+
+And `first_hits`: what the camera sees first.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.variant import mitsuba_and_drjit
+from advsearch.scene.mitsuba_backend.variant import dr, mi
+from advsearch.scene.surfaces import Surfaces
 
 STEP = 0.0625
 """How much the base colour is changed for the derivative of a BSDF with respect to it."""
@@ -94,8 +97,6 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
         depth: segments of the longest path.
         spp: samples a pixel, those of the sampler.
     """
-    mi, dr = mitsuba_and_drjit()
-
     height, width = size
     sensor = scene.sensors()[0]
     pixel = dr.arange(mi.UInt32, height * width * spp) // spp
@@ -130,8 +131,6 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
 
 def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Vertices:
     """Take the vertices that take part out of all, as tensors."""
-    mi, dr = mitsuba_and_drjit()
-
     index: Any = dr.compress(taking_part)
     if dr.width(index) == 0:
         none = torch.zeros(0)
@@ -163,9 +162,6 @@ class _First:
 
     def stops(self, hit: Any, bsdf: Any, where: Any) -> None:
         """Take reflectance and normal of a hit for those of the picture."""
-        # not before `mitsuba()`, which sees to libLLVM
-        import drjit as dr
-
         self.albedo = dr.select(where, bsdf.eval_diffuse_reflectance(hit, where), self.albedo)
         self.normal = dr.select(where, hit.sh_frame.n, self.normal)
 
@@ -208,8 +204,6 @@ class _Step:
 
     def slopes(self) -> None:
         """Find the derivatives of the BSDF, now that the base colour is larger by `STEP`."""
-        mi, dr = mitsuba_and_drjit()
-
         context = mi.BSDFContext()
         value = self.bsdf.eval(context, self.at, self.to_light, self.lit)
         self.slope = _difference(value, self.value, self.lit)
@@ -219,8 +213,6 @@ class _Step:
 
 def _walk(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[_First, list[_Step]]:
     """Trace paths; return what the camera sees, and the vertices, the first one first. Rays of weight 0 see nothing."""
-    mi, dr = mitsuba_and_drjit()
-
     context = mi.BSDFContext()
     through = mi.Spectrum(1.0)
     active, sharp = (
@@ -290,8 +282,6 @@ def _walk(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[_F
 
 def _seen(hit: Any, shown: Any) -> _First:
     """What the camera sees at the first vertices, and the radiance that these emit."""
-    mi, dr = mitsuba_and_drjit()
-
     covered, none = hit.is_valid(), dr.zeros(mi.Color3f, dr.width(hit.p))
     behind = dr.select(covered, 0.0, shown)
     return _First(shown, dr.select(covered, mi.Float(1.0), 0.0), behind, none, mi.Normal3f(none))
@@ -299,8 +289,6 @@ def _seen(hit: Any, shown: Any) -> _First:
 
 def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any, Any]]]:
     """Return the radiance that leaves the first vertices, and texture coordinates, weights and sharpness of all."""
-    mi, dr = mitsuba_and_drjit()
-
     beyond = mi.Spectrum(0.0)
     found: list[tuple[Any, Any, Any]] = []
     for one in reversed(steps):
@@ -313,17 +301,64 @@ def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any, Any]]]:
 
 def _difference(after: Any, before: Any, active: Any) -> Any:
     """The derivative of a BSDF from two values; zero where they differ by rounding alone, as on other surfaces."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit as dr
-
     change = after - before
     return dr.select(active & (dr.max(dr.abs(change)) > ROUNDING * dr.max(dr.abs(before))), change / STEP, 0.0)
 
 
 def _balance(one: Any, other: Any) -> Any:
     """The power heuristic's weight of a strategy with this density beside another one."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit as dr
-
     total = one * one + other * other
     return dr.select(total > 0.0, one * one / total, 0.0)
+
+
+def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
+    """Return the surface that the camera sees first through the middle of each pixel, without noise.
+
+    A thin lens is looked through at its middle. What lets more than half of the light pass and does not shine towards
+    the camera, as a lamp that is off or a hole in a leaf, is not seen; haze is no shape.
+
+    Args:
+        scene: Mitsuba's.
+        sensor: Mitsuba's camera.
+        resolution: (height, width) in pixels, which need not be the camera's own.
+    """
+    height, width = resolution
+    count = height * width
+    pixel = dr.arange(mi.UInt32, count)
+    place = mi.Point2f((pixel % width + 0.5) / width, (pixel // width + 0.5) / height)
+    ray, weight = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    to_world = sensor.world_transform()
+    eye = to_world @ mi.Point3f(0.0)  # rays begin at the near clipping plane
+    ahead = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
+    active = dr.any(mi.Spectrum(weight) > 0.0) & dr.full(mi.Bool, True, count)
+    number, face = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
+    depth, z_depth = dr.full(mi.Float, dr.inf, count), dr.full(mi.Float, dr.inf, count)
+    normal, uv = dr.zeros(mi.Normal3f, count), dr.zeros(mi.Point2f, count)
+    shapes = scene.shapes()
+    while dr.any(active):
+        hit = scene.ray_intersect(ray, active)
+        active &= hit.is_valid()
+        shining = dr.max(hit.emitter(scene, active).eval(hit, active)) > 0.0
+        flags = hit.bsdf().flags()
+        clear = dr.max(hit.bsdf().eval_null_transmission(hit, active)) > 0.5
+        passes = active & mi.has_flag(flags, mi.BSDFFlags.Null) & (clear | ~mi.has_flag(flags, mi.BSDFFlags.Smooth))
+        passes &= ~shining
+        seen = active & ~passes
+        for place_of, shape in enumerate(shapes, 1):
+            number[seen & (hit.shape == mi.ShapePtr(shape))] = mi.UInt32(place_of)
+        face[seen] = hit.prim_index
+        depth[seen] = dr.norm(hit.p - eye)
+        z_depth[seen] = dr.dot(hit.p - eye, ahead)
+        normal[seen] = mi.Normal3f(hit.sh_frame.n)
+        uv[seen] = mi.Point2f(hit.uv.x, 1.0 - hit.uv.y)  # Mitsuba's rows of a texture begin at the top
+        ray, active = hit.spawn_ray(ray.d), passes
+    size = (height, width)
+    return Surfaces(
+        names=tuple(shape.id() for shape in shapes),
+        id=number.torch().reshape(size).long().cpu(),
+        depth=depth.torch().reshape(size).cpu(),
+        z_depth=z_depth.torch().reshape(size).cpu(),
+        normal=torch.stack([one.torch().reshape(size).cpu() for one in normal], dim=-1),
+        uv=torch.stack([one.torch().reshape(size).cpu() for one in uv], dim=-1),
+        face=face.torch().reshape(size).long().cpu(),
+    )

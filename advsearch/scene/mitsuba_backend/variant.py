@@ -34,32 +34,35 @@ def mitsuba() -> ModuleType:
     first = "mitsuba" not in sys.modules
     if first:
         ensure_llvm()
-    # not before `mitsuba()`, which sees to libLLVM
-    import mitsuba as mi
+    # not before libLLVM is chosen
+    import mitsuba
 
-    if mi.variant() != VARIANT:
-        mi.set_variant(VARIANT)
+    if mitsuba.variant() != VARIANT:
+        mitsuba.set_variant(VARIANT)
         first = True
     if first:
-        _settle(mi)
-    module: ModuleType = mi
-    return module
+        _settle(mitsuba)
+    return mitsuba
 
 
-def mitsuba_and_drjit() -> tuple[ModuleType, ModuleType]:
-    """`mitsuba`, and Dr.Jit, which may not be imported before: it looks for libLLVM then."""
-    mi = mitsuba()
-    import drjit as dr  # see above
+class _Late:
+    """A module that is imported once it is used, with our variant: Dr.Jit looks for libLLVM as it is imported."""
 
-    return mi, dr
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        mitsuba()
+        return getattr(sys.modules[self._name], name)
+
+
+mi: Any = _Late("mitsuba")
+dr: Any = _Late("drjit")
 
 
 @contextmanager
 def fewer_warnings() -> Iterator[None]:
     """Keep Mitsuba from warning of what is told here."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import mitsuba as mi
-
     before = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:
@@ -74,9 +77,6 @@ def recorded(render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]
     Nothing may be freed while it records: memory that torch shares and scenes end with a host function, which Dr.Jit
     1.5.0 cannot record, and the process ends. So Python's garbage collector waits until after.
     """
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit as dr
-
     frozen = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
 
     def function(*arguments: Any) -> Any:
@@ -91,14 +91,14 @@ def recorded(render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]
     return function
 
 
-def _settle(mi: ModuleType) -> None:
+def _settle(module: ModuleType) -> None:
     """Only warnings are logged, Dr.Jit's pool gets the size that `advsearch.threads` chose, and Python's garbage
     collector, which every change of the scenes calls, passes over what has been imported by now: 0.2 s each time."""
-    # not before `mitsuba()`, which sees to libLLVM
-    import drjit as dr
+    # not before libLLVM is chosen
+    import drjit
 
-    mi.set_log_level(mi.LogLevel.Warn)
-    dr.set_log_level(dr.LogLevel.Warn)
+    module.set_log_level(module.LogLevel.Warn)
+    drjit.set_log_level(drjit.LogLevel.Warn)
     threads.apply_to_drjit()
     gc.freeze()
 

@@ -13,37 +13,88 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.assets import Bools
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
-from advsearch.scene.mitsuba_backend.lobes import Lobes, measured
-from advsearch.scene.mitsuba_backend.surface import Lit, Seen, Views, lit_arrays
-from advsearch.scene.mitsuba_backend.texel_rays import Ints, gather, seen_from_behind, to_map, towards
-from advsearch.scene.photograph import irradiance as unshadowed
+from advsearch.scene.grounds import irradiance as unshadowed
+from advsearch.scene.mitsuba_backend.surface import RAYS, Lit, Seen, Views, lit_arrays
+from advsearch.scene.mitsuba_backend.texel_rays import Ints, Lobes, gather, measured, seen_from_behind, to_map, towards
+from advsearch.scene.raster import rasterised
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.light import (
+from advsearch.scene.surface.texels import (
     BLURRED,
     CELLS,
+    SIDE,
     WIDTHS,
+    Texels,
+    between,
     blurred,
     directions,
     irradiance,
     looked_up,
+    on_ground,
+    on_mesh,
     seen_of,
     sky_of,
+    smoothed,
+    together,
 )
-from advsearch.scene.surface.texels import SIDE, Texels, between, on_ground, on_mesh, smoothed, together
-from advsearch.scene.surface.view import SparseProduct, SurfaceView
-from advsearch.scene.surface_map import rasterised
 from advsearch.scene.transport.matrix import bilinear
+
+
+class SurfaceView:
+    """What one camera sees: `rest`, and a sparse matrix from the fine grid, front and back, to the pixels.
+
+    Args:
+        seen: by several cameras.
+        number: of this one.
+        shape: rows and columns of the fine grid.
+        sides: 2 where the back of the surface has light of its own.
+    """
+
+    def __init__(self, seen: Seen, number: int, shape: tuple[int, int], sides: int = 1) -> None:
+        self.rest, self.covered = seen.rest[number], seen.covered[number]
+        height, width = self.rest.shape[:2]
+        ends = torch.tensor([number, number + 1]) * (height * width * RAYS)
+        begin, end = torch.searchsorted(seen.sample, ends).tolist()
+        pixel = (seen.sample[begin:end] - int(ends[0])) // RAYS
+        columns, shares = bilinear(seen.uv[begin:end].numpy(), shape)
+        columns += np.int32(shape[0] * shape[1]) * seen.back[begin:end].numpy()[:, None]
+        weights = shares * seen.weight[begin:end].numpy()[:, None]
+        starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
+        size = height * width, sides * shape[0] * shape[1]
+        self.matrix = scipy.sparse.csr_matrix(
+            (weights.ravel(), columns.ravel(), starts.astype(np.int32)), size, copy=False
+        )
+
+    def radiance(self, reflected: Tensor) -> Tensor:
+        """Return (H, W, 3) for what the fine grid reflects (sides x cells, 3); differentiable in it."""
+        found: Tensor = SparseProduct.apply(self.matrix, reflected)  # type: ignore[no-untyped-call]
+        return self.rest + found.reshape(self.rest.shape)
+
+
+class SparseProduct(torch.autograd.Function):
+    """A sparse matrix times columns, with its transpose as the derivative."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
+        ctx.matrix = matrix
+        return torch.from_numpy(matrix @ values.detach().numpy())
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[None, Tensor]:
+        return None, torch.from_numpy(ctx.matrix.T @ cotangent.numpy())
+
 
 GATHERED = 256
 """Rays from each texel that say what it sees."""
@@ -137,7 +188,7 @@ class Arrangement:
     def _value(self, name: str) -> Tensor:
         return self.inputs[name] if name in self.inputs else self._scene.base(name)
 
-    def _buried(self, seen: Ints, side: int) -> npt.NDArray[np.bool_]:
+    def _buried(self, seen: Ints, side: int) -> Bools:
         """Which texels of a side of the object lie inside of something: they see nothing but backs, or much of them
         and no sky where backs have light of their own."""
         here = seen[self.texels.of(side)]
@@ -232,7 +283,9 @@ class Arrangement:
                 if self._photographed is not None:
                     leaving[ground] = arriving[ground] / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
                 leaving[ground] = self._smooth @ leaving[ground]
-                unhidden = self._border(leaving[ground])
+                cells = leaving[ground].reshape(*self.texels.grids[-1].shape, 3)
+                rim = torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]])  # the object hides little of it
+                unhidden = rim.mean(dim=0, keepdim=True).clamp_min(1e-9)
                 seen = unhidden
                 if self._photographed is not None:
                     seen = unhidden * looked_up(padded, below.reshape(-1, 3)).reshape(*BLURRED, 3)
@@ -240,11 +293,6 @@ class Arrangement:
             on_object = torch.cat([one @ arriving[self.texels.of(side)] for side, one in enumerate(self._between)])
             cells = torch.cat([leaving[torch.from_numpy(self.texels.of_cell)], unhidden])
             return Light(on_object, lit_arrays(cells, padded, blurred(shown)))
-
-    def _border(self, ground: Tensor) -> Tensor:
-        """The mean (1, 3) of a ground's light at its border, where the object hides little of it."""
-        cells = ground.reshape(*self.texels.grids[-1].shape, 3)
-        return torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]]).mean(dim=0, keepdim=True).clamp_min(1e-9)
 
     def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """(n, 3) of each texel, the gloss counted as if it were diffuse."""

@@ -1,9 +1,12 @@
-"""A renderer of pictures from many cameras and under many environments: light is kept on surfaces."""
+"""A renderer of pictures from many cameras and under many environments: light is kept on surfaces.
+
+`why_not` says which scenes and spaces have pictures that it may predict.
+"""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,11 +14,12 @@ import torch
 from torch import Tensor
 
 from advsearch.files import scaled
+from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light
-from advsearch.scene.surface.view import SurfaceView
-from advsearch.scene.transport.renderer import MOST_BYTES, PredictingRenderer
+from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
+from advsearch.scene.transport.lights import NOISE
+from advsearch.scene.transport.matrix import MOST_BYTES, PredictingRenderer
 
 MOST_RAYS = 1 << 21
 """Rays of cameras of one launch."""
@@ -54,7 +58,7 @@ class Sketch:
 
 
 class SurfaceRenderer(PredictingRenderer):
-    """A renderer whose pictures come from light on surfaces; for spaces that `plan.why_not` says nothing against.
+    """A renderer whose pictures come from light on surfaces; for spaces that `why_not` says nothing against.
 
     A picture is linear in the base colour of the object. Light that goes from the object to itself, or to the ground
     and back, is that of the base colour `there`.
@@ -159,11 +163,7 @@ class SurfaceRenderer(PredictingRenderer):
                 yield Look(number, self.arrangement.view(seen, place), lit, lights[number][1])
 
     def shown(
-        self,
-        looks: Iterable[Look],
-        inputs: Sequence[Mapping[str, Tensor]],
-        color: Tensor,
-        wholes: Sequence[Tensor],
+        self, looks: Iterable[Look], inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]
     ) -> Tensor:
         """Return the pictures of what cameras see; arguments as of `pictures`."""
         fine, reflected, found = self.arrangement.finer(color), dict[Light, Tensor](), dict[int, Tensor]()
@@ -190,3 +190,69 @@ class SurfaceRenderer(PredictingRenderer):
 
 def _same(one: Tensor, other: Tensor) -> bool:
     return one.shape == other.shape and torch.equal(one, other)
+
+
+PLACES = (0.02, 0.29, 0.61, 0.97)
+"""Places in the range of what varies at which is looked what it changes."""
+
+
+def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
+    """Why light on surfaces cannot predict the pictures of a renderer's space, in words; None if it may: how far it is
+    off is then for measurement.
+
+    Args:
+        renderer: which traces.
+        varying: names of the controls that vary; the others are searched, and may change base colours alone.
+    """
+    reason = why_not_kept(renderer)
+    if reason is not None:
+        return reason
+    for group in renderer.plan.groups:
+        if group.control in varying or group.estimator == "image":
+            continue
+        reached = renderer.routes.get(group.name, frozenset())
+        if reached != {COLOR}:
+            return f"{group.name} changes more than the object's base colour"
+    changed = varied(renderer, varying)
+    if not changed <= FREE:
+        return f"{', '.join(sorted(changed - FREE))} varies, and light on surfaces is kept for one arrangement"
+    return None if changed & CAMERAS else "no camera varies"
+
+
+def why_not_kept(renderer: Renderer) -> str | None:
+    """Why light cannot be kept on the surfaces of a renderer's scene, in words; None if it may be."""
+    description = renderer.scene.made[0]
+    thing = description.meshes[OBJECT]
+    if thing.mesh.repeats or thing.surface is not None:
+        return "the object's surface repeats its texture, or is one of Mitsuba's own"
+    if description.environment is None or description.emits or len(description.parts) > 0:
+        return "there is more in the scene than the object, its ground and an environment"
+    if renderer.scene.volumetric or description.thin_lens or description.backdrop:
+        return "there is haze, a lens with an aperture, or a plain background"
+    if renderer.formation.denoiser != "oidn":
+        return NOISE
+    return None
+
+
+def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
+    """The scene inputs that some controls, or groups of coordinates, change; by their names."""
+    with torch.no_grad():
+        start = renderer.scene.assembly(renderer.space.inputs(renderer.start))
+        found: set[str] = set()
+        for place in _places(renderer, varying):
+            there = renderer.scene.assembly(renderer.space.inputs(place))
+            found |= {name for name in start.keys() | there.keys() if _differs(start.get(name), there.get(name))}
+    return frozenset(found)
+
+
+def _places(renderer: Renderer, varying: Collection[str]) -> Iterator[Tensor]:
+    for value in PLACES:
+        place = renderer.start.clone()
+        for group in renderer.space.groups:
+            if group.control in varying or group.name in varying:
+                place[group.coordinates] = value
+        yield place
+
+
+def _differs(one: Tensor | None, other: Tensor | None) -> bool:
+    return one is None or other is None or one.shape != other.shape or not torch.equal(one, other)

@@ -22,11 +22,11 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.environments import real_harmonics
 from advsearch.scene.gradients import Group
-from advsearch.scene.harmonics import real_harmonics
 from advsearch.scene.parts import PluginPart
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.renderer import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
+from advsearch.scene.transport.matrix import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
 
 ENVIRONMENT = "environment.padded"
 LAMPS = (".intensity", ".radiance")

@@ -16,8 +16,8 @@ from covering import once_each
 from torch import Tensor
 
 from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
+from advsearch.attacks.evaluation import Policy, one_thread, seeded
 from advsearch.attacks.policies.auto import LOW, make_plan
-from advsearch.attacks.policies.base import Policy, one_thread, seeded
 from advsearch.attacks.policies.surrogate import box_coordinates, fit
 
 POSE = (Block(3, name="position"), Block(3, periodic=True, name="rotation"))

@@ -35,8 +35,8 @@ from advsearch.attacks import (
     make_policy,
     search,
 )
+from advsearch.attacks.evaluation import Counts, seeded
 from advsearch.attacks.objectives import OBJECTIVES
-from advsearch.attacks.policies.base import Counts, seeded
 from advsearch.attacks.policies.pgd import Window
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream

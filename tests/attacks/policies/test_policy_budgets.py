@@ -18,6 +18,7 @@ from conftest import ROOT
 from advsearch.attacks import POLICIES, Block, Domain, Ending, Evaluation, Policy, Query, make_policy, search
 
 PAGE = (ROOT / "docs" / "policies" / "README.md").read_text("utf-8")
+EXTENDING = (ROOT / "docs" / "extending.md").read_text("utf-8")
 
 CHEAP = {"auto": 200, "cmaes": 500, "portfolio": 200}
 """Budgets up to so many renders are played, with three seeds each; up to 2,000 of a policy that is not named here."""
@@ -117,21 +118,21 @@ def test_the_page_has_a_row_with_every_option_and_its_default(name: str) -> None
 
 
 def users_class() -> Any:
-    """The class of the page's example."""
-    block = next(b for b in re.findall(r"^```python\n(.*?)^```$", PAGE, re.M | re.S) if "class Walk(" in b)
-    module = ModuleType("walk_of_the_page")
+    """The class of the example on the page about extending."""
+    block = next(b for b in re.findall(r"^```python\n(.*?)^```$", EXTENDING, re.M | re.S) if "class Shrinking(" in b)
+    module = ModuleType("policy_of_the_page")
     sys.modules[module.__name__] = module
-    exec(compile(block, "README.md", "exec"), module.__dict__)
-    return module.__dict__["Walk"]
+    exec(compile(block, "extending.md", "exec"), module.__dict__)
+    return module.__dict__["Shrinking"]
 
 
 def test_the_policy_of_the_page_works() -> None:
-    walk: Policy[Any] = users_class()()
+    own: Policy[Any] = users_class()()
     problem = closed_form.OBJECTIVES["quadratic, box"](6, 0)
-    result = search(partial(map, problem.evaluate), problem.domain, walk, steps=400, seed=0, candidates=0)
+    result = search(partial(map, problem.evaluate), problem.domain, own, steps=400, seed=0, candidates=0)
     assert problem.value(result.best_u) > 0.9 * problem.optimum
     assert result.stopped is Ending.BUDGET_SPENT
-    beside = make_policy("portfolio", policies=[walk, "auto"])
+    beside = make_policy("portfolio", policies=[own, "auto"])
     assert search(partial(map, problem.evaluate), problem.domain, beside, steps=40, seed=0).best_objective > 0.0
 
 

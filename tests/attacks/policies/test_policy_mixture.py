@@ -12,7 +12,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.candidates import Failures, FailureShare, failure_share
-from advsearch.attacks.policies.base import one_thread
+from advsearch.attacks.evaluation import one_thread
 from advsearch.errors import InputError
 
 BOX = Domain(

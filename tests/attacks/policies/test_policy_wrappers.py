@@ -35,8 +35,8 @@ from advsearch.attacks import (
     search,
     seeded,
 )
+from advsearch.attacks.evaluation import affordable
 from advsearch.attacks.policies import choices
-from advsearch.attacks.policies.base import affordable
 from advsearch.attacks.policies.choices import MOST, Stay, with_choices
 from advsearch.errors import InputError, UnknownNameError
 

@@ -25,13 +25,14 @@ from torch import Tensor
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.cluster.executor import InProcess
+from advsearch.cluster import InProcess
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.report.evidence import claims_of
-from advsearch.questions.test import claims, words
+from advsearch.questions.test import answer as words
+from advsearch.questions.test import claims
 from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
 from advsearch.questions.test.carry_out import test_from_config as carry_out
 from advsearch.questions.test.counterexamples import _Block as Block

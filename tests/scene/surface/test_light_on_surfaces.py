@@ -12,12 +12,11 @@ from torch import Tensor
 
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene.library import load_object
-from advsearch.scene.mitsuba_backend.lobes import measured
+from advsearch.scene.mitsuba_backend.texel_rays import measured
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import arrangement, renderer, texels
-from advsearch.scene.surface.light import sky_of
-from advsearch.scene.surface.plan import why_not
-from advsearch.scene.surface.renderer import SurfaceRenderer
+from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
+from advsearch.scene.surface.texels import sky_of
 
 SIDE = 32
 VARYING = ["camera", "environment"]

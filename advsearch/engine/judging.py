@@ -1,0 +1,304 @@
+"""What pictures are judged by: what is true of a scene, and metrics, numbers of one's own for every picture."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.attacks.objectives import labels_of
+from advsearch.config import SceneConfig
+from advsearch.controls import Space
+from advsearch.described import Value
+from advsearch.engine.loading import Scene
+from advsearch.engine.rendering import pictures_of, render, sight_of
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.options import check_takes
+from advsearch.registry import check_import, current_directory_importable
+from advsearch.report.phrases import seen_text
+from advsearch.runs.export import AFTER, OWN
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.transport.matrix import linear_inputs
+from advsearch.tasks import Answer, Facts, Judgement, Task
+from advsearch.tasks.base import Output, Truth, mean
+
+Metric = Callable[[Tensor, Any, Any], Any]
+"""f(image, output, truth), which returns a number, or numbers by name. Where one name is right, `truth` is its index, a
+tensor without axes."""
+
+Metrics = Mapping[str, Metric]
+"""Metrics by the names of their columns."""
+
+MAIN = "__main__"
+"""The script that runs, which workers on this machine import too."""
+
+
+def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
+    """Return metrics as a file names them: "package.module:function"; one that cannot be named, by its bare name."""
+    if not isinstance(metrics, Mapping) or not all(isinstance(name, str) for name in metrics):
+        raise InputError(f'metrics: expected a mapping from names to functions, as {{"f": f}}, got {metrics!r:.80}')
+    for name, function in metrics.items():
+        if name in (*OWN, *AFTER) or not name:
+            raise InputError(f"metrics: {name!r} is a column that rows have already; choose another name")
+        if not (callable(function) or isinstance(function, str)):
+            raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {function!r:.80}")
+        if not isinstance(function, str):
+            check_takes(f"metrics: {name}", function, "image", "output", "truth")
+    return {name: one if isinstance(one, str) else _text(one) for name, one in metrics.items()}
+
+
+def _text(metric: Metric) -> str:
+    module, name = getattr(metric, "__module__", None), getattr(metric, "__qualname__", None)
+    found: Any = sys.modules.get(str(module))
+    for part in str(name).split("."):
+        found = getattr(found, part, None)
+    return f"{module}:{name}" if found is metric else str(getattr(metric, "__name__", type(metric).__name__))
+
+
+def only_here(settings: Mapping[str, str]) -> list[str]:
+    """Return the metrics, by name, that no file can name."""
+    return [name for name, text in settings.items() if ":" not in text or text.startswith(f"{MAIN}:")]
+
+
+def check_shared(settings: Mapping[str, str]) -> None:
+    """Refuse metrics that workers could not import."""
+    notebook = not hasattr(sys.modules[MAIN], "__file__")
+    for name, text in settings.items():
+        if ":" not in text or (notebook and text.startswith(f"{MAIN}:")):
+            raise InputError(
+                f"metrics: {name}: workers import a metric by its name, and {text.rpartition(':')[2]} has none that "
+                "they could; write it as a function of a module, or leave `workers` and `cluster` out"
+            )
+
+
+def load_metrics(settings: Mapping[str, str], given: Mapping[str, str | Metric] | None = None) -> Metrics:
+    """Return the functions that settings name; `given` ones are there already, and take their place."""
+    return {
+        name: one if callable(one := (given or {}).get(name)) else _imported(name, text)
+        for name, text in settings.items()
+    }
+
+
+def _imported(name: str, text: str) -> Metric:
+    module, colon, attribute = text.partition(":")
+    if not colon or not attribute:
+        raise InputError(f"metrics: {name}: expected package.module:function, got {text!r}")
+    check_import(text)
+    try:
+        with current_directory_importable():
+            found: Any = import_module(module)
+            for part in attribute.split("."):
+                found = getattr(found, part)
+    except Exception as error:  # the user's code may raise anything
+        raise InputError(
+            f"metrics: {name}: {text} cannot be imported ({type(error).__name__}: {error}); a module is looked for on "
+            f"the Python path and in {os.getcwd()}"
+        ) from error
+    if not callable(found):
+        raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {found!r:.80}")
+    metric: Metric = found
+    return metric
+
+
+def judgements(
+    task: Task, output: Output, pictures: Tensor, truths: Sequence[Truth], metrics: Metrics = MappingProxyType({})
+) -> list[Judgement]:
+    """Return what a task and metrics say of pictures (N, H, W, 3), sRGB in [0, 1]: the one place where a run judges.
+    Each picture has its truth, or one is for all."""
+    with torch.no_grad():
+        if len(truths) == 1:
+            said, truths = task.judge(output, truths[0]), [truths[0]] * len(pictures)
+        else:
+            said = [task.judge(output[k : k + 1], truth)[0] for k, truth in enumerate(truths)]
+    if not metrics:
+        return said
+    return [measured(said[k], metrics, pictures[k], output[k : k + 1], truth) for k, truth in enumerate(truths)]
+
+
+def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth) -> Judgement:
+    """Return the judgement of a picture (H, W, 3), sRGB in [0, 1], with what metrics say of it. A metric gets the truth
+    as an objective does, of one picture."""
+    if not metrics:
+        return judgement
+    found: dict[str, float | None] = {}
+    seen, right = _of_one(output, truth)
+    with torch.no_grad():
+        for name, metric in metrics.items():
+            said = metric(image.detach().clone(), seen, right)
+            if isinstance(said, Mapping):
+                found |= {f"{name}.{key}": _number(f"{name}.{key}", one) for key, one in said.items()}
+            else:
+                found[name] = _number(name, said)
+    return replace(judgement, metrics=found)
+
+
+def _of_one(output: Output, truth: Truth) -> tuple[Any, Any]:
+    """The output and the truth of one picture as a metric gets them; of several models, a tuple of each."""
+    one = output[0]
+    if isinstance(one, (tuple, list)):
+        each = [_of_one(own, true) for own, true in zip(one, truth, strict=True)]
+        return tuple(seen for seen, _ in each), tuple(right for _, right in each)
+    labels = labels_of(truth, output, 1)
+    return one, labels[0] if isinstance(labels, Tensor) else labels
+
+
+def mean_metrics(judgements: Sequence[Judgement | None]) -> dict[str, float | None] | None:
+    """Return the mean of each metric over pictures of which it is a number; None where there are no metrics."""
+    each = [one.metrics for one in judgements if one is not None and one.metrics is not None]
+    names = dict.fromkeys(name for metrics in each for name in metrics)
+    numbers = {name: [one for metrics in each if (one := metrics.get(name)) is not None] for name in names}
+    return {name: mean(found) if found else None for name, found in numbers.items()} or None
+
+
+def _number(name: str, said: Any) -> float | None:
+    try:
+        number = float(said)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(
+            f"metrics: {name}: expected a number, or a dict from names to numbers, got {said!r:.80}"
+        ) from None
+    return number if math.isfinite(number) else None
+
+
+LOOK_SPP = 16
+"""Samples a pixel of the clean picture that the model is shown."""
+
+Described = Callable[[], Mapping[str, Value]]
+"""What says the configuration in named values, when it is asked."""
+
+
+Looked = Callable[[], Surfaces]
+"""What says what the camera sees, when it is asked."""
+
+
+def facts_of(scene: Scene, name: str, label: str | None, describe: Described, look: Looked | None = None) -> Facts:
+    """Return what a scene gives a task to judge by: what `describe` says of the configuration, and of the rest what the
+    scene was given; and what `look` sees, if anything looks."""
+    fixed = {key: value for key, value in scene.description.values.items() if value is not None}
+
+    def numbers() -> dict[str, float]:
+        said = {key: one["value"] for key, one in describe().items()}
+        return {key: float(v) for key, v in {**fixed, **said}.items() if isinstance(v, (int, float))}
+
+    sight = None if look is None else lambda: sight_of(look())
+    return Facts(name, label, scene.description.object.label, numbers, sight)
+
+
+def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig) -> Task:
+    """Return the task after it has seen what its model answers to clean pictures, where it asks for that (`looks`). The
+    next scene is shown where those before leave open how answers are to be read."""
+    if not task.looks:
+        return task
+    for scene in scenes:
+        view = render(scene, model, task=task, label=config.label, spp=LOOK_SPP, **pictures_of(config)).views[0]
+        task = task.seeing(view.output, view.truth)
+        if not task.unsaid:
+            return task
+    raise InputError(f"model {model.name}: {task.unsaid}")
+
+
+def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:
+    """Refuse a scene of which the task cannot say what is right, before anything is prepared; where no label was given,
+    with the model's first answers to a clean picture."""
+    try:
+        task.check(facts)
+    except InputError as error:
+        if facts.label is not None:
+            raise
+        raise InputError(f"{error}; {_advice(task, model, scene, config)}") from None
+
+
+def one_label_for_several(models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]) -> list[str]:
+    """Return a sentence if a label that was given for all objects (None: each has its own) is not what some of them are
+    called, by the labels of their own."""
+    if label is None or len(objects) < 2:
+        return []
+    others = [f"{name} (its own is {own!r})" for name, own in objects.items() if own and _differs(models, label, own)]
+    if not others:
+        return []
+    return [
+        f"The label {label!r} is taken as the right answer for every object, also for {', '.join(others)}; without a "
+        "label, each object has its own."
+    ]
+
+
+def _differs(models: Sequence[Model], label: str, own: str) -> bool:
+    """Whether a model has classes for both labels, and none in common."""
+    for model in models:
+        try:
+            known = set(model.label_set(own).indices)
+        except InputError:
+            continue
+        if not known & set(model.label_set(label).indices):
+            return True
+    return False
+
+
+def _advice(task: Task, model: Model, scene: Scene, config: SceneConfig) -> str:
+    """What the model answers to a clean picture, and how to take the first of these for right."""
+    looked = render(scene, model, task=task, spp=LOOK_SPP, **pictures_of(config))
+    answers = looked.views[0].answers
+    listed = ", ".join(seen_text(task.name, replace(answer, label=repr(answer.label))) for answer in answers)
+    return (
+        f"model {model.name} calls a clean picture of it {listed}; name what is right, such as "
+        f'`label="{_term(model, answers[0])}"`'
+    )
+
+
+def _term(model: Model, answer: Answer) -> str:
+    """What names the class of an answer and no other: its label, or else its number."""
+    try:
+        known = model.label_set(answer.label).indices == (answer.index,)
+    except InputError:
+        known = False
+    return answer.label if known else f"#{answer.index}"
+
+
+MOST_NUMBERS, MOST = 64, 512
+"""Numbers, beside base colours, of a configuration whose truth is remembered; and truths that are."""
+
+
+@dataclass
+class KnownTruths:
+    """What is true of configurations; `facts` come from what describes one and what looks at it."""
+
+    task: Task
+    space: Space
+    renderer: Renderer
+    facts: Callable[[Described, Looked], Facts]
+    _kept: dict[bytes, Truth] = field(default_factory=dict)
+
+    def at(self, whole: Tensor) -> Truth:
+        """Return what is true at (d,) of the whole space. What the camera sees first has nothing to do with base
+        colours, so that a truth is remembered where the rest is a few numbers, unless the task asks for numbers."""
+        rest = whole.detach()[self._rest]
+        key = rest.numpy().tobytes()
+        if key in self._kept:
+            return self._kept[key]
+        facts = self.facts(lambda: self.space.describe(whole), lambda: self.renderer.surfaces(whole))
+        truth = self.task.truth(facts)
+        if len(rest) <= MOST_NUMBERS and "numbers" not in vars(facts):
+            while len(self._kept) >= MOST:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = truth
+        return truth
+
+    @cached_property
+    def _rest(self) -> Tensor:
+        """Which coordinates do more than to colour surfaces, (d,) bool."""
+        linear, rest = linear_inputs(self.renderer), torch.ones(len(self.space.start), dtype=torch.bool)
+        for group in self.space.groups:
+            route = self.renderer.routes.get(group.name)
+            rest[group.coordinates] = not route or not route <= linear
+        return rest

@@ -1,0 +1,383 @@
+"""A camera's model: where in the picture a point is seen, and along which ray a place in the picture looks.
+
+    Brown-Conrady:   (x, y) = (X, Y) / Z,  r^2 = x^2 + y^2
+                     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+                          + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4,                 y' likewise
+    fisheye:         (x', y') = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (X, Y) / |(X, Y)|
+    both:            column = fx x' + skew y' + cx,    row = fy y' + cy
+    equirectangular: longitude over the width, latitude over the height
+
+These are the models of OpenCV's `projectPoints` and `fisheye::projectPoints`, after Brown 1971 (Close-range camera
+calibration) and Kannala and Brandt 2006 (A generic camera model and calibration method for conventional, wide-angle,
+and fish-eye lenses, equation 6). theta is the angle to the axis.
+
+Points are in the camera's coordinates: x to the right, y down, z ahead. Places in the picture are shares of its width
+and height from the top left corner, and so are the focal lengths: a picture of another size is the same one, scaled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.polynomial import polynomial
+from torch import Tensor
+
+from advsearch.errors import InputError
+
+BROWN_CONRADY, FISHEYE, EQUIRECTANGULAR = "brown-conrady", "fisheye", "equirectangular"
+LINEAR = ("fx", "fy", "cx", "cy", "skew")
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+NUMBERS = (*LINEAR, *COEFFICIENTS)
+"""What the numbers of a model are, in their order."""
+OF_KIND: Mapping[str, tuple[str, ...]] = {BROWN_CONRADY: COEFFICIENTS, FISHEYE: COEFFICIENTS[:4], EQUIRECTANGULAR: ()}
+"""The coefficients that each kind of model has."""
+
+STEPS = 60
+"""Steps after which an inversion has converged or never does; nearly all take five."""
+TOLERANCE = 1e-10
+"""Distance, in focal lengths, under which an inversion has converged."""
+WIDEST = math.tan(math.radians(80.0))
+"""Tangent of the widest half angle that is framed."""
+FAR = 1e6
+"""Tangents are not looked for beyond this one."""
+
+Field = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """Intrinsics and distortion of a camera.
+
+    Attributes:
+        kind: `BROWN_CONRADY`, `FISHEYE` or `EQUIRECTANGULAR`.
+        numbers: (17,) in the order of `NUMBERS`: fx, cx and skew in picture widths, fy and cy in picture heights, and
+            the coefficients.
+        name: how it was asked for: a file, or a bundled one; empty where `camera.fov` says its focal length.
+        size: (height, width) in pixels that it was calibrated for; None for any.
+        reach: largest angle to the axis that it sees, degrees.
+    """
+
+    kind: str
+    numbers: tuple[float, ...]
+    name: str = ""
+    size: tuple[int, int] | None = None
+    reach: float = 180.0
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The numbers by name."""
+        return dict(zip(NUMBERS, self.numbers, strict=True))
+
+    def with_numbers(self, numbers: Tensor) -> CameraModel:
+        """Return the model with other numbers (17,)."""
+        return replace(self, numbers=tuple(float(one) for one in numbers.double()))
+
+    def check_given(self, given: Iterable[str]) -> None:
+        """Check that nobody asks for the field of view of a camera that has focal lengths of its own.
+
+        Raises:
+            InputError: it is among the settings that are given.
+        """
+        if "camera.fov" in given:
+            raise InputError(
+                f"`camera={self.name}` and `set` camera.fov contradict each other: the camera has focal lengths of its "
+                "own; leave one of the two out"
+            )
+
+    # ---- both ways --------------------------------------------------------------------------------------------------
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return where points (N, 3) are seen, (N, 2) in picture widths and heights, and which are, (N,) bool.
+
+        One may be seen outside of the picture. What is behind a lens, or beyond the angle at which it folds, is not.
+        """
+        x, y, z = points.double().unbind(dim=-1)
+        if self.kind == EQUIRECTANGULAR:
+            longitude, latitude = torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))
+            return torch.stack([0.5 + longitude / (2.0 * torch.pi), 0.5 + latitude / torch.pi], dim=-1), x == x
+        if self.kind == FISHEYE:
+            aside = torch.hypot(x, y)
+            angle = torch.atan2(aside, z)
+            scale = self._radial(angle) / aside.clamp_min(1e-300)
+            seen, bent = angle <= self._last, torch.stack([x * scale, y * scale], dim=-1)
+        else:
+            depth = torch.where(z > 0.0, z, torch.ones_like(z))
+            flat = torch.stack([x / depth, y / depth], dim=-1)
+            radius = flat.norm(dim=-1)
+            seen = (z > 0.0) & (radius <= self._last)
+            bent = self._bent(flat)
+        one = self.values
+        column = one["fx"] * bent[..., 0] + one["skew"] * bent[..., 1] + one["cx"]
+        return torch.stack([column, one["fy"] * bent[..., 1] + one["cy"]], dim=-1), seen
+
+    def rays(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the directions in which places (N, 2) in the picture look, and how far inside the view they are.
+
+        Found by Newton's method, kept within bounds by halving, and checked: a place whose inversion has not converged
+        to the branch that the axis lies on is outside.
+
+        Returns:
+            (N, 3) float64, of a fisheye and a panorama unit vectors, else with z = 1; and (N,) float64, over 0 where
+            something is seen: it changes its sign along the edge of that.
+        """
+        u, v = places.double().unbind(dim=-1)
+        if self.kind == EQUIRECTANGULAR:
+            longitude, latitude = (u - 0.5) * (2.0 * torch.pi), (v - 0.5) * torch.pi
+            level = latitude.cos()
+            return torch.stack([level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1), torch.ones_like(
+                u
+            )
+        one = self.values
+        y = (v - one["cy"]) / one["fy"]
+        x = (u - one["cx"] - one["skew"] * y) / one["fx"]
+        bent = torch.stack([x, y], dim=-1)
+        radius = bent.norm(dim=-1)
+        axis = bent / radius.clamp_min(1e-300)[..., None]
+        high = min(self._last, FAR)
+        most = float(self._radial(torch.tensor([high], dtype=torch.float64)))
+        if self.kind == FISHEYE:
+            angle, converged = self._inverted(radius, min(self.fold, math.pi))  # past its circle too, for its edge
+            directions = torch.cat([axis * angle.sin()[..., None], angle.cos()[..., None]], dim=-1)
+            return directions, _inside(most - radius, converged)
+        start, converged = self._inverted(radius, high)
+        flat = axis * start[..., None]
+        if any(self.numbers[NUMBERS.index("p1") :]):
+            flat, converged = self._newton(flat, bent, high)
+            radius = (bent - self._decentred(flat)).norm(dim=-1)
+        directions = torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1)
+        return directions, _inside(most - radius, converged)
+
+    def _inverted(self, wanted: Tensor, high: float) -> tuple[Tensor, Tensor]:
+        """Solve radial(found) = wanted within [0, high], where it grows; and which of them are solved."""
+        bound = min(1.0, high)
+        while bound < high and float(self._radial(torch.tensor(bound, dtype=torch.float64))) < float(wanted.max()):
+            bound = min(2.0 * bound, high)
+        low, most = torch.zeros_like(wanted), torch.full_like(wanted, bound)
+        found = torch.minimum(wanted, most)
+        for _ in range(STEPS):
+            square = found * found
+            scale, rise = self._scale(square)
+            error = found * scale - wanted
+            if bool(((error.abs() <= TOLERANCE) | (most - low <= TOLERANCE)).all()):
+                break
+            most, low = torch.where(error > 0.0, found, most), torch.where(error > 0.0, low, found)
+            step = found - error / (scale + 2.0 * square * rise)
+            found = torch.where((step > low) & (step < most), step, (low + most) / 2.0)
+        error = (self._radial(found) - wanted).abs()
+        return found, error <= 1e3 * TOLERANCE * (1.0 + wanted)
+
+    def _newton(self, flat: Tensor, bent: Tensor, high: float) -> tuple[Tensor, Tensor]:
+        """Solve bent(found) = bent in two dimensions from (N, 2); and which are solved, before the lens folds."""
+        converged = torch.zeros_like(flat[..., 0], dtype=torch.bool)
+        for _ in range(STEPS // 3):
+            error = self._bent(flat) - bent
+            (a, b), (c, d) = self._jacobian(flat)
+            determinant = a * d - b * c
+            inside = (determinant > 0.0) & (flat.norm(dim=-1) < high)
+            converged = inside & (error.norm(dim=-1) <= TOLERANCE * (1.0 + bent.norm(dim=-1)))
+            if bool(converged.all()):
+                break
+            safe = torch.where(determinant.abs() > 1e-12, determinant, torch.full_like(determinant, 1e-12))
+            x, y = error.unbind(dim=-1)
+            moved = flat - torch.stack([d * x - b * y, a * y - c * x], dim=-1) / safe[..., None]
+            radius = moved.norm(dim=-1, keepdim=True)
+            moved = torch.where(torch.isfinite(radius), moved * (high / radius.clamp_min(high)), flat)
+            flat = torch.where(converged[..., None], flat, moved)
+        return flat, converged
+
+    # ---- distortion -------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _polynomials(self) -> tuple[np.ndarray, np.ndarray]:
+        """Numerator and denominator of radial(r) / r in r^2."""
+        one = self.values
+        if self.kind == FISHEYE:
+            return np.array([1.0, one["k1"], one["k2"], one["k3"], one["k4"]]), np.ones(1)
+        over, under = ([1.0, *(one[name] for name in names)] for names in (("k1", "k2", "k3"), ("k4", "k5", "k6")))
+        return polynomial.polytrim(over), polynomial.polytrim(under)
+
+    @cached_property
+    def fold(self) -> float:
+        """Angle to the axis, radians, at which the radial distortion turns back; infinite if it never does.
+
+        Beyond it two directions are seen in one place, so that no picture tells them apart.
+        """
+        over, under = self._polynomials
+        square = np.array([0.0, 2.0])
+        slope = polynomial.polysub(
+            polynomial.polymul(polynomial.polyadd(over, polynomial.polymul(square, polynomial.polyder(over))), under),
+            polynomial.polymul(square, polynomial.polymul(over, polynomial.polyder(under))),
+        )
+        roots = np.concatenate([_positive_roots(slope), _positive_roots(under)])
+        if not roots.size:
+            return math.inf
+        last = math.sqrt(float(roots.min()))
+        return last if self.kind == FISHEYE else math.atan(last)
+
+    @cached_property
+    def _last(self) -> float:
+        """The last angle that a fisheye sees, or the last tangent that another lens does."""
+        if self.kind == FISHEYE:
+            return min(self.fold, math.radians(self.reach), math.pi)
+        return math.tan(self.fold) * (1.0 - 1e-9) if self.fold < math.pi / 2.0 else math.inf
+
+    def _scale(self, square: Tensor) -> tuple[Tensor, Tensor]:
+        """radial(r) / r at r^2, and its derivative with respect to r^2."""
+        over, under = self._polynomials
+        top, rise = _evaluated(over, square), _evaluated(polynomial.polyder(over), square)
+        if len(under) == 1:
+            return top, rise
+        bottom, fall = _evaluated(under, square), _evaluated(polynomial.polyder(under), square)
+        return top / bottom, (rise * bottom - top * fall) / (bottom * bottom)
+
+    def _radial(self, radius: Tensor) -> Tensor:
+        return radius * self._scale(radius * radius)[0]
+
+    def _bent(self, flat: Tensor) -> Tensor:
+        """Where tangents (N, 2) lie after the distortion."""
+        return flat * self._scale(flat.square().sum(dim=-1))[0][..., None] + self._decentred(flat)
+
+    def _decentred(self, flat: Tensor) -> Tensor:
+        """The part of the distortion that is not radial: of a lens off its centre, and of a thin prism."""
+        one, (x, y) = self.values, flat.unbind(dim=-1)
+        square = x * x + y * y
+        aside = 2.0 * one["p1"] * x * y + one["p2"] * (square + 2.0 * x * x) + square * (one["s1"] + one["s2"] * square)
+        below = one["p1"] * (square + 2.0 * y * y) + 2.0 * one["p2"] * x * y + square * (one["s3"] + one["s4"] * square)
+        return torch.stack([aside, below], dim=-1)
+
+    def _jacobian(self, flat: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """The derivative of `_bent`, row by row."""
+        one, (x, y) = self.values, flat.unbind(dim=-1)
+        square = x * x + y * y
+        scale, rise = self._scale(square)
+        turn = 2.0 * rise
+        aside, below = (2.0 * one[a] + 4.0 * one[b] * square for a, b in (("s1", "s2"), ("s3", "s4")))
+        p1, p2 = one["p1"], one["p2"]
+        return (
+            (
+                scale + turn * x * x + 2.0 * p1 * y + 6.0 * p2 * x + aside * x,
+                turn * x * y + 2.0 * p1 * x + 2.0 * p2 * y + aside * y,
+            ),
+            (
+                turn * x * y + 2.0 * p1 * x + 2.0 * p2 * y + below * x,
+                scale + turn * y * y + 6.0 * p1 * y + 2.0 * p2 * x + below * y,
+            ),
+        )
+
+    # ---- what follows from it ---------------------------------------------------------------------------------------
+
+    @cached_property
+    def tangents(self) -> tuple[float, float]:
+        """Half the sides of a rectangle around the axis, as tangents, that is in the picture as a whole."""
+        edges = self._half_widths()
+        along = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
+        rim = torch.stack(
+            [
+                torch.cat([along, along, torch.ones_like(along), -torch.ones_like(along)]),
+                torch.cat([torch.ones_like(along), -torch.ones_like(along), along, along]),
+            ],
+            dim=-1,
+        ) * torch.tensor(edges, dtype=torch.float64)
+        for share in torch.linspace(1.0, 0.02, 50).tolist():
+            points = torch.cat([share * rim, torch.ones_like(rim[:, :1])], dim=-1)
+            places, seen = self.project(points)
+            if bool((seen & (places >= -1e-6).all(dim=-1) & (places <= 1.0 + 1e-6).all(dim=-1)).all()):
+                break
+        return share * edges[0], share * edges[1]
+
+    def _half_widths(self) -> tuple[float, float]:
+        """The tangents at which the picture ends to the nearer side, along its row and its column through the axis."""
+        middle, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
+        found = []
+        for axis in (0, 1):
+            line = middle.repeat(512, 1)
+            tangents = []
+            for end in (0.0, 1.0):
+                line[:, axis] = torch.linspace(float(middle[0, axis]), end, 512, dtype=torch.float64)
+                directions, inside = self.rays(line)
+                seen = (inside > 0.0) & (directions[:, 2] > 0.1)
+                aside = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
+                tangents.append(float(torch.where(seen, aside, torch.zeros_like(aside)).max()))
+            found.append(min(WIDEST, *tangents))
+        return max(found[0], 1e-3), max(found[1], 1e-3)
+
+    @cached_property
+    def black(self) -> float:
+        """Share of the picture in which nothing is seen."""
+        step = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
+        places = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(-1, 2)
+        return float((self.rays(places)[1] <= 0.0).double().mean())
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of it, in sentences."""
+        if self.black == 0.0:
+            return ()
+        name = self.name or "the lens"
+        if self.fold < math.radians(self.reach):
+            return (
+                f"{name}: the lens folds at {math.degrees(self.fold):.1f} degrees from its axis, and "
+                f"{100.0 * self.black:.2g} % of the picture, which only directions beyond that would fill, is black.",
+            )
+        return (f"{name}: {100.0 * self.black:.2g} % of the picture lies outside the lens's circle and is black.",)
+
+    def scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
+        """Return what is to be said of a picture of another size (height, width) than the model is for."""
+        if self.size is None or self.size == resolution:
+            return ()
+        (tall, wide), (height, width) = self.size, resolution
+        shape = wide * height / (tall * width)
+        squeezed = f", which makes things {shape:.3g} times as high for their width" if abs(shape - 1.0) > 0.005 else ""
+        return (
+            f"{self.name} is for {wide} x {tall} pixels (width x height): its focal lengths and its principal point "
+            f"are scaled to {width} x {height}{squeezed}.",
+        )
+
+
+def pinhole(fov: float, aspect: float) -> CameraModel:
+    """Return the model of a camera without distortion.
+
+    Args:
+        fov: field of view along the larger side of the picture, degrees.
+        aspect: width over height of the picture.
+    """
+    focal = 0.5 / math.tan(math.radians(fov) / 2.0)
+    linear = (focal * max(1.0, 1.0 / aspect), focal * max(1.0, aspect), 0.5, 0.5, 0.0)
+    return CameraModel(BROWN_CONRADY, (*linear, *[0.0] * len(COEFFICIENTS)))
+
+
+def bundled(aspect: float = 1.0) -> Mapping[str, CameraModel]:
+    """Return the models that need no file, by name, for a picture of a shape."""
+    half, none = 1.0 / math.pi, [0.0] * len(COEFFICIENTS)
+    ideal = (half * min(1.0, 1.0 / aspect), half * min(1.0, aspect), 0.5, 0.5, 0.0, *none)
+    whole = (1.0, 1.0, 0.5, 0.5, 0.0, *none)
+    return {
+        FISHEYE: CameraModel(FISHEYE, ideal, FISHEYE, reach=90.0),
+        EQUIRECTANGULAR: CameraModel(EQUIRECTANGULAR, whole, EQUIRECTANGULAR),
+    }
+
+
+def _positive_roots(coefficients: np.ndarray) -> np.ndarray:
+    """The real positive roots of a polynomial, lowest power first."""
+    trimmed = polynomial.polytrim(np.asarray(coefficients, dtype=np.float64))
+    roots = polynomial.polyroots(trimmed) if len(trimmed) > 1 else np.zeros(0)
+    real = roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)]
+    return np.asarray(real[real > 0.0])
+
+
+def _evaluated(coefficients: np.ndarray, at: Tensor) -> Tensor:
+    """A polynomial, lowest power first."""
+    found = torch.full_like(at, float(coefficients[-1]))
+    for one in coefficients[-2::-1]:
+        found = found * at + float(one)
+    return found
+
+
+def _inside(margin: Tensor, converged: Tensor) -> Tensor:
+    """The margin, at most 1, below zero where an inversion has not converged."""
+    return torch.where(converged | (margin <= 0.0), margin, torch.full_like(margin, -1e-6)).clamp(-1.0, 1.0)

@@ -1,0 +1,296 @@
+"""Pictures of a scene by Cycles, Blender's path tracer, in a process of Blender's own that reads the scene as glTF.
+
+It is the same scene in other words, not the same picture: textures have 8 bits, surfaces are Blender's, round lamps are
+faceted, and light is sampled in Cycles' way.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import tempfile
+import time
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import torch
+from torch import Tensor
+
+from advsearch import files
+from advsearch.errors import AdvsearchError, FileFormatError
+from advsearch.scene.assets import Material, Mesh
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.glb import PosedMesh, glb, posed
+from advsearch.scene.grounds import paved
+from advsearch.scene.importing.blender import command, last_line, surroundings
+from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
+
+LONGEST = 300
+"""Seconds that one picture may take, the start included, before `advsearch.files.scaled`."""
+MATT = Material(roughness=1.0, metallic=0.0, specular=0.0)
+"""Of the ground."""
+PAUSE = 0.02
+"""Seconds between looks at whether a picture is there."""
+
+RENDER = """
+import json, math, os, sys
+import bpy
+from mathutils import Matrix
+folder = sys.argv[-1]
+with open(os.path.join(folder, "scene.json")) as file:
+    told = json.load(file)
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.import_scene.gltf(filepath=os.path.join(folder, "scene.glb"))
+scene = bpy.context.scene
+def put(name, data, matrix):
+    found = bpy.data.objects.new(name, data)
+    found.matrix_world = Matrix(matrix)
+    scene.collection.objects.link(found)
+    return found
+camera = bpy.data.cameras.new("camera")
+camera.sensor_fit, camera.angle, camera.clip_start, camera.clip_end = "AUTO", told["fov"], 0.01, 1e5
+camera.shift_x, camera.shift_y = told["shift"]
+scene.camera = put("camera", camera, told["camera"])
+for one in told["lamps"]:
+    strength = max(one["color"]) or 1.0
+    color = [value / strength for value in one["color"]]
+    if one["ball"] is None:
+        lamp = bpy.data.lights.new("lamp", "POINT")
+        lamp.energy, lamp.color, lamp.shadow_soft_size = 4.0 * math.pi * strength, color, 0.0
+        put("lamp", lamp, one["place"])
+        continue
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32, radius=1.0)
+    ball = bpy.context.object
+    ball.matrix_world, ball.visible_shadow = Matrix(one["ball"]), False
+    bpy.ops.object.shade_smooth()
+    material = bpy.data.materials.new("lamp")
+    material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    glow, out = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    side, front = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeMath")  # a ball that throws no shadow
+    front.operation, front.inputs[1].default_value = "LESS_THAN", 0.5               # would show its inside too
+    links.new(side.outputs["Backfacing"], front.inputs[0])
+    power = nodes.new("ShaderNodeMath")
+    power.operation, power.inputs[1].default_value = "MULTIPLY", strength
+    links.new(front.outputs[0], power.inputs[0])
+    links.new(power.outputs[0], glow.inputs["Strength"])
+    glow.inputs["Color"].default_value = (*color, 1.0)
+    links.new(glow.outputs[0], out.inputs["Surface"])
+    ball.data.materials.append(material)
+world = bpy.data.worlds.new("world")
+scene.world = world
+world.use_nodes = True
+nodes, links = world.node_tree.nodes, world.node_tree.links
+nodes.clear()
+back, out = nodes.new("ShaderNodeBackground"), nodes.new("ShaderNodeOutputWorld")
+back.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+links.new(back.outputs[0], out.inputs["Surface"])
+if told["environment"]:
+    image = bpy.data.images.load(os.path.join(folder, "environment.exr"))
+    image.colorspace_settings.name = "Linear Rec.709"
+    texture, turn = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeMapping")
+    texture.image, turn.vector_type = image, "POINT"
+    turn.inputs["Rotation"].default_value = (0.0, 0.0, told["turn"])
+    links.new(nodes.new("ShaderNodeTexCoord").outputs["Generated"], turn.inputs["Vector"])
+    links.new(turn.outputs[0], texture.inputs["Vector"])
+    links.new(texture.outputs["Color"], back.inputs["Color"])
+    back.inputs["Strength"].default_value = told["strength"]
+render, cycles = scene.render, scene.cycles
+render.engine, render.resolution_x, render.resolution_y = "CYCLES", told["width"], told["height"]
+render.resolution_percentage, render.use_file_extension, render.use_compositing = 100, False, False
+render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
+cycles.device, cycles.pixel_filter_type, cycles.filter_width = "CPU", "BOX", 1.0
+cycles.use_adaptive_sampling, cycles.use_denoising = False, told["denoise"]
+cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
+for kind in ("max_bounces", "diffuse_bounces", "glossy_bounces", "transmission_bounces"):
+    setattr(cycles, kind, told["bounces"])
+for line in sys.stdin:
+    seed, cycles.samples, name = (int(part) for part in line.split())
+    cycles.seed = seed % 2 ** 31
+    path = os.path.join(folder, str(name))
+    render.filepath = path + ".part"
+    bpy.ops.render.render(write_still=True)
+    os.replace(path + ".part", path + ".exr")
+"""
+
+
+class BlenderError(AdvsearchError):
+    """Blender is not there, cannot show a scene, or stopped."""
+
+
+class Cycles:
+    """Renders the configurations of one scene by Cycles.
+
+    Args:
+        description: of the scene.
+        resolution: (height, width) in pixels.
+        max_depth: longest light path in segments.
+        denoise: with Blender's Open Image Denoise.
+
+    Raises:
+        BlenderError: there is no Blender, or the scene has what is not carried over.
+    """
+
+    def __init__(
+        self, description: SceneDescription, resolution: tuple[int, int], *, max_depth: int, denoise: bool
+    ) -> None:
+        try:
+            self._command = command("Blender's Cycles has to render it", "leave `ways=blender` out")
+        except FileFormatError as error:
+            raise BlenderError(str(error)) from None
+        unknown = [one.name for one in description.parts if not isinstance(one, (MeshPart, PointLamp, BallLamp))]
+        unknown += [
+            f"a surface of Mitsuba's own on the {name}" for name, one in description.meshes.items() if one.surface
+        ]
+        unknown += ["a lens"] if description.thin_lens or description.camera_model else []
+        unknown += ["a plain background"] if description.backdrop else []
+        if unknown:
+            raise BlenderError(f"the scene has {', '.join(unknown[:5])}, which is not carried over to Blender")
+        self._description, self._resolution = description, resolution
+        self._depth, self._denoise = max_depth, denoise
+        self._held: dict[str, Tensor] | None = None
+        self._process: _Process | None = None
+
+    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
+        """Render linear radiance (H, W, 3); arguments as for `MitsubaScene.radiance`.
+
+        Raises:
+            BlenderError: Blender stopped, or took too long.
+        """
+        held = self._held
+        same = held is not None and held.keys() == inputs.keys()
+        if held is None or not same or not all(torch.equal(held[name], inputs[name]) for name in inputs):
+            self._process = None
+            self._process = _Process(self._command, *self._told(inputs))
+            self._held = {name: one.detach().clone() for name, one in inputs.items()}
+        assert self._process is not None
+        return self._process.picture(seed, spp)
+
+    def _told(self, inputs: Mapping[str, Tensor]) -> tuple[dict[str, object], bytes, np.ndarray | None]:
+        """What Blender is told beside the meshes, the meshes, and the environment's map."""
+        scene, (height, width) = self._description, self._resolution
+        given = {name: one.detach().cpu() for name, one in inputs.items()}
+        meshes = [posed(part, given) for part in scene.meshes.values()]
+        meshes += _ground(scene, given.get("ground.reflectance"))
+        camera = given.get("camera.to_world", torch.from_numpy(camera_to_world(scene, width / height))).double().numpy()
+        fov = float(given.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0])
+        shift = [float(given.get(f"camera.shift_{axis}", torch.zeros(1))[0]) for axis in "xy"]
+        lamps: list[dict[str, object]] = []
+        for lamp in scene.lamps.values():
+            ball, place = np.eye(4), np.eye(4)
+            if isinstance(lamp, BallLamp):
+                ball[:3, :3] *= lamp.radius
+                ball[:3, 3] = lamp.place
+                ball = given.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().numpy()
+                color = given.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
+            else:
+                place[:3, 3] = given.get(f"{lamp.name}.position", torch.tensor(lamp.position)).numpy()
+                color = given.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
+            if bool((color > 0.0).any()):
+                shape = ball.tolist() if isinstance(lamp, BallLamp) else None
+                lamps.append({"ball": shape, "place": place.tolist(), "color": color.tolist()})
+        radiance = None if scene.environment is None else np.asarray(scene.environment.radiance, np.float32)
+        if "environment.padded" in given:
+            radiance = given["environment.padded"][:, 1:-1].numpy()
+        told: dict[str, object] = {
+            "width": width,
+            "height": height,
+            "camera": (camera @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist(),  # Blender's look along their own -z
+            "fov": math.radians(fov),
+            "shift": [shift[0] * width / max(width, height), -shift[1] * height / max(width, height)],
+            "lamps": lamps,
+            "environment": radiance is not None,
+            "turn": math.pi / 2.0 - math.radians(scene.number("environment.rotation")),
+            "strength": 2.0 ** scene.number("environment.exposure"),
+            "bounces": max(0, self._depth - 2),
+            "denoise": self._denoise,
+        }
+        return told, glb(meshes), radiance
+
+
+def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[PosedMesh]:
+    """The ground as a mesh; none where there is none."""
+    photograph = scene.photograph
+    if photograph is not None:
+        shown = photograph.base if reflectance is None else reflectance
+        return [PosedMesh("ground", photograph.mesh, linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
+    half = scene.number("ground.size") / 2.0
+    if half <= 0.0 or paved(scene):
+        return []
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
+    mesh = Mesh(
+        corners * np.float32(half),
+        np.array([[0, 1, 2], [0, 2, 3]], np.uint32),
+        up,
+        corners[:, :2] * np.float32(0.5) + np.float32(0.5),
+    )
+    return [PosedMesh("ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT)]
+
+
+class _Process:
+    """Blender with one configuration."""
+
+    def __init__(self, program: list[str], told: dict[str, object], meshes: bytes, radiance: np.ndarray | None) -> None:
+        self._keeper = tempfile.TemporaryDirectory(prefix="advsearch-cycles-")
+        self._folder, self._count = Path(self._keeper.name), 0
+        (self._folder / "scene.json").write_text(json.dumps(told), "utf-8")
+        (self._folder / "scene.glb").write_bytes(meshes)
+        (self._folder / "render.py").write_text(RENDER, "utf-8")
+        if radiance is not None:
+            with OpenEXR.File({}, {"RGB": np.ascontiguousarray(radiance)}) as picture:
+                picture.write(str(self._folder / "environment.exr"))
+        between = [] if "-I" in program else ["--"]
+        self._said = self._folder / "said.txt"
+        with self._said.open("wb") as said:
+            try:
+                self._process = subprocess.Popen(
+                    [*program, str(self._folder / "render.py"), *between, str(self._folder)],
+                    cwd=self._folder,
+                    env=surroundings(str(self._folder)),
+                    stdin=subprocess.PIPE,
+                    stdout=said,
+                    stderr=said,
+                )
+            except OSError as error:
+                raise BlenderError(f"Blender can't be started ({error.strerror}); check {program[0]}") from error
+        weakref.finalize(self, _end, self._process, self._keeper)
+
+    def picture(self, seed: int, spp: int) -> Tensor:
+        """One picture with its own noise, (H, W, 3)."""
+        self._count += 1
+        path, until = self._folder / f"{self._count}.exr", time.monotonic() + files.scaled(LONGEST)
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{seed} {spp} {self._count}\n".encode())
+            self._process.stdin.flush()
+        except OSError:
+            pass  # it has stopped, which is said below
+        while not path.is_file():
+            if self._process.poll() is not None and not path.is_file():
+                said = last_line(self._said.read_text("utf-8", "replace"))
+                raise BlenderError(f"Blender stopped{said}")
+            if time.monotonic() > until:
+                raise BlenderError(f"Blender had not rendered it after {files.scaled(LONGEST)} seconds")
+            time.sleep(PAUSE)
+        with OpenEXR.File(str(path)) as picture:
+            pixels = next(iter(picture.channels().values())).pixels
+            found = torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
+        path.unlink()
+        return found
+
+
+def _end(process: subprocess.Popen[bytes], keeper: tempfile.TemporaryDirectory[str]) -> None:
+    """Let Blender end, by force if it does not, and remove its folder."""
+    process.kill()
+    process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
+    keeper.cleanup()

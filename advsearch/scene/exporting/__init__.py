@@ -1,1 +1,0 @@
-"""Scenes for other programs, as data of theirs."""

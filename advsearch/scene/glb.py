@@ -1,0 +1,276 @@
+"""Meshes as binary glTF 2.0 (.glb): y up, one node a mesh, its texture inside as a PNG or JPEG file of 8 bits.
+
+Materials have the numbers of the principled surface (glTF 2.0, section 3.9, and the extensions KHR_materials_specular
+and KHR_materials_clearcoat): a specular of 0.5 reflects 4 % at normal incidence, as glTF's default does.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from PIL import Image
+from torch import Tensor
+
+from advsearch.scene.assembly import MovingMesh
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.parts import MeshPart
+
+FLOAT, WHOLE, SHORT = 5126, 5125, 5123
+"""Types of numbers in glTF: float32, uint32 and uint16."""
+CORNERS, INDICES = 34962, 34963
+"""What a part of the buffer is for."""
+COAT_ROUGHNESS = 0.316
+"""Of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it."""
+PLAIN = 0.5
+"""Specular of a surface whose index of refraction is 1.5."""
+WEB_SIDE, WEB_QUALITY = 1024, 90
+"""Longest side in pixels of a texture in a file for the web, and the quality of its JPEG, from 1 to 95."""
+PNG = b"\x89PNG"
+"""The first bytes of such a file."""
+CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
+"""The camera of such a file: its place counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedMesh:
+    """A mesh as it is in a configuration.
+
+    Attributes:
+        name: of the part of the scene.
+        mesh: in world space, z up.
+        base_color: (h, w, 3) display-referred sRGB, row 0 at v = 1.
+        material: the rest of the surface.
+        opacity: (h', w') in [0, 1], or None where there are no cut-outs.
+        normal_map, emission: as those of `ObjectAsset`.
+    """
+
+    name: str
+    mesh: Mesh
+    base_color: Floats
+    material: Material
+    opacity: Floats | None = None
+    normal_map: Floats | None = None
+    emission: Floats | None = None
+
+
+def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
+    """Return a mesh of a scene as its inputs have it.
+
+    Args:
+        part: of the scene.
+        inputs: of `MitsubaScene`, that differ from the base values.
+    """
+    given = {key.partition(".")[2]: value.detach().cpu() for key, value in inputs.items() if _of(key) == part.name}
+    vertices, normals = MovingMesh(part.mesh, part.to_world).place(None, None)
+    vertices, normals = given.get("vertices", vertices), given.get("normals", normals)
+    mesh = replace(part.mesh, vertices=_rows(vertices), normals=_rows(normals))
+    color = part.base_color
+    if "base_color" in given:
+        color = linear_to_srgb(given["base_color"].clamp(0.0, 1.0)).numpy()
+    numbers = {key: float(given[key]) for key in vars(part.material) if key in given}
+    material = replace(part.material, **numbers)
+    return PosedMesh(part.name, mesh, color, material, part.opacity, part.normal_map, part.emission)
+
+
+def _of(key: str) -> str:
+    return key.partition(".")[0]
+
+
+def _rows(flat: Tensor) -> Floats:
+    return flat.reshape(-1, 3).to(torch.float32).numpy()
+
+
+def glb(meshes: Sequence[PosedMesh]) -> bytes:
+    """Return a binary glTF file of some meshes."""
+    made = _Buffer()
+    return made.file(_described(made, meshes, _png))
+
+
+def web_glb(answer: Sequence[PosedMesh], clean: Sequence[PosedMesh], camera: Doubles, note: str = "") -> bytes:
+    """Return a small file with two scenes, the answer and "clean": what is the same in both is there once.
+
+    Args:
+        answer: the meshes of the answer.
+        clean: the same before.
+        camera: (4, 4) pose of the camera that sees the answer; it looks along its own +z.
+        note: what a reader has to know, in `asset.extras`.
+    """
+    made, count = _Buffer(), len(answer)
+    header = _described(made, [*answer, *clean], _jpeg)
+    ours = camera[:3].T.astype(np.float32)  # rows: its axes, then its place
+    columns = np.eye(4)
+    columns[:, :3] = _y_up(ours * np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32))  # glTF's look along their -z
+    header["cameras"] = [CAMERA]
+    header["nodes"].append({"name": "camera", "camera": 0, "matrix": columns.ravel().tolist()})
+    first, last = list(range(count)), len(header["nodes"]) - 1
+    header["scenes"] = [
+        {"name": "adversarial", "nodes": [*first, last]},
+        {"name": "clean", "nodes": list(range(count, last))},
+    ]
+    header["asset"] |= {"extras": {"note": note}} if note else {}
+    return made.file(header)
+
+
+def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Floats], bytes]) -> dict[str, Any]:
+    """Return the header of a file with some meshes in one scene, and put their bytes into the buffer."""
+    header: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "advsearch"},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(meshes)))}],
+        "nodes": [{"name": one.name, "mesh": number} for number, one in enumerate(meshes)],
+        "meshes": [],
+        "materials": [],
+        "textures": [],
+        "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 10497, "wrapT": 10497}],
+        "images": [],
+    }
+    for number, one in enumerate(meshes):
+        mesh = one.mesh
+        corners = {
+            "POSITION": made.accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
+            "NORMAL": made.accessor(_y_up(_unit(mesh.normals)), "VEC3"),
+            "TEXCOORD_0": made.accessor(np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1), "VEC2"),
+        }
+        whole = np.uint32 if len(mesh.vertices) > np.iinfo(np.uint16).max else np.uint16
+        indices = made.accessor(mesh.faces.reshape(-1).astype(whole), "SCALAR")
+        header["meshes"].append(
+            {"name": one.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
+        )
+        encoded = picture(one.base_color) if one.opacity is None else _cut_out_png(one.base_color, one.opacity)
+        material = _material(one, _texture(header, made.view(encoded), encoded))
+        if one.normal_map is not None:
+            encoded = picture(one.normal_map)
+            material["normalTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
+        if one.emission is not None:
+            most = float(one.emission.max())
+            share = linear_to_srgb(one.emission / np.float32(most))
+            material["emissiveFactor"] = [1.0, 1.0, 1.0]
+            encoded = picture(share)
+            material["emissiveTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
+            material.setdefault("extensions", {})["KHR_materials_emissive_strength"] = {"emissiveStrength": most}
+        header["materials"].append(material)
+    used = sorted({name for material in header["materials"] for name in material.get("extensions", ())})
+    return {**header, "extensionsUsed": used} if used else header
+
+
+def _texture(header: dict[str, Any], view: int, picture: bytes) -> int:
+    """Add a picture in a view of the buffer to the header, and return the number of its texture."""
+    kind = "image/png" if picture.startswith(PNG) else "image/jpeg"
+    header["images"].append({"mimeType": kind, "bufferView": view})
+    header["textures"].append({"source": len(header["textures"]), "sampler": 0})
+    return len(header["textures"]) - 1
+
+
+class _Buffer:
+    """The bytes of a file and where in them what is; bytes that are there already are not added again."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self._known: dict[tuple[bytes, int | None], int] = {}
+        self.views: list[dict[str, int]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def view(self, data: bytes, target: int | None = None) -> int:
+        """Append some bytes, whole words, and return the number of the view."""
+        if (data, target) in self._known:
+            return self._known[data, target]
+        self._known[data, target] = len(self.views)
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
+        self.views.append(view if target is None else {**view, "target": target})
+        self.data += data + bytes(-len(data) % 4)
+        return len(self.views) - 1
+
+    def accessor(self, values: npt.NDArray[Any], kind: str, *, bounds: bool = False) -> int:
+        """Append an array and return the number of its accessor."""
+        kinds = {np.dtype(np.uint32): WHOLE, np.dtype(np.uint16): SHORT}
+        number = kinds.get(values.dtype, FLOAT)
+        entry: dict[str, Any] = {
+            "bufferView": self.view(np.ascontiguousarray(values).tobytes(), CORNERS if number == FLOAT else INDICES),
+            "componentType": number,
+            "count": len(values),
+            "type": kind,
+        }
+        if bounds:
+            entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        self.accessors.append(entry)
+        return len(self.accessors) - 1
+
+    def file(self, header: dict[str, Any]) -> bytes:
+        """Return the whole file with a header that says all but what is in the buffer."""
+        header |= {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": len(self.data)}]}
+        text = json.dumps(header).encode()
+        text += b" " * (-len(text) % 4)
+        rest = bytes(self.data)
+        head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(rest), len(text), 0x4E4F534A)
+        return head + text + struct.pack("<II", len(rest), 0x004E4942) + rest
+
+
+def _material(one: PosedMesh, texture: int) -> dict[str, Any]:
+    surface = one.material
+    extensions: dict[str, Any] = {}
+    if surface.specular != PLAIN:
+        extensions["KHR_materials_specular"] = {"specularFactor": min(1.0, surface.specular / PLAIN)}
+    if surface.clearcoat > 0.0:
+        extensions["KHR_materials_clearcoat"] = {
+            "clearcoatFactor": surface.clearcoat,
+            "clearcoatRoughnessFactor": COAT_ROUGHNESS,
+        }
+    cut_out = {}
+    if one.opacity is not None:
+        cut_out = {"alphaMode": "MASK" if set(np.unique(one.opacity)) <= {0.0, 1.0} else "BLEND"}
+    return {
+        "name": one.name,
+        "doubleSided": True,
+        **cut_out,
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": texture},
+            "roughnessFactor": surface.roughness,
+            "metallicFactor": surface.metallic,
+        },
+        **({"extensions": extensions} if extensions else {}),
+    }
+
+
+def _y_up(vectors: Floats) -> Floats:
+    """Turn (N, 3) from z up to y up, by 90 degrees about x."""
+    return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=1).astype(np.float32)
+
+
+def _unit(normals: Floats) -> Floats:
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    found: Floats = np.where(lengths > 0.0, normals / np.maximum(lengths, 1e-12), np.eye(3)[2])
+    return found.astype(np.float32)
+
+
+def _png(color: Floats) -> bytes:
+    file = io.BytesIO()
+    _rounded(color).save(file, "PNG")
+    return file.getvalue()
+
+
+def _cut_out_png(color: Floats, opacity: Floats) -> bytes:
+    """A picture whose alpha is the opacity, at the size of the colour."""
+    file, picture = io.BytesIO(), _rounded(color)
+    picture.putalpha(_rounded(opacity).resize(picture.size, Image.Resampling.BILINEAR))
+    picture.save(file, "PNG")
+    return file.getvalue()
+
+
+def _jpeg(color: Floats) -> bytes:
+    file, picture = io.BytesIO(), _rounded(color)
+    picture.thumbnail((WEB_SIDE, WEB_SIDE))
+    picture.save(file, "JPEG", quality=WEB_QUALITY, subsampling=0)
+    return file.getvalue()
+
+
+def _rounded(color: Floats) -> Image.Image:
+    return Image.fromarray(np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5))

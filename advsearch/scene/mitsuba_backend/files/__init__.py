@@ -1,1 +1,0 @@
-"""Mitsuba's own scenes, from its XML files and Python dictionaries."""

@@ -1,0 +1,289 @@
+"""Plugins of our own for Mitsuba: a path tracer for haze, guides of the denoiser, a camera with a lens.
+
+Import this only inside Mitsuba's scenes: it registers them, which takes the variant that `variant.mitsuba` sets.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+from advsearch.scene.camera_model import NUMBERS, CameraModel
+from advsearch.scene.mitsuba_backend.variant import dr, mi
+
+common: Any = mi.ad.integrators.common
+
+PHASE = 1.0 / (4.0 * math.pi)
+"""Isotropic phase function, per steradian."""
+NO_EXTINCTION = 1e-20
+MOST_SCATTERINGS = 8
+"""Longest chain of scatterings in the haze along a path. They do not count as bounces off surfaces, so that haze of
+density 0 is no haze. Where the haze's optical radius is 1.2, what is cut off is below 1 % of the light."""
+
+
+class HazePath(common.RBIntegrator):  # type: ignore[misc]
+    """The integrator `advsearch_haze`: a path tracer for a uniform haze in a ball around the scene, with its adjoint.
+
+        L(x, w) = e^(-s l) L_o + integral_0^l s a e^(-s t) L_i(x + t w) dt,      L_i = mean over the sphere of L
+
+    with extinction s (grey, per object size), single-scattering albedo a (per channel), l the length of the segment
+    inside the ball, and L_o what leaves the next surface or comes from outside. Distances are sampled in proportion to
+    `s e^(-s t)`, light from emitters through the haze is worked out exactly, and the derivative is path replay
+    backpropagation (Vicini et al. 2021, Path Replay Backpropagation, sections 4 and 5) with detached samples.
+
+    Why not Mitsuba's `prbvolpath`: it starts every path outside of all media, so a camera inside haze sees none up to
+    the first surface (its source says so: "TODO: support sensors inside media"). Knowing that there is one uniform
+    medium in one ball also spares the boundary's intersections and the walk through them towards emitters.
+
+    Derivatives are right for the haze's colour, for emission and for everything that surfaces look up; for the density
+    where it is greater than 0. Moving geometry has none.
+
+    Properties beside those of `prb`: `medium`, a homogeneous medium with grey extinction, and `radius`, that of the
+    ball around the origin which it fills.
+    """
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        self.haze = props["medium"]
+        self.radius = props["radius"]
+
+    def stretch(self, origin: Any, towards: Any, distance: Any) -> tuple[Any, Any]:
+        """Return where the haze begins on a segment, and for how long it lasts (0 if it misses the ball)."""
+        middle = -dr.dot(origin, towards)
+        half = dr.sqrt(dr.maximum(dr.square(middle) - dr.squared_norm(origin) + self.radius**2, 0.0))
+        begin = dr.maximum(middle - half, 0.0)
+        return begin, dr.maximum(dr.minimum(middle + half, distance) - begin, 0.0)
+
+    def coefficients(self) -> tuple[Any, Any]:
+        """Return the scattering coefficient (3 channels) and the extinction (1 number), with derivatives if wanted."""
+        scattering, _, extinction = self.haze.get_scattering_coefficients(dr.zeros(mi.MediumInteraction3f))
+        return scattering, extinction[0]
+
+    @dr.syntax  # type: ignore[untyped-decorator]
+    def sample(
+        self, mode: Any, scene: Any, sampler: Any, ray: Any, δL: Any, state_in: Any, active: Any, **rest: Any
+    ) -> Any:
+        """See `RBIntegrator.sample`."""
+        primal = mode == dr.ADMode.Primal
+        context = mi.BSDFContext()
+
+        ray = mi.Ray3f(dr.detach(ray))
+        bounces, scatterings = mi.UInt32(0), mi.UInt32(0)
+        L = mi.Spectrum(0 if primal else state_in)
+        δL = mi.Spectrum(δL if δL is not None else 0)
+        β = mi.Spectrum(1)
+        active = mi.Bool(active)
+        last = dr.zeros(mi.Interaction3f)
+        last_pdf = mi.Float(1)
+        last_delta = mi.Bool(True)
+
+        longest = self.max_depth + MOST_SCATTERINGS
+        while dr.hint(active, max_iterations=longest, label=f"Haze path ({mode.name})"):
+            # ---- the next event: a surface, the outside, or the haze in between -------------------------------------
+            first = bounces + scatterings == 0
+            si = scene.ray_intersect(ray, mi.RayFlags.All, first, active)
+            if dr.hint(self.hide_emitters, mode="scalar"):
+                skipped = active & first & si.is_valid() & (si.shape.emitter() != None)  # noqa: E711
+                beyond = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skipped)
+                si[skipped] = beyond.compute_surface_interaction(ray, mi.RayFlags.All, skipped)
+            begin, length = self.stretch(ray.o, ray.d, si.t)
+            with dr.resume_grad(when=not primal):
+                scattering, extinction = self.coefficients()
+                flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(dr.detach(extinction), NO_EXTINCTION)
+                scattered = active & (flight < length)
+                passed = dr.exp(-extinction * dr.minimum(flight, length))
+                weight = dr.select(scattered, scattering * passed, passed)
+            albedo = dr.detach(scattering) / dr.maximum(dr.detach(extinction), NO_EXTINCTION)
+            β = dr.select(scattered, β * albedo, β)
+            at_surface = active & ~scattered
+
+            here = dr.zeros(mi.Interaction3f)
+            here.t = dr.select(scattered, begin + flight, si.t)
+            here.p = dr.select(scattered, ray(begin + flight), si.p)
+            here.n = dr.select(scattered, mi.Normal3f(0.0), si.n)
+            here.time = ray.time
+            here.wavelengths = ray.wavelengths
+
+            # ---- emission of the surface or of the outside ----------------------------------------------------------
+            shining = at_surface
+            if dr.hint(self.hide_emitters, mode="scalar"):
+                shining = at_surface & ~(first & ~si.is_valid())
+            seen = mi.DirectionSample3f(scene, si, last)
+            share = common.mis_weight(last_pdf, scene.pdf_emitter_direction(last, seen, shining & ~last_delta))
+            with dr.resume_grad(when=not primal):
+                Le = β * share * seen.emitter.eval(si, shining)
+
+            # ---- light that emitters send here, through the haze ----------------------------------------------------
+            may_bounce = si.is_valid() & (bounces + 1 < self.max_depth)
+            may_scatter = scatterings < MOST_SCATTERINGS
+            going_on = active & ((scattered & may_scatter) | (~scattered & may_bounce))
+            at_surface &= going_on
+            bsdf = si.bsdf(ray)
+            lit = going_on & (scattered | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+            to_light, emitted = scene.sample_emitter_direction(here, sampler.next_2d(), True, lit)
+            lit &= to_light.pdf != 0.0
+            outside = mi.has_flag(to_light.emitter.flags(), mi.EmitterFlags.Infinite)
+            _, hazy = self.stretch(here.p, to_light.d, dr.select(outside, dr.inf, to_light.dist))
+            with dr.resume_grad(when=not primal):
+                if dr.hint(not primal, mode="scalar"):
+                    attached = scene.eval_emitter_direction(here, to_light, lit)
+                    emitted = dr.replace_grad(emitted, attached * dr.select(lit, dr.rcp(to_light.pdf), 0.0))
+                value, pdf = bsdf.eval_pdf(context, si, si.to_local(to_light.d), lit & at_surface)
+                value = dr.select(scattered, PHASE, value)
+                pdf = dr.select(scattered, PHASE, pdf)
+                share = dr.select(to_light.delta, 1.0, common.mis_weight(to_light.pdf, pdf))
+                Lr_dir = dr.select(lit, β * share * value * emitted * dr.exp(-extinction * hazy), 0.0)
+
+            # ---- the direction to go on -----------------------------------------------------------------------------
+            bounce, bounce_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), at_surface)
+            anywhere = mi.warp.square_to_uniform_sphere(sampler.next_2d())
+            towards = dr.select(scattered, anywhere, si.to_world(bounce.wo))
+            L = (L + Le + Lr_dir) if primal else (L - Le - Lr_dir)
+            β = dr.select(scattered, β, β * bounce_weight)
+            going_on &= dr.max(β) != 0.0
+
+            # ---- derivatives ----------------------------------------------------------------------------------------
+            if dr.hint(not primal, mode="scalar"):
+                with dr.resume_grad():
+                    reflected = bsdf.eval(context, si, bounce.wo, going_on & at_surface)
+                    further = dr.select(at_surface, L * dr.relative_grad(reflected), L)
+                    Lo = (Le + Lr_dir + further) * dr.relative_grad(weight)
+                    if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
+                        dr.backward_from(δL * Lo)
+
+            ray = here.spawn_ray(towards)
+            last = here
+            last_pdf = dr.select(scattered, PHASE, bounce.pdf)
+            last_delta = ~scattered & mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
+            scatterings[scattered] += 1
+            bounces[~scattered & si.is_valid()] += 1
+            active = going_on
+
+        return (L if primal else δL, bounces + scatterings != 0, [], L)
+
+
+mi.register_integrator("advsearch_haze", lambda props: HazePath(props))
+
+
+class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
+    """The integrator `advsearch_guides`: diffuse reflectance and shading normal, three channels each, of the first hit
+    that light does not pass. Mitsuba's `aov` takes the first one, and the outline of what is cut off would show."""
+
+    @dr.syntax  # type: ignore[untyped-decorator]
+    def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+        """See `SamplingIntegrator.sample`; light passes through a surface with its probability."""
+        going = mi.Bool(active)
+        way = mi.Ray3f(ray)
+        covered, albedo, normal = mi.Bool(False), mi.Spectrum(0.0), mi.Normal3f(0.0)
+        while going:
+            hit = scene.ray_intersect(way, going)
+            going &= hit.is_valid()
+            bsdf = hit.bsdf()
+            clear = dr.max(bsdf.eval_null_transmission(hit, going))
+            passes = going & (sampler.next_1d(going) < clear)
+            seen = going & ~passes
+            albedo[seen] = bsdf.eval_diffuse_reflectance(hit, seen)
+            normal[seen] = hit.sh_frame.n
+            covered |= seen
+            way = hit.spawn_ray(way.d)
+            going = passes
+        return albedo, covered, [*albedo, *normal]
+
+    def aov_names(self) -> list[str]:
+        """See `SamplingIntegrator.aov_names`."""
+        return [f"{name}.{channel}" for name in ("albedo", "normal") for channel in "XYZ"]
+
+
+mi.register_integrator("advsearch_guides", Guides)
+
+
+CELLS = (128, 512)
+"""Fewest and most cells along a side of the grid."""
+
+
+class ModelledCamera(mi.Sensor):  # type: ignore[misc]
+    """The sensor `advsearch_camera`: a `CameraModel` at a place.
+
+    The directions of rays are kept on a grid over the picture, from Newton's method, and in between are bilinear: the
+    grid is so fine that this is off by less than a hundredth of a pixel, but for the last pixels before a fold. Every
+    sample of a picture has a ray of its own, so that edges are as sharp as a pinhole's.
+
+    Parameters: `to_world`; `lens`, its numbers in the order of `NUMBERS`.
+    """
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        numbers = tuple(float(props[name]) for name in NUMBERS)
+        self._model = CameraModel(str(props["kind"]), numbers, reach=float(props["reach"]))
+        self._near, self._far = float(props["near_clip"]), float(props["far_clip"])
+        self._cells = tuple(max(CELLS[0], min(CELLS[1], int(side))) for side in self.film().crop_size())
+        self.pose = mi.Transform4f(super().world_transform())
+        self.lens = mi.TensorXf(list(numbers), (len(NUMBERS),))
+        self.rays = mi.Float()
+        self._make_rays()
+
+    def traverse(self, cb: Any) -> None:
+        """See `mi.Object.traverse`."""
+        super().traverse(cb)
+        cb.put("to_world", self.pose, mi.ParamFlags.NonDifferentiable)
+        cb.put("lens", self.lens, mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys: Any) -> None:
+        """See `mi.Object.parameters_changed`."""
+        if not keys or "lens" in keys:
+            self._make_rays()
+        super().parameters_changed(keys)
+
+    def world_transform(self) -> Any:
+        """The pose."""
+        return self.pose
+
+    def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        """See `mi.Sensor.sample_ray_differential`; where the lens sees nothing, a ray of weight 0 that hits nothing."""
+        ahead, inside = self._looked_up(sample2)
+        ray = dr.zeros(mi.RayDifferential3f)  # all of it, or it would be ragged for derivatives
+        ray.time = time
+        ray.o = self.pose @ mi.Point3f(self._near * ahead)
+        ray.d = self.pose @ mi.Vector3f(ahead)
+        ray.maxt = dr.select(inside, mi.Float(self._far), 0.0)
+        return ray, dr.select(inside, mi.Spectrum(1.0), 0.0)
+
+    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        """See `mi.Sensor.sample_ray`."""
+        ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
+        return mi.Ray3f(ray), weight
+
+    def to_string(self) -> str:
+        """See `mi.Object.to_string`."""
+        return f"ModelledCamera[{self._model.kind}]"
+
+    def _make_rays(self) -> None:
+        wide, tall = self._cells
+        across, down = (torch.linspace(0.0, 1.0, cells + 1, dtype=torch.float64) for cells in (wide, tall))
+        places = torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1).reshape(-1, 2)
+        with torch.no_grad():
+            directions, inside = self._model.with_numbers(self.lens.torch().cpu()).rays(places)
+        directions = directions * torch.tensor([-1.0, -1.0, 1.0])  # Mitsuba's x is to the left and its y up
+        table = torch.cat([directions, inside[:, None]], dim=-1).to(torch.float32)
+        self.rays = mi.Float(table.reshape(-1).contiguous())
+        dr.eval(self.rays)
+
+    def _looked_up(self, place: Any) -> tuple[Any, Any]:
+        """Direction at a place in the picture, and whether the lens sees anything there."""
+        wide, tall = self._cells
+        x, y = place.x * wide, place.y * tall
+        column = dr.clip(mi.Int32(dr.floor(x)), 0, wide - 1)
+        row = dr.clip(mi.Int32(dr.floor(y)), 0, tall - 1)
+        right, down = x - mi.Float(column), y - mi.Float(row)
+        first = mi.UInt32(row * (wide + 1) + column)
+        upper, lower = (
+            dr.lerp(dr.gather(mi.Vector4f, self.rays, at), dr.gather(mi.Vector4f, self.rays, at + 1), right)
+            for at in (first, first + (wide + 1))
+        )
+        found = dr.lerp(upper, lower, down)
+        return dr.normalize(mi.Vector3f(found.x, found.y, found.z)), found.w > 0.0
+
+
+mi.register_sensor("advsearch_camera", ModelledCamera)

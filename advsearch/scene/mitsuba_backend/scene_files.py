@@ -1,0 +1,405 @@
+"""A shape of a Mitsuba scene as the object, and all the rest around it as it is.
+
+Lengths are in object sizes, so that everything is moved and scaled with the object, as in
+`advsearch.scene.importing.scenes`. Lights whose power is a quantity of lengths are scaled with it, and media too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assets import Doubles, Floats, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.importing.files import safe_name, shown
+from advsearch.scene.importing.geometry import assemble, join
+from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
+from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
+from advsearch.scene.importing.texture import textured
+from advsearch.scene.mitsuba_backend.meshes import plain
+from advsearch.scene.mitsuba_backend.shape_surfaces import ShapeSurface, constant, surface_of
+from advsearch.scene.mitsuba_backend.shapes import MESHES, ShapeMesh, haze_in, mesh_of
+from advsearch.scene.mitsuba_backend.variant import Plugin
+from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
+from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
+
+SHAPES = frozenset(
+    "rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve "
+    "ellipsoids ellipsoidsmesh merge".split()
+)
+LIGHTS = frozenset("constant envmap point spot directional projector sunsky timed_sunsky area directionalarea".split())
+SENSORS = frozenset("perspective thinlens orthographic radiancemeter irradiancemeter distant batch".split())
+CAMERAS = frozenset(("perspective", "thinlens"))
+INTEGRATORS = frozenset(
+    "path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes".split()
+)
+NOTHING = {"type": "null"}
+"""The surface of what only bounds a medium."""
+MEDIA = frozenset(("homogeneous", "heterogeneous"))
+Y_TO_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+MOST_PARTS = 2000
+"""Plugins at the top of a scene."""
+DIAGONAL = math.hypot(36.0, 24.0)
+"""Of the film of which Mitsuba's `focal_length` speaks, millimetres."""
+
+
+def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
+    """Return a scene file's dictionary, or a caller's own, with arrays for transforms; and warnings about its pictures.
+
+    Raises:
+        FileFormatError: as for `read_scene` and `trusted`.
+        InputError: no scene.
+    """
+    notes: list[str] = []
+    if isinstance(scene, Path):
+        return trusted(scene, read_scene(scene), notes), notes
+    if scene.get("type") != "scene":
+        raise InputError(f"scene: expected a dictionary of type 'scene', got {scene.get('type')!r}")
+    notes += [
+        f"scene: {name} is left out: expected a plugin's dictionary, got {type(one).__name__}"
+        for name, one in scene.items()
+        if name != "type" and not isinstance(one, Mapping)
+    ]
+    return plain(scene), notes
+
+
+@dataclass(frozen=True)
+class PluginContents:
+    """What is in a Mitsuba scene, by id.
+
+    Attributes:
+        objects: shapes that can be the object.
+        kept: the rest, which stays as it is: its plugin's name.
+        lights: what shines.
+        cameras: sensors that can be looked through.
+    """
+
+    objects: tuple[str, ...]
+    kept: Mapping[str, str]
+    lights: tuple[str, ...]
+    cameras: tuple[str, ...]
+
+
+def contents(path: Path) -> PluginContents:
+    """Return what is understood of a scene file.
+
+    Raises:
+        FileFormatError: as for `read_tree`.
+    """
+    named = dict(_plugins(read_tree(path)[0]))
+    kinds = {name: str(one["type"]) for name, one in named.items()}
+    objects = tuple(name for name, kind in kinds.items() if kind in MESHES and named[name].get("bsdf") != NOTHING)
+    cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
+    others = {
+        name: kind
+        for name, kind in kinds.items()
+        if name not in (*objects, *cameras) and kind not in INTEGRATORS | SENSORS
+    }
+    lights = tuple(name for name, one in named.items() if _shines(one))
+    return PluginContents(objects, others, lights, tuple(map(_free, cameras)))
+
+
+def _free(name: str) -> str:
+    """A name, or another one where the house has taken it."""
+    return f"{name}-2" if name in TAKEN else name
+
+
+def _shines(plugin: Mapping[str, object]) -> bool:
+    return any(inner.get("type") in LIGHTS for inner in plugins_in(plugin))
+
+
+def _meant(wanted: str, ids: Sequence[str]) -> str:
+    """Return the id that is meant by a name; the name itself where that is none, or several."""
+    alike = [one for one in ids if _letters(one) == _letters(wanted)]
+    return alike[0] if wanted not in ids and len(alike) == 1 else wanted
+
+
+def _letters(name: str) -> str:
+    return "".join(sign for sign in name.casefold() if sign.isalnum())
+
+
+def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedScene:
+    """Read a Mitsuba scene.
+
+    The shape becomes a mesh with its own kind of surface, whose base colour, where it has one, becomes a texture.
+    Everything else stays as it is, under its own name. Perspective sensors become cameras. Integrator, sampler and film
+    are those of the house. What is left out is among the object's warnings.
+
+    Args:
+        scene: an XML file, or a dictionary as Mitsuba's loader takes it.
+        wanted: id of the shape that is the object; where there is none, the only one that differs in nothing but case
+            and signs ("largebox" means "large-box", as Mitsuba's own writer calls it).
+
+    Raises:
+        UnknownNameError: it has no such shape.
+        FileFormatError: as for `read_tree`.
+        InputError: the shape is no mesh and cannot be made one, or the scene is too large.
+    """
+    tree, notes = read_tree(scene)
+    where = scene.name if isinstance(scene, Path) else "scene"
+    ids = [name for name, one in _plugins(tree) if one["type"] in SHAPES]
+    wanted = _meant(wanted, ids)
+    if wanted not in ids:
+        raise UnknownNameError(f"shape of {where}", wanted, ids)
+    named = dict(_plugins(tree))
+    if len(named) > MOST_PARTS:
+        raise InputError(f"{where}: expected at most {MOST_PARTS} plugins at the top, got {len(named)}; join meshes")
+    shape = named[wanted]
+    surface, found = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
+    frame = _Frame(found.mesh, wanted, z_up=_is_z_up(named))
+    haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
+    light = _light(shape)
+    left_out = _left_out(tree, shape, hazy=haze is not None, lit=light is not None)
+    notes += [f"{where}: {one}" for one in (*left_out, *surface.notes, *_without(surface.plugin, found.mesh))]
+    source = scene if isinstance(scene, Path) else Path("scene.xml")
+    mesh, base_color = _painted(frame.turned(found), surface, str(shape["type"]), where)
+    made = ObjectAsset(
+        name=f"{safe_name(source)}-{clean(wanted)}",
+        mesh=normalised(mesh),
+        base_color=base_color,
+        source=str(source),
+        warnings=tuple(notes),
+        up=UpAxis("z"),
+        surface=surface.plugin,
+        emission=light,
+    )
+    around: list[ScenePart] = [] if haze is None else [haze]
+    cameras: dict[str, PlacedCamera] = {}
+    for name, one in named.items():
+        if name == wanted or name in used or one["type"] in INTEGRATORS:
+            continue
+        free = _free(name)
+        if one["type"] in SENSORS:
+            if one["type"] in CAMERAS:
+                cameras[free] = _camera(one, frame)
+            continue
+        kept = _renamed(frame.moved(one))
+        holds = MediumPart if any(inner.get("type") in MEDIA for inner in plugins_in(kept)) else PluginPart
+        around.append(holds(free, kept, _shines(kept)))
+    return ImportedScene(made, tuple(around), cameras)
+
+
+def _painted(found: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> tuple[Mesh, Floats]:
+    """Return a shape's mesh with texture coordinates for its base colour, and that.
+
+    Where anything is looked up by the mesh's own, or by its attributes, they stay. A shape of one colour gets new ones
+    where its own do not tell its places apart, as on a cube.
+    """
+    mesh = found.mesh
+    if surface.picture or surface.bound:
+        down = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
+        down = down @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
+        return replace(mesh, uvs=(down * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)), surface.base_color
+    own = found.uv and kind not in ("cube", "sphere", "cylinder", "disk")
+    vertices, normals, uvs = (one.astype(np.float64) for one in (mesh.vertices, mesh.normals, mesh.uvs))
+    color = ImportedSurface(color=surface.base_color[0, 0])
+    part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own else None, None, color)
+    soup, maps, _ = textured(join([part], where, y_up=False), [color])
+    return assemble(soup), maps.color
+
+
+def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:
+    """The plugins at the top of a scene, by name."""
+    return ((name, one) for name, one in tree.items() if isinstance(one, Mapping) and "type" in one)
+
+
+def _renamed(plugin: Mapping[str, object]) -> Plugin:
+    """A plugin whose references have the names that the house left free."""
+    found = {key: _renamed(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
+    if found["type"] == "ref" and found["id"] in TAKEN:
+        found["id"] = f"{found['id']}-2"
+    return found
+
+
+def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]) -> Mapping[str, object]:
+    """The surface of a shape with what it refers to in its place; Mitsuba's default where it has none."""
+
+    count = 0
+
+    def whole(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
+        nonlocal count
+        count += 1
+        if count > MOST_PARTS:
+            raise InputError(f"object: expected a surface of at most {MOST_PARTS} plugins, got more; make it simpler")
+        if plugin["type"] == "ref":
+            name = str(plugin["id"])
+            if name not in named or depth > len(named):
+                raise UnknownNameError("material of the scene", name, list(named))
+            return whole(named[name], depth + 1)
+        return {key: whole(one, depth) if isinstance(one, Mapping) else one for key, one in plugin.items()}
+
+    for inner in shape.values():
+        if isinstance(inner, Mapping) and inner["type"] not in LIGHTS | MEDIA:
+            return whole(inner, 0)
+    return {"type": "diffuse"}
+
+
+def _light(shape: Mapping[str, object]) -> Floats | None:
+    """The radiance (1, 1, 3) of a shape that shines evenly; None of any other."""
+    for inner in shape.values():
+        if isinstance(inner, Mapping) and inner["type"] == "area" and set(inner) <= {"type", "id", "radiance"}:
+            radiance = constant(inner.get("radiance"))
+            if radiance is not None and 0.0 < radiance.max() <= BRIGHTEST and radiance.min() >= 0.0:
+                return radiance.reshape(1, 1, 3)
+    return None
+
+
+def _without(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
+    """Sentences about attributes that a surface shows and the mesh has not."""
+    for one in plugins_in(surface):
+        if one["type"] == "mesh_attribute" and one.get("name") not in mesh.attributes:
+            there = ", ".join(sorted(mesh.attributes)) or "none"
+            yield f"the mesh has no attribute {shown(str(one.get('name')))} (it has {there}), so that is black"
+
+
+def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool) -> Iterator[str]:
+    """Sentences about what is not as it is in the file; `hazy`: the camera's medium is the scene's haze, `lit`: the
+    object keeps its light."""
+    for name, one in _plugins(tree):
+        kind = one["type"]
+        if kind in SENSORS - CAMERAS:
+            yield f"the sensor {name} is left out: a {kind}"
+        elif kind == "thinlens":
+            yield f"the sensor {name} is sharp at all distances: its lens is left out"
+        elif kind in INTEGRATORS - {"path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective"}:
+            yield f"the integrator {name} is left out: a {kind}; light takes all paths of up to 6 segments"
+        elif kind in INTEGRATORS:
+            if one.get("hide_emitters"):
+                yield f"hide_emitters of the integrator {name} is left out: lights are seen"
+            depth = one.get("max_depth", -1)
+            if isinstance(depth, int) and 0 <= depth < 6:
+                yield f"the integrator's max_depth of {depth} is left out: light takes all paths of up to 6 segments"
+        if kind in SENSORS and any(
+            isinstance(film, Mapping) and any(str(key).startswith("crop") for key in film) for film in one.values()
+        ):
+            yield f"the crop of the film of {name} is left out: the whole picture is seen"
+        if kind in SENSORS and "medium" in one and not hazy:
+            yield f"the sensor {name} sees nothing of its medium up to the first surface"
+        if kind in SENSORS and any("principal_point" in key for key in one):
+            yield f"the sensor {name} looks along its middle: its principal point is left out"
+    for inner in shape.values():
+        if isinstance(inner, Mapping) and inner["type"] in LIGHTS and not lit:
+            yield "the object's own light is left out"
+        if isinstance(inner, Mapping) and inner["type"] in MEDIA:
+            yield "the medium in the object is left out"
+
+
+def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
+    """Whether the first camera's upper side points along z, and not along y as is usual."""
+    for one in named.values():
+        if one["type"] in SENSORS and "to_world" in one:
+            above = np.asarray(one["to_world"], dtype=np.float64)[:3, 1]
+            return bool(abs(above[2]) > abs(above[1]))
+    return False
+
+
+class _Frame:
+    """From the scene's coordinates to the object's: z up, standing on z = 0, a largest extent of 1."""
+
+    def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
+        turn = np.eye(4) if z_up else Y_TO_Z
+        places = mesh.vertices.astype(np.float64) @ turn[:3, :3].T
+        low, high = places.min(axis=0), places.max(axis=0)
+        self.turn = turn[:3, :3]
+        self.size = float((high - low).max())
+        if not (math.isfinite(self.size) and self.size > 0.0):
+            raise InputError(f"object {name}: expected a shape of some size, got one of {self.size}")
+        move = np.eye(4)
+        move[:3, 3] = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
+        self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
+
+    def turned(self, found: ShapeMesh) -> ShapeMesh:
+        """Return a mesh with z up."""
+        turn = self.turn.astype(np.float32)
+        mesh = replace(found.mesh, vertices=found.mesh.vertices @ turn.T, normals=found.mesh.normals @ turn.T)
+        return replace(found, mesh=mesh)
+
+    def moved(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin at the top of a scene in its place."""
+        kind, found = plugin["type"], dict(plugin)
+        if kind == "merge":
+            return {key: self.moved(one) if isinstance(one, Mapping) else one for key, one in found.items()}
+        if kind in SHAPES - {"shapegroup", "merge"}:
+            found["to_world"] = self.matrix @ _matrix(plugin)
+        elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
+            turn = np.eye(4)
+            turn[:3, :3] = self.turn
+            if "direction" in found:
+                found["direction"] = (self.turn @ np.asarray(found["direction"], dtype=np.float64)).tolist()
+            elif kind != "constant":
+                found["to_world"] = turn @ _matrix(plugin)
+        elif kind in ("point", "spot", "projector"):
+            if "position" in found:
+                place = np.asarray(found["position"], dtype=np.float64)
+                found["position"] = (self.matrix[:3, :3] @ place + self.matrix[:3, 3]).tolist()
+            else:
+                found["to_world"] = self.matrix @ _matrix(plugin)
+            power = "irradiance" if kind == "projector" else "intensity"
+            found[power] = _times(found.get(power, 1.0), self.size**-2, str(kind))
+        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in found.items()}
+
+    def _inside(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin within another: media and volumes are scaled."""
+        found = dict(plugin)
+        if plugin["type"] in MEDIA:
+            found["scale"] = float(np.asarray(found.get("scale", 1.0))) * self.size
+        if plugin["type"] in ("gridvolume", "constvolume"):
+            found["to_world"] = self.matrix @ _matrix(plugin)
+        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in found.items()}
+
+
+def _matrix(plugin: Mapping[str, object]) -> Doubles:
+    return np.asarray(plugin.get("to_world", np.eye(4)), dtype=np.float64)
+
+
+def _times(value: object, factor: float, kind: str) -> object:
+    """A power times a factor."""
+    if isinstance(value, (int, float)):
+        return float(value) * factor
+    if isinstance(value, Mapping):
+        inner = value.get("value")
+        if value["type"] in ("rgb", "uniform", "srgb", "spectrum") and isinstance(inner, (int, float)):
+            return {**value, "value": float(inner) * factor}
+        if value["type"] == "rgb" and inner is not None:
+            return {**value, "value": (np.asarray(inner, dtype=np.float64) * factor).tolist()}
+        if value["type"] == "spectrum" and isinstance(inner, (list, tuple)):
+            return {**value, "value": [(length, amount * factor) for length, amount in inner]}
+        if value["type"] in ("d65", "blackbody"):
+            return {**value, "scale": float(np.asarray(value.get("scale", 1.0))) * factor}
+        if value["type"] == "bitmap" and isinstance(value.get("bitmap"), np.ndarray):
+            return {**value, "bitmap": np.asarray(value["bitmap"]) * np.float32(factor)}
+    raise InputError(f"{kind} light: expected a power as a number, rgb or spectrum; change it in the scene")
+
+
+def _camera(sensor: Mapping[str, object], frame: _Frame) -> PlacedCamera:
+    matrix = frame.matrix @ _matrix(sensor)
+    matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
+    film = next((one for one in sensor.values() if isinstance(one, Mapping) and "film" in str(one["type"])), {})
+    width, height = (float(np.asarray(film.get(side, other))) for side, other in (("width", 768), ("height", 576)))
+    axis, degrees = str(sensor.get("fov_axis", "x")), float(np.asarray(sensor.get("fov", 0.0)))
+    if not degrees:
+        length = float(millimetres(str(sensor.get("focal_length", "50mm"))))
+        axis, degrees = "diagonal", 2.0 * math.degrees(math.atan(DIAGONAL / (2.0 * length)))
+    larger, smaller = max(width, height), min(width, height)
+    across = {"x": width, "y": height, "diagonal": math.hypot(width, height), "larger": larger, "smaller": smaller}
+    half = math.tan(math.radians(degrees) / 2.0) * larger / across.get(axis, width)
+    return PlacedCamera(matrix, 2.0 * math.degrees(math.atan(half)))
+
+
+def millimetres(text: str) -> float:
+    """The number of ``50mm``.
+
+    Raises:
+        InputError: there is none.
+    """
+    try:
+        found = float(text.removesuffix("mm"))
+    except ValueError:
+        found = 0.0
+    if not found > 0.0:
+        raise InputError(f"focal_length: expected millimetres, such as 50mm, got {text!r}")
+    return found

@@ -1,0 +1,257 @@
+"""Shapes of a Mitsuba scene as triangles, and those that make up its haze."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from advsearch.errors import InputError
+from advsearch.scene.assets import Doubles, Floats, Ints, Mesh
+from advsearch.scene.mitsuba_backend.meshes import FACES, NORMALS, POSITIONS, TEXCOORDS, loadable
+from advsearch.scene.mitsuba_backend.variant import fewer_warnings, mi
+from advsearch.scene.parts import HazePart
+
+Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
+"""Vertices, faces, normals and texture coordinates of a mesh, and its attributes, (V or F, n) by their names."""
+
+BARE = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+"""Texture coordinates of a face that has none, as Mitsuba takes them."""
+SECTIONS = 64
+"""Sides of a round shape."""
+SOLIDS = ("rectangle", "sphere", "cylinder", "disk")
+"""Shapes of which Mitsuba has no triangles."""
+MESHES = (*SOLIDS, "cube", "obj", "ply", "serialized")
+"""The shapes that can be the object."""
+OF_A_MESH = frozenset(
+    ("type", "filename", "to_world", "face_normals", "flip_tex_coords", "flip_normals", "shape_index")
+)
+"""Entries of a mesh that are no surface, light or medium."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeMesh:
+    """The triangles of a shape in its scene, as Mitsuba has them.
+
+    Attributes:
+        mesh: with the file's own texture coordinates, which may leave the unit square, and attributes.
+        uv: whether it has texture coordinates of its own; else they are (0, 0), (1, 0) and (0, 1) on each face, as
+            Mitsuba takes them.
+    """
+
+    mesh: Mesh
+    uv: bool = True
+
+
+def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
+    """Return a shape's triangles.
+
+    Where Mitsuba has a mesh, it is Mitsuba's own; round shapes become triangles here. Of a mesh with `face_normals`, or
+    without texture coordinates, every face has vertices of its own.
+
+    Args:
+        shape: its dictionary.
+        name: of it.
+
+    Raises:
+        InputError: it has none.
+    """
+    kind = str(shape["type"])
+    if kind not in MESHES:
+        raise InputError(f"object {name}: a {kind} cannot be moved; expected a shape of {', '.join(MESHES)}")
+    vertices, faces, normals, uvs, attributes = _solid(kind, shape) if kind in SOLIDS else _loaded(shape, name)
+    if not np.isfinite(vertices).all():
+        raise InputError(f"object {name}: expected finite vertices, got NaN or infinite ones; repair the mesh")
+    if uvs is None or normals is None or shape.get("face_normals"):
+        corners = faces.reshape(-1)
+        attributes = _of(corners, attributes)
+        vertices, faces = vertices[corners], np.arange(len(corners)).reshape(-1, 3)
+        flat = normals is None or bool(shape.get("face_normals"))
+        normals = _unit(_fronts(vertices, faces)).repeat(3, axis=0) if flat or normals is None else normals[corners]
+        texture = np.tile(BARE, (len(faces), 1)) if uvs is None else uvs[corners]
+    else:
+        texture = uvs
+    used, index = np.unique(faces, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    vertices, texture = vertices[used], texture[used] * (1.0, -1.0) + (0.0, 1.0)
+    normals = np.nan_to_num(normals)[used] * (-1.0 if shape.get("flip_normals") else 1.0)
+    if np.einsum("fk,fck->", _fronts(vertices, faces), normals[faces]) < 0.0:
+        faces = faces[:, ::-1]  # Mitsuba shades by the normals, whichever way faces are wound
+    mesh = Mesh(
+        vertices.astype(np.float32),
+        np.ascontiguousarray(faces, np.uint32),
+        normals.astype(np.float32),
+        texture.astype(np.float32),
+        _of(used, attributes),
+    )
+    return ShapeMesh(mesh, uvs is not None)
+
+
+def _of(vertices: Ints, attributes: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The attributes of some of the vertices, in their order, and of all faces."""
+    return {key: one[vertices] if key.startswith("vertex_") else one for key, one in attributes.items()}
+
+
+def _fronts(vertices: Doubles, faces: Ints) -> Doubles:
+    """Vectors (F, 3) along the sides from which faces are wound counter-clockwise, twice as long as their areas."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _loaded(shape: Mapping[str, object], name: str) -> Buffers:
+    """Return what Mitsuba reads of a mesh."""
+    try:
+        with fewer_warnings():
+            loaded = mi.load_dict(loadable({key: value for key, value in shape.items() if key in OF_A_MESH}))
+    except RuntimeError as error:
+        raise InputError(f"object {name}: Mitsuba refuses the shape: {error}; change it there") from error
+    found = mi.traverse(loaded)
+    vertices = np.array(found[POSITIONS], np.float64).reshape(-1, 3)
+    faces = np.array(found[FACES], np.int64).reshape(-1, 3)
+    if not len(faces):
+        raise InputError(f"object {name}: expected a mesh with faces, got none; export triangles")
+    normals = np.array(found[NORMALS], np.float64).reshape(-1, 3) if loaded.has_vertex_normals() else None
+    uvs = np.array(found[TEXCOORDS], np.float64).reshape(-1, 2) if loaded.has_vertex_texcoords() else None
+    attributes: dict[str, Floats] = {}
+    for key in found.keys():
+        count = {"vertex": len(vertices), "face": len(faces)}.get(key.split("_")[0], 0)
+        if count and key not in (POSITIONS, NORMALS, TEXCOORDS) and "." not in key:
+            attributes[str(key)] = np.array(found[key], np.float32).reshape(count, -1)
+    return vertices, faces, normals, uvs, attributes
+
+
+def _unit(vectors: Doubles) -> Doubles:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30))
+
+
+def _solid(kind: str, shape: Mapping[str, object]) -> Buffers:
+    """The same of a shape of which Mitsuba has no triangles."""
+    own = np.eye(4)
+    round_ = np.linspace(0.0, 1.0, SECTIONS + 1)
+    normals = None
+    if kind == "sphere":
+        uvs, faces = _grid(round_, round_[::2])
+        down = np.pi * uvs[:, 1]
+        vertices = normals = np.stack([*(np.sin(down) * _circle(uvs[:, 0])), np.cos(down)], axis=1)
+        own[:3, :3] *= _number(shape.get("radius", 1.0))
+        own[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), dtype=np.float64)
+    elif kind == "cylinder":  # open at both ends, as Mitsuba's
+        uvs, faces = _grid(round_, np.array([0.0, 1.0]))
+        vertices = np.stack([*_circle(uvs[:, 0]), uvs[:, 1]], axis=1)
+        normals = vertices * (1.0, 1.0, 0.0)
+        own = _along(shape)
+    elif kind == "disk":
+        uvs, faces = _grid(round_[::8], round_)
+        vertices = np.stack([*(uvs[:, 0] * _circle(uvs[:, 1])), np.zeros(len(uvs))], axis=1)
+    else:
+        uvs, faces = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+        vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
+    normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1)) if normals is None else normals
+    faces = faces[np.linalg.norm(_fronts(vertices, faces), axis=1) > 1e-9]
+    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64) @ own
+    normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
+    return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
+
+
+def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, Ints]:
+    """The points (N, 2) of a grid of texture coordinates, and its triangles (F, 3)."""
+    points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    first = (np.arange(len(v) - 1)[:, None] * len(u) + np.arange(len(u) - 1)).reshape(-1)
+    above = first + len(u)
+    triangles = [[first, first + 1, above + 1], [first, above + 1, above]]
+    return points, np.concatenate([np.stack(one, axis=1) for one in triangles])
+
+
+def _circle(share: Doubles) -> Doubles:
+    """Points (2, N) of the unit circle, at shares (N,) of a whole turn."""
+    found: Doubles = np.stack([np.cos(2.0 * np.pi * share), np.sin(2.0 * np.pi * share)])
+    return found
+
+
+def _along(shape: Mapping[str, object]) -> Doubles:
+    """The transform (4, 4) of a cylinder between its two points; around it as Mitsuba's (Duff et al. 2017)."""
+    low = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), dtype=np.float64)
+    high = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), dtype=np.float64)
+    length = float(np.linalg.norm(high - low))
+    x, y, z = along = (high - low) / max(length, 1e-30)
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    aside = np.array([1.0 + sign * x * x * a, sign * x * y * a, -sign * x])
+    across = np.array([x * y * a, sign + y * y * a, -y])
+    radius = _number(shape.get("radius", 1.0))
+    own = np.eye(4)
+    own[:3] = np.stack([aside * radius, across * radius, along * length, low], axis=1)
+    return own
+
+
+def _number(value: object) -> float:
+    return float(np.asarray(value, dtype=np.float64))
+
+
+Plugins = Mapping[str, Mapping[str, object]]
+
+MOST, DARKEST = 2.0, 1e-3
+"""Of a haze: the largest extinction per object size, and the least share of the light that is scattered."""
+OFF = 0.05
+"""By what share of its radius the ball's middle may lie beside the object's; its edge is in the far background."""
+
+_OF_BALL = {"type", "id", "radius", "center", "to_world", "bsdf", "interior"}
+_OF_MEDIUM = {"type", "id", "sigma_t", "albedo", "scale", "phase"}
+
+
+def haze_in(named: Plugins, matrix: Doubles) -> tuple[HazePart, frozenset[str]] | None:
+    """Return the haze of a scene and the names of the plugins that it is made of; None where there is none.
+
+    That is one grey medium in a ball that the camera stands in: Mitsuba's `prbvolpath` sees nothing of it up to the
+    first surface, so such a scene is rendered as one with a `HazePart`. All other media stay as they are.
+
+    Args:
+        named: the plugins at the top of the scene.
+        matrix: (4, 4) from the scene to the object's coordinates, with one scale for all directions.
+    """
+    inside = {_reference(one.get("medium")) for one in named.values()} - {None}
+    balls = [
+        name for name, one in named.items() if one["type"] == "sphere" and _reference(one.get("interior")) in inside
+    ]
+    media = [name for name, one in named.items() if one["type"] in ("homogeneous", "heterogeneous")]
+    if len(inside) != 1 or len(balls) != 1 or len(media) != 1:
+        return None
+    ball, medium = named[balls[0]], named[media[0]]
+    bsdf, phase = ball.get("bsdf"), medium.get("phase", {"type": "isotropic"})
+    plain = set(ball) <= _OF_BALL and set(medium) <= _OF_MEDIUM and medium["type"] == "homogeneous"
+    if not plain or bsdf != {"type": "null"} or phase != {"type": "isotropic"} or inside != {media[0]}:
+        return None
+    told = [_numbers(ball.get(key, otherwise)) for key, otherwise in (("radius", 1.0), ("center", np.zeros(3)))]
+    told += [
+        _numbers(medium.get(key, otherwise)) for key, otherwise in (("sigma_t", 1.0), ("albedo", 0.75), ("scale", 1.0))
+    ]
+    across, middle, density, albedo, scale = (np.full(1, np.nan) if one is None else one for one in told)
+    own = matrix @ np.asarray(ball.get("to_world", np.eye(4)), np.float64)
+    place = own @ np.append(np.broadcast_to(middle, (3,)), 1.0)
+    radius = float(across[0]) * float(np.cbrt(abs(np.linalg.det(own[:3, :3]))))
+    size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+    extinction, (red, green, blue) = density * scale / size, np.broadcast_to(albedo, (3,)).tolist()
+    grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MOST
+    if not (grey and DARKEST <= min(red, green, blue) and max(red, green, blue) <= 1.0):
+        return None
+    if not (radius > 0.0 and float(np.linalg.norm(place[:3])) <= OFF * radius):
+        return None
+    return HazePart(balls[0], radius, float(extinction[0]), (red, green, blue)), frozenset((balls[0], media[0]))
+
+
+def _reference(given: object) -> str | None:
+    return str(given["id"]) if isinstance(given, Mapping) and given.get("type") == "ref" else None
+
+
+def _numbers(given: object) -> Doubles | None:
+    """Return a number, or the three of a colour; None of anything else."""
+    if isinstance(given, Mapping):
+        given = (
+            given.get("value") if given.get("type") in ("rgb", "uniform") and set(given) <= {"type", "value"} else None
+        )
+    try:
+        found = np.atleast_1d(np.asarray(given, np.float64))
+    except (TypeError, ValueError):
+        return None
+    return found if found.shape in ((1,), (3,)) and bool(np.isfinite(found).all()) else None

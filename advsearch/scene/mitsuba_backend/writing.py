@@ -1,0 +1,300 @@
+"""A scene with its inputs set, as an XML file that stock Mitsuba loads, with meshes (PLY) and pictures (EXR) beside it.
+
+Mitsuba 3.9 writes no XML itself. Every number is written with all of its digits, meshes and pictures in float32.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import OpenEXR
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.description import OBJECT, SceneDescription
+from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, loadable, matt, own_surface, principled
+from advsearch.scene.mitsuba_backend.parts import GROUND, scene_dict, translation
+from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import Plugin, mi
+from advsearch.scene.parts import (
+    BallLamp,
+    HazePart,
+    MeshPart,
+    PluginNumbers,
+    PluginPart,
+    PointLamp,
+    ScenePart,
+    SpotLamp,
+)
+
+NAME = "scene.xml"
+
+TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
+"""Elements that are not called as Mitsuba calls the type, in small letters."""
+MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
+SCATTERINGS = 3
+"""Segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike."""
+BAKED = ("filename", "to_world", "flip_tex_coords")
+"""Entries of a mesh from a file that are in the mesh that is written."""
+CAMERA = {
+    "to_world": "to_world",
+    "fov": "fov",
+    "shift_x": "principal_point_offset_x",
+    "shift_y": "principal_point_offset_y",
+    "aperture": "aperture_radius",
+    "focus": "focus_distance",
+}
+
+
+def write_scene(
+    scene: MitsubaScene, inputs: Mapping[str, Tensor], path: Path, note: str, *, hide: bool = False
+) -> None:
+    """Write a scene as XML that stock Mitsuba loads, with meshes and pictures beside it.
+
+    Args:
+        scene: what to write.
+        inputs: as in `MitsubaScene.radiance`.
+        path: of the XML file, in a folder that is there.
+        note: for a comment at the beginning.
+        hide: as in `MitsubaScene.radiance`.
+
+    Raises:
+        InputError: something in it is no part of stock Mitsuba.
+    """
+    description, filter = scene.made
+    if description.camera_model is not None:
+        raise InputError("camera: stock Mitsuba has no sensor with distortion; export the run as glTF (.glb) instead")
+    kind = "volpath" if scene.volumetric else "path"  # not `prbvolpath`, which starts outside of all media
+    integrator: Plugin = {"type": kind, "max_depth": scene.max_depth, "rr_depth": NO_ROULETTE, "hide_emitters": hide}
+    base = scene_dict(description, scene.resolution, filter, scene.sampler)
+    plugins = described(base, description, inputs, integrator)
+    meshes = {shape.id(): shape for shape in scene.held(inputs).shapes() if shape.is_mesh()}
+    write_xml(path, plugins, {name: one for name, one in meshes.items() if name in plugins}, note)
+
+
+def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, Tensor], integrator: Plugin) -> Plugin:
+    """Return Mitsuba's dictionary of a scene with its inputs set; a mesh is `{"type": "ply", "bsdf": ...}`.
+
+    Args:
+        base: of `scene_dict`; changed.
+        description: of the scene.
+        inputs: those of `MitsubaScene`, that differ from the base values.
+        integrator: the path integrator's dictionary.
+
+    Raises:
+        InputError: something in it is no part of stock Mitsuba.
+    """
+    left = {name: value.detach().cpu().numpy().astype(np.float32) for name, value in inputs.items()}
+    scene: Plugin = {"type": "scene", "integrator": integrator, **base}
+    for name, key in CAMERA.items():
+        value = left.pop(f"camera.{name}", None)
+        if value is not None:
+            matrix = value.shape == (4, 4)
+            scene["camera"][key] = mi.ScalarTransform4f(value) if matrix else float(value[0])
+    if "environment.padded" in left:
+        scene["environment"]["bitmap"] = mi.Bitmap(np.ascontiguousarray(left.pop("environment.padded")[:, 1:-1]))
+    if description.photograph is not None:
+        base_color = description.photograph.base.numpy()
+        scene[GROUND] = {"type": "ply", "bsdf": matt(left.pop("ground.reflectance", base_color))}
+    for part in (description.meshes[OBJECT], *description.parts):
+        if isinstance(part, HazePart):
+            _put_haze(scene, part, left)
+        elif not isinstance(part, PluginNumbers):
+            scene[part.name] = _part(description.meshes.get(part.name, part), left)
+    for part in description.parts:
+        if isinstance(part, PluginNumbers):
+            for one in part.numbers:
+                if one.input in left and _put(scene, one.key.split("."), left[one.input].tolist()):
+                    del left[one.input]
+    if left:
+        raise InputError(f"out: stock Mitsuba has nothing for {', '.join(sorted(left))}; export another run")
+    return scene
+
+
+def _put_haze(scene: Plugin, haze: HazePart, left: Plugin) -> None:
+    """Fill a ball and the camera in it with haze, unless its density is 0; takes its inputs from what is left."""
+    density = left.pop(f"{haze.name}.density", np.array([haze.density])).tolist()
+    albedo = left.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
+    if not density[0] > 0.0:
+        return
+    medium = f"{haze.name}-medium"
+    inside = {"type": "ref", "id": medium}
+    scene[medium] = {"type": "homogeneous", "sigma_t": density[0], "albedo": {"type": "rgb", "value": albedo}}
+    scene[haze.name] = {"type": "sphere", "radius": haze.radius, "bsdf": {"type": "null"}, "interior": inside}
+    scene["camera"]["medium"] = inside
+    scene["integrator"]["max_depth"] += SCATTERINGS
+
+
+def _put(plugin: Plugin, key: list[str], values: list[float]) -> bool:
+    """Set a number or colour by Mitsuba's name, where that is the way to it in a dictionary; whether it is."""
+    here, *rest = key
+    if here.startswith("brdf_") and here not in plugin:  # the one surface of two sides
+        here = next((name for name, inner in plugin.items() if isinstance(inner, Mapping)), here)
+    inner = plugin.get(here)
+    if isinstance(inner, Mapping):
+        plugin[here] = dict(inner)
+        return bool(rest) and _put(plugin[here], rest, values)
+    if rest or inner is None:
+        return False
+    plugin[here] = values if len(values) > 1 else values[0]
+    return True
+
+
+def _part(part: ScenePart, left: Plugin) -> Plugin:
+    """A part's dictionary; takes its inputs from what is left."""
+    given = {name.partition(".")[2]: left.pop(name) for name in sorted(left) if name.startswith(f"{part.name}.")}
+    if isinstance(part, MeshPart):
+        given.pop("vertices", None), given.pop("normals", None)  # the mesh that is written has them
+        color = given.pop("base_color", None)
+        numbers = {name: float(given.pop(name)[0]) for name in MATERIAL if name in given and part.surface is None}
+        part = replace(part, material=replace(part.material, **numbers))
+        if color is not None:
+            part = replace(part, base_color=_display(color))
+        surface = principled(part)
+        if part.surface is not None:
+            base_color = part.base_color
+            surface = own_surface(part.surface, lambda options: base_texture(base_color, options))
+        radiance = given.pop("radiance", None)
+        if radiance is not None:
+            part = replace(part, emission=radiance.reshape(-1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)))
+        light = emitter(part)
+        found: Plugin = {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
+    elif isinstance(part, (PointLamp, SpotLamp)):
+        found = translation(replace(part, **_triples(given))).plugins[part.name]
+    elif isinstance(part, BallLamp):
+        ball = given.pop("ball", None)
+        found = translation(replace(part, **_triples(given))).plugins[part.name]
+        if ball is not None:
+            found["to_world"] = mi.ScalarTransform4f(ball)
+    elif isinstance(part, PluginPart):
+        found = loadable(part.plugin)
+    else:
+        raise InputError(f"out: stock Mitsuba has nothing for {part.name}; export a run without it")
+    left |= {f"{part.name}.{name}": value for name, value in given.items()}
+    return found
+
+
+def _triples(given: Plugin) -> Plugin:
+    """Take all colours and places out of what is given, as the fields of a lamp."""
+    return {name: tuple(map(float, given.pop(name))) for name in list(given)}
+
+
+def _display(linear: Any) -> Any:
+    return linear_to_srgb(torch.from_numpy(linear)).numpy()
+
+
+def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -> None:
+    """Write a scene's dictionary as XML, and beside it what it needs, in files whose names begin with its own.
+
+    Args:
+        path: of the XML file, in a folder that is there.
+        scene: of `described`.
+        meshes: Mitsuba's, by the names of the scene's entries of the type "ply".
+        note: for a comment at the beginning.
+    """
+    writer = _Writer(path)
+    root = ElementTree.Element("scene", version="3.0.0")
+    root.append(ElementTree.Comment(f" {note.replace('--', '- -')} "))
+    for name, plugin in scene.items():
+        if name == "type":
+            continue
+        if plugin["type"] == "ply" and name in meshes:
+            rest = {key: entry for key, entry in plugin.items() if key not in BAKED}
+            plugin = {**rest, "filename": writer.free(name, ".ply").name}
+            meshes[name].write_ply(str(path.with_name(plugin["filename"])))
+        writer.put(root, name, plugin, top=True)
+    ElementTree.indent(root)
+    path.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+class _Writer:
+    def __init__(self, path: Path) -> None:
+        self._path, self._taken = path, set[str]()
+
+    def free(self, name: str, suffix: str) -> Path:
+        """A file beside the scene that is not there yet."""
+        number, found = 1, f"{self._path.stem}-{name}{suffix}"
+        while found in self._taken:
+            number += 1
+            found = f"{self._path.stem}-{name}-{number}{suffix}"
+        self._taken.add(found)
+        return self._path.with_name(found)
+
+    def put(self, into: ElementTree.Element, name: str, value: Any, *, top: bool = False, within: str = "") -> None:
+        """Put an entry of a dictionary into an element."""
+        named = {"name": name}
+        if isinstance(value, Mapping):
+            self._mapping(into, name, value, top=top, within=within)
+        elif isinstance(value, mi.Bitmap):
+            path = self.free(within or name, ".exr")
+            _write_picture(path, np.array(value, dtype=np.float32))
+            ElementTree.SubElement(into, "string", name="filename", value=path.name)
+        elif hasattr(value, "matrix"):
+            matrix = np.array(value.matrix, dtype=np.float64).reshape(16)
+            one = ElementTree.SubElement(into, "transform", named)
+            ElementTree.SubElement(one, "matrix", value=_numbers(matrix))
+        elif isinstance(value, bool):
+            ElementTree.SubElement(into, "boolean", named, value=str(value).lower())
+        elif isinstance(value, int):
+            ElementTree.SubElement(into, "integer", named, value=str(value))
+        elif isinstance(value, float):
+            ElementTree.SubElement(into, "float", named, value=repr(float(value)))
+        elif isinstance(value, str):
+            if name == "filename" and os.path.isabs(value):
+                path = self.free(Path(value).stem, Path(value).suffix)
+                shutil.copyfile(value, path)
+                value = path.name
+            ElementTree.SubElement(into, "string", named, value=value)
+        elif isinstance(value, (list, tuple)) and len(value) == 3:
+            ElementTree.SubElement(into, "point", named, value=_numbers(value))
+        else:
+            raise InputError(f"out: {name} of {within} is a {type(value).__name__}, which XML of Mitsuba cannot say")
+
+    def _mapping(
+        self, into: ElementTree.Element, name: str, value: Mapping[str, Any], *, top: bool, within: str
+    ) -> None:
+        kind = str(value["type"])
+        if kind == "rgb":
+            found = value["value"]
+            numbers = _numbers(found if isinstance(found, (list, tuple)) else [found] * 3)
+            ElementTree.SubElement(into, "rgb", name=name, value=numbers)
+        elif kind == "spectrum":
+            found = value["value"]
+            pairs = found if isinstance(found, (int, float)) else ", ".join(f"{a!r}:{b!r}" for a, b in found)
+            ElementTree.SubElement(into, "spectrum", name=name, value=str(pairs))
+        elif kind == "ref":
+            ElementTree.SubElement(into, "ref", name=name, id=str(value["id"]))
+        else:
+            tag = mi.PluginManager.instance().plugin_type(kind).name
+            one = ElementTree.SubElement(into, TAGS.get(tag, tag.lower()), type=kind)
+            one.set("id" if top else "name", name)
+            inside = name if top else f"{within}-{name}"
+            for key, entry in value.items():
+                if key != "type":
+                    self.put(one, key, entry, within=inside)
+
+
+def _write_picture(path: Path, values: np.ndarray) -> None:
+    """Write an EXR; Mitsuba's own writer waits forever where Dr.Jit has one thread."""
+    channels = values.shape[2] if values.ndim == 3 else 1
+    by_name = {"Y": values.reshape(values.shape[:2])} if channels == 1 else {"RGBA"[:channels]: values}
+    with OpenEXR.File({}, by_name) as picture:
+        picture.write(str(path))
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(_each(values))
+
+
+def _each(values: Any) -> Iterator[str]:
+    for value in values:
+        yield repr(float(value))
