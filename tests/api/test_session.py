@@ -79,7 +79,7 @@ def victim(threshold: float, name: str = "bright") -> advsearch.Model:
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What an attack would do, without doing it."""
-    monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
+    monkeypatch.setattr(attacking, "_carry_out", lambda job, progress, resumed: job)
     return advsearch.attack
 
 
