@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from advsearch import losses as losses
     from advsearch import testing as testing
-    from advsearch.api.load import load_model as load_model
-    from advsearch.api.load import load_run as load_run
     from advsearch.api.render import Rendering as Rendering
+    from advsearch.api.render import load_model as load_model
+    from advsearch.api.render import load_run as load_run
     from advsearch.api.render import render as render
     from advsearch.engine.attack_result import AttackResult as AttackResult
     from advsearch.engine.loading import Scene as Scene
@@ -53,8 +53,8 @@ _HOMES = {
     "explain": "advsearch.questions.explain.carry_out",
     "gap": "advsearch.questions.gap.carry_out",
     "harden": "advsearch.questions.harden.carry_out",
-    "load_model": "advsearch.api.load",
-    "load_run": "advsearch.api.load",
+    "load_model": "advsearch.api.render",
+    "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
     "plan": "advsearch.questions.plan.carry_out",

@@ -77,10 +77,7 @@ def either(endings: Sequence[str]) -> str:
 
 def scaled(limit: int) -> int:
     """Return a limit on the size of input (bytes, pixels, faces, ...) times `ADVSEARCH_LIMITS`, which is 1 by default.
-
-    Raises:
-        InputError: `ADVSEARCH_LIMITS` is not a number greater than 0.
-    """
+    Raises InputError where `ADVSEARCH_LIMITS` is not a number greater than 0."""
     text = os.environ.get(FACTOR, "") or "1"
     try:
         factor = float(text)
@@ -92,13 +89,8 @@ def scaled(limit: int) -> int:
 
 
 def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
-    """Return the error for input over a limit; it names the setting that raises the limit.
-
-    Args:
-        path: the file.
-        expected: what was expected, with the limit: ``"a mesh of at most 100 faces"``.
-        size: what was got: ``"120"``.
-    """
+    """Return the error for input over a limit, which names the setting that raises it. Expected: ``"a mesh of at most
+    100 faces"``; size: ``"120"``."""
     return FileFormatError(
         f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the environment makes all limits "
         "ten times as large"
@@ -106,16 +98,10 @@ def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
 
 
 def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
-    """Return an ordinary file opened for reading; close it.
+    """Return an ordinary file, such as ``"a label file"``, opened for reading; close it. Links are followed.
 
-    Args:
-        path: the file; links are followed.
-        expected: what it should be, for messages: ``"a label file"``.
-        limit: the most bytes it may have, before `scaled`.
-
-    Raises:
-        FileFormatError: a directory, a pipe, a socket or a device, none of which is read; or too large.
-        OSError: as for `open`: it is not there, or there is no permission.
+    Raises FileFormatError: a directory, a pipe, a socket or a device, none of which is read; or more bytes than the
+    limit, which is `scaled`. Raises OSError as `open`: it is not there, or there is no permission.
     """
     if "\0" in str(path):
         raise FileFormatError(f"{path}: expected the name of a file, got one with a zero byte in it")
@@ -160,19 +146,16 @@ def read_text(path: Path, expected: str, limit: int) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        ValueError: it is not JSON, is nested deeper than `DEPTH`, or has a number of thousands of digits; the message
-            is short.
-    """
+    """Return the value of a JSON text. Raises ValueError where it is not JSON, is nested deeper than `DEPTH`, or has a
+    number of thousands of digits; the message is short."""
     try:
         value = json.loads(text, parse_int=_whole_number)
     except RecursionError:
         raise ValueError(f"lists or objects nested deeper than {DEPTH}") from None
     level = [value]
     for _ in range(DEPTH):
-        level = [inner for outer in level if isinstance(outer, (list, dict)) for inner in _inside(outer)]
+        level = [list(one.values()) if isinstance(one, dict) else one for one in level if isinstance(one, (dict, list))]
+        level = [inner for outer in level for inner in outer]
         if not level:
             return value
     raise ValueError(f"lists or objects nested deeper than {DEPTH}")
@@ -182,10 +165,6 @@ def _whole_number(text: str) -> int:
     if len(text) > DIGITS:
         raise ValueError(f"a whole number of {len(text)} digits")
     return int(text)
-
-
-def _inside(value: list[JsonValue] | JsonObject) -> list[JsonValue]:
-    return value if isinstance(value, list) else list(value.values())
 
 
 def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> None:

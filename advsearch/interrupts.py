@@ -8,19 +8,14 @@ from types import FrameType
 
 
 class Interrupts:
-    """A handler of Ctrl-C as Python's own, which counts.
-
-    Attributes:
-        count: signals that have come.
-        ended: whether further ones are only counted, since nothing is left to interrupt.
-    """
+    """A handler of Ctrl-C as Python's own, which counts signals. Once it has `ended` they are only counted, since
+    nothing is left to interrupt."""
 
     def __init__(self) -> None:
         self.count = 0
         self.ended = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Take a signal."""
         self.count += 1
         if not self.ended:
             raise KeyboardInterrupt
@@ -37,11 +32,8 @@ INTERRUPTS = Interrupts()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise what an interrupt that comes inside the block was made into as the interrupt that it is.
-
-    Raises:
-        KeyboardInterrupt: there was an error of any kind inside the block, and an interrupt before it.
-    """
+    """Raise what an interrupt that comes inside the block was made into as the interrupt that it is. Raises
+    KeyboardInterrupt where there was an error of any kind inside the block, and an interrupt before it."""
     before = INTERRUPTS.count
     try:
         yield

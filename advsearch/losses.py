@@ -3,11 +3,9 @@
     def smooth(logits, images, labels, texture):
         return losses.margin(logits, labels) - 10.0 * losses.total_variation(texture)
 
-Those of logits are **maximised**: they rise as the answer gets worse, or nearer to a target. Each takes logits (N, C)
-and labels: (N,) int64, one right answer for each picture, or the indices of a label set of which every answer is right.
-Each is an objective by itself: `attack("mug", objective=losses.log_odds)`. Those of colours are a **cost**, which is
-subtracted. All return (N,) and are differentiable; formulas and sources stand in
-`advsearch.attacks.objective_functions` and `advsearch.engine.objective`.
+Those of logits are **maximised**. Each takes logits (N, C) and labels: (N,) int64, or the indices of a label set of
+which every answer is right; each is an objective by itself. Those of colours are a **cost**. All return (N,) and are
+differentiable; formulas are in `advsearch.attacks.objective_functions` and `advsearch.engine.objective`.
 """
 
 from __future__ import annotations
@@ -22,19 +20,9 @@ from advsearch.engine import objective
 from advsearch.errors import InputError
 
 __all__ = [
-    "carlini_wagner",
-    "cross_entropy",
-    "dlr",
-    "log_odds",
-    "margin",
-    "non_printability",
-    "targeted_carlini_wagner",
-    "targeted_cross_entropy",
-    "targeted_dlr",
-    "targeted_log_odds",
-    "targeted_margin",
-    "total_variation",
-]
+    "carlini_wagner", "cross_entropy", "dlr", "log_odds", "margin", "non_printability", "targeted_carlini_wagner",
+    "targeted_cross_entropy", "targeted_dlr", "targeted_log_odds", "targeted_margin", "total_variation",
+]  # fmt: skip
 
 Labels = Tensor | Sequence[int]
 """(N,) int64, the right answer of each picture; or indices, each of which is right for all pictures."""

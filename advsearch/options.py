@@ -59,18 +59,9 @@ def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
 
 
 def check_options(what: str, name: str, kind: type[Any], given: Mapping[str, object]) -> None:
-    """Check that there are such options, and that a number, a truth value or a text is one; ranges are theirs.
-
-    Args:
-        what: "policy", say.
-        name: of it.
-        kind: its dataclass.
-        given: option to value.
-
-    Raises:
-        UnknownNameError: there is no such option.
-        InputError: a value is of another type.
-    """
+    """Check that a dataclass has such options, and that a number, a truth value or a text is one; ranges are theirs.
+    `what` is "policy", say. Raises UnknownNameError: there is no such option. Raises InputError: a value is of another
+    type."""
     known = declared_options(kind)
     for option, value in given.items():
         if option not in known:
@@ -123,16 +114,8 @@ def told(given: object) -> str:
 
 
 def check_takes(what: str, function: Callable[..., object], *names: str) -> None:
-    """Check that a user's function can be called with arguments by position.
-
-    Args:
-        what: "metrics: f", say.
-        function: what is called.
-        names: what it is given, for the message.
-
-    Raises:
-        InputError: it takes others.
-    """
+    """Check that a user's function ("metrics: f") can be called with arguments of these names, by position; InputError
+    otherwise."""
     try:
         inspect.signature(function).bind(*names)
     except ValueError:  # built in: nothing to look at

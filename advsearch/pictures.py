@@ -39,22 +39,16 @@ def without_pillows_limit() -> Iterator[None]:
 
 
 def check_pixels(path: Path | str, width: int, height: int, limit: int = LARGEST_PIXELS) -> None:
-    """Refuse a picture with too many pixels before it is decoded.
-
-    Raises:
-        FileFormatError: it has more than `limit`, before `advsearch.files.scaled`.
-    """
+    """Refuse a picture with too many pixels before it is decoded. Raises FileFormatError where it has more than
+    `limit`, before `advsearch.files.scaled`."""
     if width * height > files.scaled(limit):
         expected = f"a picture of at most {files.scaled(limit):,} pixels"
         raise files.too_large(path, expected, f"{width} x {height}")
 
 
 def check_decodable(image: Image.Image, path: Path | str) -> None:
-    """Refuse an opened picture that takes too much to decode.
-
-    Raises:
-        FileFormatError: too many pixels or scans, or a format that is not one of `FORMATS`.
-    """
+    """Refuse an opened picture that takes too much to decode. Raises FileFormatError for too many pixels or scans, or a
+    format that is not one of `FORMATS`."""
     check_pixels(path, *image.size)
     if image.format not in (None, "MPO", *FORMATS):  # an MPO is a JPEG with a second picture
         raise FileFormatError(f"{path}: expected a picture such as PNG or JPEG, got {image.format}; convert it")
@@ -64,15 +58,8 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path, limit: int) -> Iterator[Image.Image]:
-    """Open a picture file for the block, which may decode it.
-
-    Args:
-        path: the file.
-        limit: the most bytes that it may have.
-
-    Raises:
-        FileFormatError: it is missing, no ordinary file, no picture, too large or damaged.
-    """
+    """Open a picture file of at most `limit` bytes for the block, which may decode it. Raises FileFormatError: it is
+    missing, no ordinary file, no picture, too large or damaged."""
     try:
         data = files.read_bytes(path, "a picture file such as PNG", limit)
         with warnings.catch_warnings(), without_pillows_limit():

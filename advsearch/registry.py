@@ -72,11 +72,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return all(part.isidentifier() for part in parts) and not (parts[0] in self._own or parts[0] in self._installed)
 
     def _class(self, name: str) -> Entry:
-        """Import "package.module:Class".
-
-        Raises:
-            InputError: it cannot be imported, is something else, or must not be imported (`only_named_code`).
-        """
+        """Import "package.module:Class". Raises InputError where it cannot be imported, is something else, or must not
+        be imported (`only_named_code`)."""
         module, _, attribute = name.partition(":")
         check_import(name)
         try:
@@ -91,11 +88,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
     @cached_property
     def _installed(self) -> dict[str, Entry]:
-        """Entries of other packages.
-
-        Raises:
-            InputError: what an entry point names cannot be imported, or is something else.
-        """
+        """Entries of other packages. Raises InputError where what an entry point names cannot be imported, or is
+        something else."""
         found: dict[str, Entry] = {}
         for point in entry_points(group=self.group):
             where = f"entry point {point.name} = {point.value} of group {self.group}"
@@ -116,12 +110,8 @@ _GUARD: ContextVar[tuple[str, frozenset[str]] | None] = ContextVar("guard", defa
 
 @contextmanager
 def only_named_code(file: str | os.PathLike[str], named: Iterable[str]) -> Iterator[None]:
-    """Import no Python code by its name inside the block but what is named: the settings are somebody's file.
-
-    Args:
-        file: for messages.
-        named: "package.module:attribute", each as it stands in the file.
-    """
+    """Import no Python code by its name inside the block but what is `named`, as it stands in the file: the settings
+    are somebody's file."""
     token = _GUARD.set((os.fspath(file), frozenset(named)))
     try:
         yield

@@ -30,13 +30,8 @@ def there(module: str) -> bool:
 
 
 def in_room(name: str, module: str, what: str) -> Any:
-    """Return what a question has in one of its modules; None where it has no such, or is no room.
-
-    Args:
-        name: of the question, as its command.
-        module: `settings`, say.
-        what: `CONFIG`, say.
-    """
+    """Return what a question has in one of its modules, such as `CONFIG` in `settings`; None where it has no such, or
+    is no room."""
     path = f"advsearch.questions.{name}.{module}"
     if name not in rooms() or find_spec(path) is None:
         return None

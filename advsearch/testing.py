@@ -147,16 +147,7 @@ def _asserted(
     """Try a suite of one claim, and raise what its answer says."""
     __tracebackhide__ = True
     # late: torch takes long to import
-    from advsearch.engine.loading import (
-        CONTROL,
-        MODEL,
-        SCENE,
-        Scene,
-        instances_in,
-        lending,
-        scene_as_settings,
-        settings_of,
-    )
+    from advsearch.engine import loading
     from advsearch.engine.naming import exists_here, in_turn, model_name
     from advsearch.questions.test.carry_out import test_from_config
 
@@ -164,18 +155,18 @@ def _asserted(
     with ExitStack() as stack:
         stack.enter_context(in_turn())
         given, said = dict(settings), dict(claim)
-        if isinstance(object, Scene):
-            given |= {key: value for key, value in scene_as_settings(object).items() if value is not None}
-            stack.enter_context(lending(SCENE, {given["object"]: object}))
+        if isinstance(object, loading.Scene):
+            given |= {key: value for key, value in loading.scene_as_settings(object).items() if value is not None}
+            stack.enter_context(loading.lending(loading.SCENE, {given["object"]: object}))
         else:
             given["object"] = str(object)
         for key, model in models.items():
             (given if key == "model" else said)[key] = model_name(model)
             if not isinstance(model, (str, Path)):
-                stack.enter_context(lending(MODEL, {model_name(model): model}))
-        if instances := instances_in(given.get("controls", ())):
-            stack.enter_context(lending(CONTROL, {one.name: one for one in instances}))
-            given["controls"] = settings_of(given["controls"])
+                stack.enter_context(loading.lending(loading.MODEL, {model_name(model): model}))
+        if instances := loading.instances_in(given.get("controls", ())):
+            stack.enter_context(loading.lending(loading.CONTROL, {one.name: one for one in instances}))
+            given["controls"] = loading.settings_of(given["controls"])
         title = f"assert_{claim['claim']}"
         values = {"title": title, "settings": given, "seed": seed, "confidence": confidence, "claims": {name: said}}
         suite = suite_of(values, title)
@@ -191,7 +182,6 @@ def _asserted(
 
 
 def _told(result: SuiteResult, one: ClaimAnswer, again: str) -> str:
-    """What a failing test shows."""
     run = Path(result.run or "")
     lines = [f"{one.name}: {one.answer}: {one.reason}", f"  claimed: {one.statement}"]
     lines += [f"  picture: {(run / one.picture).resolve()}"] if one.picture else []

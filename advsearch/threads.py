@@ -1,28 +1,10 @@
 """How many threads torch and Dr.Jit use, and how torch's wait, so that the two pools do not fight.
 
-A search step renders (Dr.Jit's pool), then runs the model (torch's OpenMP pool), then renders again. An idle Dr.Jit
-worker polls for 20 ms before it sleeps. OpenMP threads poll at their barriers, by default for about ten milliseconds:
-as soon as anything else wants a core, the polling thread holds the one that the awaited thread needs, and a network of
-a hundred short layers has hundreds of barriers. A thread that sleeps at once costs a few microseconds to wake instead.
-
-Measured (`benchmarks/threads.py`; two cores, 16 samples, a network like MobileNetV2; medians of a step, 1.00 is the
-best that any setting reached in the same run):
-
-                                    quiet, 224 x 224    quiet, 64 x 64    busy, 224    busy, 64
-    sleeping at once (PASSIVE)      1.12                1.08              1.03         1.09
-    a millisecond of polling        1.00                1.15                           4.26
-    torch's default                 1.01                                  6.50         1.35
-    polling on (ACTIVE)             1.5                 2.0               1.53         1.82
-    torch on one thread             1.04                1.00                           1.07
-
-Busy is a machine that others use as well; its figures vary a good deal. Sleeping is never far from the best, and the
-others are at times. Right after a render Dr.Jit's workers still poll, and a model that shares their cores waits at
-every barrier: in a search at 128 x 128 the reference model took 23 ms forward with two threads and 4 ms with one, and
-MobileNetV2 at 224 x 224 took 30 and 18 ms (64 and 56 ms forward and backward). So while there is rendering, torch gets
-half of the cores, and all of them only where it works alone (training).
-
-OpenMP reads its environment once, when torch is imported, so this module sets it when it is imported itself and has to
-come before torch. What the user has set already is left alone. Imports the standard library only.
+Idle OpenMP threads poll at their barriers, and hold the core that the awaited one needs. Measured
+(`benchmarks/threads.py`), threads that sleep at once are never far from the best; others can be 4 to 6 times slower on
+a busy machine. Right after a render Dr.Jit's workers still poll too, so while there is rendering torch gets half of the
+cores, and all of them only where it works alone (training). OpenMP reads its environment once, when torch is imported:
+this module has to come before torch. What the user has set is left alone. Imports the standard library only.
 """
 
 from __future__ import annotations
@@ -50,11 +32,8 @@ _chosen: int | None = None
 
 
 def cores(quota: Path = _CPU_MAX) -> int:
-    """The number of cores this process may use: those it is pinned to, and no more than a container's quota allows.
-
-    Args:
-        quota: the file with the quota and its period in microseconds (control groups, version 2).
-    """
+    """The number of cores this process may use: those it is pinned to, and no more than a container's quota allows. The
+    file has the quota and its period in microseconds (control groups, version 2)."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         limit, period = quota.read_text(encoding="ascii").split()

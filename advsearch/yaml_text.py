@@ -64,12 +64,8 @@ _Loader.add_implicit_resolver(
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the value of a YAML text.
-
-    Raises:
-        ValueError: it is not YAML, is too large or nested too deeply, or holds something else than settings are made
-            of; the message is short.
-    """
+    """Return the value of a YAML text. Raises ValueError where it is not YAML, is too large or nested too deeply, or
+    holds something else than settings are made of; the message is short."""
     if len(text) > scaled(LARGEST):
         raise ValueError(f"a text of {len(text):,} characters")
     try:
@@ -77,17 +73,13 @@ def parse_yaml(text: str) -> Any:
     except RecursionError:
         raise ValueError(f"lists or mappings nested deeper than {DEPTH}") from None
     except yaml.MarkedYAMLError as error:
-        raise ValueError(_short(_marked(error))) from None
+        what = error.note or f"other text ({error.problem or error.context})"
+        mark = error.problem_mark or error.context_mark
+        marked = what if mark is None else f"{what} in line {mark.line + 1}, column {mark.column + 1}"
+        raise ValueError(_short(marked)) from None
     except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         # The constructors of PyYAML raise all of these for values that do not fit their tags.
         raise ValueError(_short(str(error))) from None
-
-
-def _marked(error: yaml.MarkedYAMLError) -> str:
-    """What is there, and where: ours by itself, and what a rule of YAML says as an aside."""
-    what = error.note or f"other text ({error.problem or error.context})"
-    mark = error.problem_mark or error.context_mark
-    return what if mark is None else f"{what} in line {mark.line + 1}, column {mark.column + 1}"
 
 
 def _short(text: str) -> str:

@@ -40,7 +40,8 @@ from torch.nn import functional
 
 from advsearch.attacks import Block, Domain, Evaluate, Evaluation, Query, make_policy, search
 from advsearch.models.model import Detaching, mend_batch_norms
-from advsearch.tasks.detection import Detection, Place
+from advsearch.tasks.boxes import Place
+from advsearch.tasks.detection import Detection
 
 SIDE, TEXELS = 64, 8
 NAMES = ("square", "disc", "cross")

@@ -19,7 +19,7 @@ threads.configure()
 import torch  # noqa: E402
 
 from advsearch.models import Model, load_model  # noqa: E402
-from advsearch.models.trainable import Trainable, trainable  # noqa: E402
+from advsearch.models.reference import Trainable, trainable  # noqa: E402
 from advsearch.questions.harden.lessons import Lesson  # noqa: E402
 from advsearch.questions.harden.scenes import (  # noqa: E402
     TRAINING,

@@ -35,7 +35,6 @@ COMMON = {
     "seeds",
     "threads",
     "progress",
-    "watching",
     "yaml_text",
 }
 """Small modules that anyone may import and that import nobody but each other."""
@@ -61,7 +60,7 @@ RULES = {
     **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
     "pictures": Rule(set(), {"numpy", "PIL"}, HEAVY),
     "yaml_text": Rule(set(), {"yaml"}),
-    "watching": Rule({"report"}, {"rich"}),
+    "progress": Rule({"report"}, {"rich"}),
     # typing_extensions for the type checker only
     "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),
     "config": Rule({"settings"}, {"pydantic", "yaml", "typing_extensions"}),

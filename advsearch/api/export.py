@@ -48,13 +48,8 @@ GLB, XML = ".glb", ".xml"
 
 @dataclass(frozen=True, eq=False)
 class AnsweredRun:
-    """A run with its answer.
-
-    Attributes:
-        folder: of the run.
-        problem: as the run had it.
-        u: (d,) the configuration of the whole space; what varies by chance is as in the clean scene.
-    """
+    """A run's folder, its problem as it had it, and its answer: u (d,), the configuration of the whole space; what
+    varies by chance is as in the clean scene."""
 
     folder: Path
     problem: Problem

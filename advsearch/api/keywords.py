@@ -19,25 +19,13 @@ from typing import Any, Literal, TypedDict, TypeVar
 import numpy as np
 from torch import nn
 
-from advsearch.engine.loading import (
-    CONTROL,
-    MODEL,
-    SCENE,
-    Controls,
-    Scene,
-    all_lent,
-    instances_in,
-    lending,
-    only_here,
-    scene_as_settings,
-    settings_of,
-)
+from advsearch.engine import loading
 from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, in_turn, model_name
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import told
+from advsearch.progress import watched
 from advsearch.settings import Config, as_python, is_shallow, settings
-from advsearch.watching import watched
 
 Names = str | Sequence[str]
 """Names in a list, or in a text with commas between them."""
@@ -81,7 +69,7 @@ class NamedKeywords(RunKeywords, total=False):
     """What a question takes by name."""
 
     task: Named
-    controls: Controls
+    controls: loading.Controls
 
 
 class DerivativeKeywords(PictureKeywords, total=False):
@@ -155,19 +143,16 @@ class GapKeywords(SearchKeywords, NamedKeywords, total=False):
     policy: Named
     workers: int | None
     cluster: str | None
-    over: Controls
+    over: loading.Controls
 
 
-LOADED = (Scene, Model, nn.Module)
+LOADED = (loading.Scene, Model, nn.Module)
 """What a question may be given in place of a name."""
 
 
 class _Signature(inspect.Signature):
-    """A signature with all settings, for editors, which `help` writes without them: it lists them below.
-
-    Attributes:
-        short: the same with `**settings` in their place.
-    """
+    """A signature with all settings, for editors; `help` writes the `short` one, with `**settings` in their place: it
+    lists them below."""
 
     __slots__ = ("short",)
     short: Any
@@ -239,11 +224,15 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                             "takes your own, and `sweep` a task of your own"
                         )
                 for key in {"controls", "over"} & plain.keys() - own.parameters.keys():
-                    if instances_in(plain[key]):
-                        if only_here(plain[key]):
+                    if loading.instances_in(plain[key]):
+                        if loading.only_here(plain[key]):
                             check_not_spread(plain)
-                        stack.enter_context(lending(CONTROL, {one.name: one for one in instances_in(plain[key])}))
-                        plain[key] = settings_of(plain[key])
+                        stack.enter_context(
+                            loading.lending(
+                                loading.CONTROL, {one.name: one for one in loading.instances_in(plain[key])}
+                            )
+                        )
+                        plain[key] = loading.settings_of(plain[key])
                 if "object" in own.parameters and "scene" not in own.parameters:
                     loaded = {name: one for name, one in bound.arguments.items() if isinstance(one, LOADED)}
                     if loaded:
@@ -279,20 +268,22 @@ def _docstring(text: str, names: Sequence[str], command: str, settings: Sequence
 def configured(config: type[Made], **given: object) -> Made:
     """Return a configuration of settings as Python has them; None is one that was not given."""
     made = config(**{name: value for name, value in given.items() if value is not None})
-    parts = [f"the model {model_name(one)}" for one in all_lent(MODEL) if exists_here(one)]
-    parts += ["the scene"] if any(one.only_here for one in all_lent(SCENE)) else []
-    return made.with_only_here([*parts, *(f"the control {name}" for name in only_here(all_lent(CONTROL)))])
+    parts = [f"the model {model_name(one)}" for one in loading.all_lent(loading.MODEL) if exists_here(one)]
+    parts += ["the scene"] if any(one.only_here for one in loading.all_lent(loading.SCENE)) else []
+    return made.with_only_here(
+        [*parts, *(f"the control {name}" for name in loading.only_here(loading.all_lent(loading.CONTROL)))]
+    )
 
 
 def _named(loaded: Mapping[str, Any], given: Mapping[str, Any], stack: ExitStack) -> dict[str, Any]:
     """Lend a scene and a model that a question takes by name, and return the settings that name them."""
     named: dict[str, Any] = {}
     for one in loaded.values():
-        if isinstance(one, Scene):
+        if isinstance(one, loading.Scene):
             check_not_of_scene({name: value for name, value in given.items() if name != "object"})
-            named |= {name: value for name, value in scene_as_settings(one).items() if value is not None}
-            stack.enter_context(lending(SCENE, {named["object"]: one}))
+            named |= {name: value for name, value in loading.scene_as_settings(one).items() if value is not None}
+            stack.enter_context(loading.lending(loading.SCENE, {named["object"]: one}))
         else:
             named["model"] = model_name(one)
-            stack.enter_context(lending(MODEL, {named["model"]: one}))
+            stack.enter_context(loading.lending(loading.MODEL, {named["model"]: one}))
     return named

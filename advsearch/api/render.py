@@ -1,20 +1,124 @@
-"""`render`: pictures of a scene, written to a file, with what the model says of them."""
+"""`render`: pictures of a scene, with what the model says of them; `load_run`, the answer of a run from its folder.
+
+And `load_model`, to which a task may be named.
+"""
 
 from __future__ import annotations
 
+import inspect
 import os
+from collections.abc import Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
 
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from advsearch import models
 from advsearch.config import RenderConfig
 from advsearch.engine import rendering
+from advsearch.engine.attack_parts import parts_in
+from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.naming import check_run_settings, given_to, in_turn, load_models, scene_of
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import pictures_of, writable
+from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import InputError
-from advsearch.progress import NullProgress, Progress
-from advsearch.runs.results.base import RenderResult
+from advsearch.files import read_bytes
+from advsearch.models import Model
+from advsearch.progress import NullProgress, Progress, shows_progress
+from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
+from advsearch.runs.images import read_png
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.base import RenderResult, Result
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.summary import read_answer, read_result
+from advsearch.scene.importing.files import LARGEST_FILE
+from advsearch.scene.importing.hdr import read_exr
 from advsearch.scene.surfaces import aovs_of
-from advsearch.tasks import make_task
-from advsearch.watching import shows_progress
+from advsearch.tasks import AnyTask, make_task
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from advsearch.models.model import Read
+
+
+def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
+    """Return the answer of a run from its folder, of the type that the function of its question returns.
+
+    An attack's is an `AttackResult`, a sweep's a `SweepResult`, `gap`'s a `GapResult`, and so on; of several epsilons
+    or models, which only a command attacks, it is the table of them. `search` of a loaded attack is None:
+    `rows("search")` has its steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
+
+    Args:
+        run: its name, which stands for runs/NAME, or its folder.
+
+    Raises:
+        UnknownNameError: there is no such run.
+        InputError: it is neither a name nor a folder.
+        FileFormatError: it has not ended, or its files are damaged.
+    """
+    if not isinstance(run, (str, Path)):
+        raise InputError(f"run: expected the name of a run or its folder, got {run!r:.80}")
+    path = find_run(run)
+    result = read_result(path)
+    if isinstance(result, AttackSummary):
+        return _attack(path, result)
+    if isinstance(result, SweepSummary):
+        return SweepResult(result, path)
+    return result
+
+
+def _attack(path: Path, summary: AttackSummary) -> AttackResult:
+    clean, adversarial = (
+        torch.from_numpy(read_png(path / IMAGES / f"{name}.png")) for name in ("clean", "adversarial")
+    )
+    return AttackResult(
+        summary=summary,
+        run=path,
+        u=torch.from_numpy(read_answer(path)),
+        clean=clean,
+        adversarial=adversarial,
+        artifacts={one.stem: _layer(one) for one in sorted((path / ARTIFACTS).glob("*.exr"))},
+        search=None,
+        parts=cache(partial(parts_in, path)),
+    )
+
+
+def _layer(path: Path) -> Tensor:
+    """What a control handed over, (h, w, 3) float32."""
+    planes, _ = read_exr(path, read_bytes(path, "a picture of a run", LARGEST_FILE))
+    return torch.from_numpy(np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1))
+
+
+class ModelKeywords(TypedDict, total=False):
+    """What may be said of a model, see `advsearch.models.load_model`."""
+
+    labels: str | os.PathLike[str] | Sequence[str] | None
+    prompt: str | Sequence[str] | None
+    name: str | None
+    input_size: int | Sequence[int] | str | None
+    mean: float | Sequence[float] | str | None
+    std: float | Sequence[float] | str | None
+    value_range: Sequence[float] | str | None
+    layout: str | None
+    channels: str | None
+    max_batch: int | None
+    read: Read | None
+
+
+def load_model(
+    spec: str | Path | nn.Module | Model, *, task: AnyTask | None = None, **options: Unpack[ModelKeywords]
+) -> Model:
+    return models.load_model(spec, task=None if task is None else make_task(task), **options)
+
+
+load_model.__doc__ = models.load_model.__doc__
+load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]
+
 
 render = in_turn()(shows_progress(rendering.render))
 

@@ -43,13 +43,8 @@ from advsearch.viewer.pages import keep_answer
 
 
 def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
-    """Return the result of a part; what is done of it is not done again.
-
-    Args:
-        path: of its folder.
-        config: what it does, where it has not begun.
-        progress: told how far it is.
-    """
+    """Return the result of the part in the folder `path`; what is done of it is not done again. The configuration is
+    what it does, where it has not begun."""
     if not is_run(path) or not (path / CONFIG).is_file():
         return carry_out(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
     if finished(path):
@@ -77,14 +72,8 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class StudyAttack:
-    """One attack of a study.
-
-    Attributes:
-        config: what the attack is carried out with.
-        name: of its folder.
-        of: what tells it from the others: an object, a control of it, or a model.
-        epsilon: that of a curve; None where there is one for all.
-    """
+    """One attack of a study: what it is carried out with, the name of its folder, and what tells it from the others: an
+    object, a control of it, or a model. The epsilon is that of a curve, or None."""
 
     config: AttackConfig
     name: str
@@ -108,30 +97,26 @@ def chains_of(config: AttackConfig) -> list[Chain]:
         InputError: a setting that none of the controls takes, or a name comes twice.
     """
     if config.command == "gap":
-        return [[one] for one in _controls_of(config)]
-    return [[one] for one in _models_of(config)] if config.is_matrix else _objects_of(config)
+        return _controls_of(config)
+    if not config.is_matrix:
+        return _objects_of(config)
+    names = different(config.models, "model")
+    own = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
+    return [
+        [StudyAttack(AttackConfig.of(config, **more), f"{place:02d}-" + default_name(name, []), name)]
+        for place, (name, more) in enumerate(own)
+    ]
 
 
-def _controls_of(config: AttackConfig) -> Chain:
-    """Every object with every control."""
+def _controls_of(config: AttackConfig) -> list[Chain]:
     check_run_settings(config)
     attacks = []
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
             own = settings_alone(config, control, settings)
             one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
-            attacks.append(StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control))
+            attacks.append([StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control)])
     return attacks
-
-
-def _models_of(config: AttackConfig) -> Chain:
-    """Every model, or all of them together."""
-    names = different(config.models, "model")
-    own = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
-    return [
-        StudyAttack(AttackConfig.of(config, **more), f"{place:02d}-" + default_name(name, []), name)
-        for place, (name, more) in enumerate(own)
-    ]
 
 
 def _objects_of(config: AttackConfig) -> list[Chain]:
@@ -177,17 +162,8 @@ def attacks_of(settings: JsonObject) -> Call:
 
 
 def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress) -> None:
-    """Have the attacks that are not begun carried out by workers, where some were asked for.
-
-    Args:
-        config: of the study.
-        chains: its attacks.
-        run: its folder, which gets theirs.
-        progress: told how far it is.
-
-    Raises:
-        ClusterError: every worker died of an attack, or there are none.
-    """
+    """Have the attacks of a study that are not begun carried out by workers into its folder, where some were asked for.
+    Raises ClusterError: every worker died of an attack, or there are none."""
     left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / one.name) for one in chain)]
     plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     settings, threads = {"command": config.command, **plain}, config.used_threads or 1
@@ -229,15 +205,8 @@ def carry_out_study(
     progress: Progress | None,
     resumed: Path | None,
 ) -> Study:
-    """Carry out the attacks of a study in its run.
-
-    Args:
-        config: what is asked.
-        attacks: carries out the attacks and returns their rows.
-        result_of: puts these into a result, beside what all studies have in common.
-        progress: told how far it is.
-        resumed: folder of the run to go on with.
-    """
+    """Carry out the attacks of a study in its run: `attacks` does so and returns their rows, and `result_of` puts these
+    into a result, beside what all studies have in common."""
     begun, progress = time.perf_counter(), progress or NullProgress()
     with RunDirectory.of(config, resumed) as run:
         notes = _label_for_all(config)
@@ -279,13 +248,8 @@ def _label_for_all(config: AttackConfig) -> list[str]:
 class StudyRun:
     """Carries out attacks, each in a folder of its own, unless they are done already; first on workers, if asked to.
 
-    Attributes:
-        chains: all that there are.
-        run: of the study.
-        progress: told how far it is.
-        names: of the parts so far.
-        warnings: what they said, each sentence once.
-        interrupted: whether one was; nothing more is carried out then.
+    `chains` are all that there are, `names` are of those so far, and `warnings` what they said, each sentence once.
+    After an interrupt nothing more is carried out.
     """
 
     def __init__(self, config: AttackConfig, run: RunDirectory, progress: Progress) -> None:

@@ -1,29 +1,32 @@
-"""`advsearch dashboard`: look at runs in a browser."""
+"""`advsearch dashboard`: look at runs in a browser; `advsearch view`: make the page of a run anew.
+
+Or a folder with it that any web server can serve.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
+from advsearch.cli.question import Command
 from advsearch.errors import InputError
+from advsearch.questions.photographs.answer import NO_QR, qr_text
+from advsearch.runs.directory import find_run
+from advsearch.viewer.pages import renewed, write_bundle
+from advsearch.viewer.server import Dashboard
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from advsearch.questions.photographs.answer import PhotoAgreement
     from advsearch.questions.photographs.carry_out import Photographs
 
-HELP = "show the pages of runs in a browser on this machine"
-MORE = ". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C"
-
 PORT = 8265
-EXAMPLES = ("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _dashboard_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)")
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen at (default: %(default)s); others need the printed token"
@@ -35,13 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the address as JSON")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Serve until Ctrl-C."""
-    # late, so that --help answers at once
-    from advsearch.questions.photographs.answer import NO_QR, qr_text
-    from advsearch.runs.directory import find_run
-    from advsearch.viewer.server import Dashboard
-
+def _dashboard(args: argparse.Namespace) -> int:
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     runs = [find_run(name) for name in args.runs]
@@ -74,8 +71,7 @@ class _LoadedLater:
 
     @cached_property
     def _loaded(self) -> Photographs:
-        # late, so that --help answers at once
-        from advsearch.questions.photographs.carry_out import Photographs
+        from advsearch.questions.photographs.carry_out import Photographs  # takes seconds
 
         return Photographs()
 
@@ -84,3 +80,32 @@ class _LoadedLater:
 
     def agreement(self, run: Path) -> PhotoAgreement:
         return self._loaded.agreement(run)
+
+
+DASHBOARD = Command(
+    _dashboard_arguments,
+    _dashboard,
+    ". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C",
+    ("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0"),
+)
+
+
+def _view_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle")
+    parser.add_argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures")
+    output.add_flags(parser)
+
+
+def _view(args: argparse.Namespace) -> int:
+    folders = [find_run(name) for name in args.runs]
+    if args.bundle is None and len(folders) > 1:
+        raise InputError("--bundle: pages of several runs go into a folder; name one, or give one run")
+    out = renewed(folders[0]) if args.bundle is None else write_bundle(folders, Path(args.bundle))
+    if args.json:
+        output.print_json({"schema": 1, "command": "view", "runs": [str(one) for one in folders], "out": str(out)})
+    else:
+        print(out)
+    return 0
+
+
+VIEW = Command(_view_arguments, _view, "", ("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"))

@@ -17,15 +17,20 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata, resources
 from pathlib import Path
 
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
 from advsearch import __version__, threads
 from advsearch.cli import output
+from advsearch.cli.question import Command
 from advsearch.errors import AdvsearchError
-
-HELP = "check every part that a run needs, with versions and how to mend it"
+from advsearch.scene.mitsuba_backend import llvm
 
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
 """The states of a part. A warning does not keep anything from running."""
@@ -47,15 +52,8 @@ _NO_FIX_NEEDED = ""
 
 @dataclass(frozen=True)
 class Component:
-    """One part of the installation.
-
-    Attributes:
-        name: what it is.
-        version: its version; empty where there is none to tell.
-        status: ok, warning, missing or broken.
-        detail: what was tried or found.
-        fix: what to type or do; empty when nothing has to be done.
-    """
+    """One part of the installation: its version ("" where there is none to tell), a status (ok, warning, missing or
+    broken), what was tried or found, and what to type or do ("" when nothing has to be done)."""
 
     name: str
     version: str
@@ -64,12 +62,7 @@ class Component:
     fix: str = _NO_FIX_NEEDED
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    output.add_flags(parser)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Check, print, and return the checks' exit status."""
+def _doctor(args: argparse.Namespace) -> int:
     print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
     return told(as_json=args.json)
 
@@ -115,7 +108,8 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
         done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False)
         output, errors, status = done.stdout, done.stderr, done.returncode
     except subprocess.TimeoutExpired as expired:
-        output, errors, status = _text(expired.stdout), "", None
+        text = expired.stdout.decode("utf-8", "replace") if isinstance(expired.stdout, bytes) else expired.stdout or ""
+        output, errors, status = text, "", None
     tried = {}
     for line in output.splitlines():
         try:
@@ -132,7 +126,8 @@ def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
     for name in ("numpy", "torch", "mitsuba", "drjit", "render", "mitsuba-oidn", *_SMALL_PACKAGES):
         version = "" if name == "render" else installed_version(name)
         if version is None:
-            yield _absent(name)
+            status, why = (WARNING, f": {OPTIONAL[name]}") if name in OPTIONAL else (MISSING, "")
+            yield Component(name, "", status, f"not installed{why}", _reinstall(name))
         elif name in ("mitsuba", "drjit"):
             yield Component(name, version, OK, "tried by the render below")
         else:
@@ -140,11 +135,8 @@ def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
 
 
 def other_packages(requirements: Sequence[str] | None = None) -> Component:
-    """The dependencies that need no trial: present or not.
-
-    Args:
-        requirements: as in the package's metadata, e.g. ``"rich>=13"``; None reads them there.
-    """
+    """The dependencies that need no trial: present or not. Requirements are as in the package's metadata, e.g.
+    ``"rich>=13"``; None reads them there."""
     wanted = (metadata.requires("advsearch") or []) if requirements is None else requirements
     names = {re.split(r"[^\w.-]", one, maxsplit=1)[0] for one in wanted if "extra ==" not in one}
     rest = sorted(names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES}, key=str.lower)
@@ -165,12 +157,6 @@ def installed_version(name: str) -> str | None:
         return None
 
 
-def _absent(name: str) -> Component:
-    if name in OPTIONAL:
-        return Component(name, "", WARNING, f"not installed: {OPTIONAL[name]}", _reinstall(name))
-    return Component(name, "", MISSING, "not installed", _reinstall(name))
-
-
 def _tried(name: str, version: str, tried: dict[str, tuple[bool, str]]) -> Component:
     if name not in tried:
         return Component(name, version, BROKEN, f"not reached: {tried[''][1]}", "see libLLVM below")
@@ -189,19 +175,16 @@ def _reinstall(name: str) -> str:
 
 def check_llvm() -> Component:
     """The libLLVM that will be used, what else there is, and why that is not used."""
-    # late, so that --help answers at once
-    from advsearch.scene.mitsuba_backend.llvm import VARIABLE, ensure_llvm, find, install_command
-
-    given = os.environ.get(VARIABLE, "")
-    others = find()
+    given = os.environ.get(llvm.VARIABLE, "")
+    others = llvm.find()
     try:
-        chosen = ensure_llvm()
+        chosen = llvm.ensure_llvm()
     except AdvsearchError as error:
-        fix = f"unset {VARIABLE}" if given else f"{install_command()} (or name a file in {VARIABLE})"
+        fix = f"unset {llvm.VARIABLE}" if given else f"{llvm.install_command()} (or name a file in {llvm.VARIABLE})"
         return Component("libLLVM", "", BROKEN if others or given else MISSING, str(error), fix)
     refused = [str(c) for c in others if c.refused]
     usable = [str(c) for c in others if not c.refused and c.path != chosen.path.resolve()]
-    detail = f"chosen: {chosen.path}" + (f", named by {VARIABLE}" if given else "")
+    detail = f"chosen: {chosen.path}" + (f", named by {llvm.VARIABLE}" if given else "")
     detail += f"; also usable: {', '.join(usable)}" if usable else ""
     detail += f"; refused: {', '.join(refused)}" if refused else ""
     return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
@@ -211,8 +194,7 @@ def bundled_scenes() -> Component:
     """The objects and environments that travel inside the package."""
     name, fix = "bundled scenes", "reinstall advsearch; in a checkout: git restore scenes/data"
     try:
-        # late, so that --help answers at once
-        from advsearch.scene.library import list_environments, list_objects
+        from advsearch.scene.library import list_environments, list_objects  # what is tried
 
         objects, environments = list_objects(), list_environments()
     except (ImportError, OSError, ValueError, KeyError, AdvsearchError) as error:
@@ -260,20 +242,14 @@ def disk(folder: Path) -> Component:
 def check_hardware() -> Component:
     """Cores and memory."""
     cores = threads.cores()
-    memory = _memory()
+    memory = 0  # where the system does not tell
+    with suppress(AttributeError, ValueError, OSError):
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     detail = f"{platform.system()} {platform.machine()}, {cores} core{'s' * (cores > 1)}"
     detail += f", {memory / GIB:.1f} GiB of memory" if memory else ""
     if memory and memory < MEMORY_WANTED:
         return Component("machine", "", WARNING, detail, "a search peaks at 2.5 GiB: close other programs")
     return Component("machine", "", OK, detail)
-
-
-def _memory() -> int:
-    """Bytes of memory, or 0 where the system does not tell."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return 0
 
 
 def _ending(status: int | None, errors: str) -> str:
@@ -287,17 +263,8 @@ def _ending(status: int | None, errors: str) -> str:
     return f"the trial ended with {how}" + (f" ({telling[0][:120]})" if telling else "")
 
 
-def _text(output: str | bytes | None) -> str:
-    return output.decode("utf-8", "replace") if isinstance(output, bytes) else output or ""
-
-
 def _print_table(parts: list[Component], good: bool) -> None:
     """Print the parts as a table, and below it what has to be done."""
-    # late, so that --help answers at once
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     colours = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
     table = Table(box=None, pad_edge=False)
     for heading in ("part", "version", "", "detail"):
@@ -311,3 +278,6 @@ def _print_table(parts: list[Component], good: bool) -> None:
     for part in (part for part in parts if part.fix):
         console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
     console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
+
+
+DOCTOR = Command(output.add_flags, _doctor)

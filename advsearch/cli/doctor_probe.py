@@ -11,7 +11,10 @@ import io
 import json
 import os
 import sys
+import tempfile
 from collections.abc import Callable
+
+from advsearch import threads
 
 PIXELS = 8
 NOISE = 0.08
@@ -20,8 +23,7 @@ NOISE = 0.08
 
 def numpy() -> str:
     """Solve a small system."""
-    # what is probed
-    import numpy as np
+    import numpy as np  # what is probed
 
     if not np.allclose(np.linalg.solve(np.diag([2.0, 4.0]), [2.0, 4.0]), 1.0):
         raise ArithmeticError("a system of two equations came out wrong")
@@ -30,12 +32,8 @@ def numpy() -> str:
 
 def torch() -> str:
     """A convolution and its gradient; say which build it is and how many threads it uses."""
-    # what is probed
-    from advsearch import threads
-
     threads.configure()
-    # what is probed
-    import torch
+    import torch  # what is probed
 
     image = torch.ones(1, 3, PIXELS, PIXELS, requires_grad=True)
     torch.nn.functional.conv2d(image, torch.ones(1, 3, 3, 3)).sum().backward()
@@ -48,12 +46,10 @@ def torch() -> str:
 
 def probe_renderer() -> str:
     """Render a few pixels of a lit wall and differentiate them with respect to its colour, which is linear."""
-    # what is probed
-    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
+    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba  # what is probed
 
     mi = mitsuba()
-    # what is probed
-    import drjit as dr
+    import drjit as dr  # what is probed
 
     wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
     film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
@@ -90,9 +86,6 @@ def probe_denoiser() -> str:
 def openexr() -> str:
     """Write a linear picture to a file and read it back."""
     # what is probed
-    import tempfile
-
-    # what is probed
     import numpy as np
     import OpenEXR
 
@@ -121,9 +114,6 @@ def imageio() -> str:
 def pyarrow() -> str:
     """Write a Parquet table and read it back."""
     # what is probed
-    import io
-
-    # what is probed
     import pyarrow
     import pyarrow.parquet
 
@@ -137,11 +127,7 @@ def pyarrow() -> str:
 
 def matplotlib() -> str:
     """Draw an empty figure."""
-    # what is probed
-    import io
-
-    # what is probed
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # what is probed
 
     stream = io.BytesIO()
     Figure(figsize=(1, 1)).savefig(stream, format="png")
@@ -150,8 +136,7 @@ def matplotlib() -> str:
 
 def cma() -> str:
     """Import the library of evolution strategies."""
-    # what is probed
-    import cma as library
+    import cma as library  # what is probed
 
     return f"pycma {library.__version__.split()[0]}"
 

@@ -1,4 +1,4 @@
-"""`advsearch export`: a run's rows as a table for other programs."""
+"""`advsearch export`: a run's rows as a table for other programs, or what else comes out of it in another format."""
 
 from __future__ import annotations
 
@@ -6,33 +6,125 @@ import argparse
 import io
 import os
 import sys
-from importlib import import_module
+from collections.abc import Callable
 from pathlib import Path
-from pkgutil import iter_modules
+from typing import NamedTuple
 
-from advsearch.cli import exports, output
-from advsearch.cli.exports.print import USUAL_SIZE
-from advsearch.cli.output import output_errors
+from advsearch.cli import output
+from advsearch.cli.output import at_work, output_errors
+from advsearch.cli.question import Command
 from advsearch.errors import InputError
+from advsearch.report.sheets import MOST_SHEETS, write_sheets
+from advsearch.runs.directory import PARTS, find_run
+from advsearch.runs.export import FORMATS, write_rows, write_threedb
+from advsearch.runs.fiftyone import write_fiftyone
+from advsearch.runs.files import placed_by, replacing
+from advsearch.runs.store import NAME, Store
+from advsearch.viewer.thumbnails import kept_pictures, name_of_object, pictured
+
+Written = tuple[dict[str, object], str]
+"""What to tell of a file, as JSON and in words."""
+
+
+class Writer(NamedTuple):
+    """What a run is exported as besides a table of its rows.
+
+    Attributes:
+        text: what comes out, in a sentence.
+        writes: what the name after `--out` is of: "a PDF file".
+        example: a command line without `advsearch` in front.
+        write: writes the run that the words of the command line name.
+        ending: of files that are of this format if no other is asked for: "pdf"; "" for none.
+    """
+
+    text: str
+    writes: str
+    example: str
+    write: Callable[[argparse.Namespace, Path], Written]
+    ending: str = ""
+
+
+def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
+    folder = find_run(args.run)
+    count = write_fiftyone(lambda: pictured(folder), out, folder.resolve().name, name_of_object(folder))
+    return {"samples": count}, f"{count} samples in {out}, a fiftyone.types.FiftyOneDataset"
+
+
+def _gltf(args: argparse.Namespace, out: Path) -> Written:
+    with at_work(as_json=True, quiet=False):
+        from advsearch.api.export import write_gltf  # takes seconds
+
+        notes = write_gltf(args.run, out)
+    return {"notes": notes}, " ".join([f"The object is in {out}.", *notes])
+
+
+def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
+    with at_work(as_json=True, quiet=False):
+        from advsearch.api.export import write_mitsuba  # takes seconds
+
+        notes = write_mitsuba(args.run, out)
+    return {"notes": notes}, " ".join([f"The scene is in {out}.", *notes])
+
+
+USUAL_SIZE = 100.0
+"""Longest side of a printed object where nobody says it, in millimetres."""
+
+
+def _print(args: argparse.Namespace, out: Path) -> Written:
+    longest = USUAL_SIZE if args.size is None else args.size
+    with at_work(as_json=True, quiet=False):
+        from advsearch.api.export import printable  # takes seconds
+
+        pieces = printable(args.run, longest)
+        profile = None if args.icc is None else Path(args.icc)
+        title = f"{Path(args.run).name}, object of {longest:g} mm"
+        with placed_by("out"), replacing(out) as part:
+            paper, most = (args.paper or "a4").lower(), MOST_SHEETS if args.sheets is None else args.sheets
+            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most)
+    sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
+    text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
+    if args.size is None:
+        text += f"\nThe real object's longest side is taken for {longest:g} mm; --size says otherwise."
+    return {"pages": pages, "size_mm": longest, "pieces": sizes}, text
+
+
+def _threedb(args: argparse.Namespace, out: Path) -> Written:
+    folder = find_run(args.run)
+    kept = kept_pictures(folder)
+    with Store(folder / NAME, read_only=True) as store:
+        picture = kept.png_of if kept else lambda _: None
+        count = write_threedb(lambda: store.rows(args.kind or "sweep"), out, picture)
+    return {"rows": count}, f"{count} rows in {out}; look at them with: python -m threedboard {out}"
+
 
 WRITERS = {
-    module.FORMAT: module
-    for module in (import_module(f"{exports.__name__}.{one.name}") for one in iter_modules(exports.__path__))
-}
-"""What is no table, by the word of `--format`: the modules of `advsearch.cli.exports`."""
+    "fiftyone": Writer(
+        "The kept pictures as a dataset for FiftyOne.", "a folder",
+        "export mug-sweep-001 --format fiftyone --out folder", _fiftyone,
+    ),
+    "gltf": Writer(
+        "The adversarial object as glTF.", "a .glb file", "export mug-texture-001 --format gltf --out mug.glb", _gltf,
+        "glb",
+    ),
+    "mitsuba": Writer(
+        "The adversarial scene for Mitsuba.", "an XML file and what belongs to it, or a new folder for them",
+        "export mug-texture-001 --format mitsuba --out folder", _mitsuba, "xml",
+    ),
+    "print": Writer(
+        "A patch or texture as sheets to print.", "a PDF file",
+        "export mug-patch-001 --format print --size 95 --out sheets.pdf", _print, "pdf",
+    ),
+    "3db": Writer(
+        "A sweep as a folder for 3DB's dashboard.", "a folder", "export mug-sweep-001 --format 3db --out folder",
+        _threedb,
+    ),
+}  # fmt: skip
+"""What is no table, by the word of `--format`."""
 
-HELP = "export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an object as glTF"
-EXAMPLES = (
-    "export mug-texture-001",
-    "export runs/mug-texture-001 --kind search --out search.parquet",
-    *(module.EXAMPLE for module in WRITERS.values()),
-)
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
-    told = {format: (module.__doc__ or "").rstrip(".") for format, module in WRITERS.items()}
-    known = "; ".join(f"{format}: {text[:1].lower()}{text[1:]}" for format, text in told.items())
+    known = "; ".join(f"{format}: {one.text[0].lower()}{one.text[1:-1]}" for format, one in WRITERS.items())
     text = f"csv, json or parquet: the rows as a table; {known} (default: by the name of --out, or csv)"
     parser.add_argument("--format", help=text.replace("%", "%%"))
     parser.add_argument("--out", metavar="FILE", help="the file to write (default: standard output)")
@@ -51,11 +143,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Write what was asked for."""
+def _export(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
-    endings = {getattr(module, "ENDING", format): format for format, module in WRITERS.items()}
+    endings = {one.ending or format: format for format, one in WRITERS.items()}
     format = args.format or endings.get(by_name, by_name)
     for name in ("size", "sheets", "paper", "icc"):
         if format != "print" and getattr(args, name) is not None:
@@ -63,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     if format not in WRITERS:
         return _table(args, out, by_name)
     if out is None:
-        raise InputError(f"--out: {format} writes {WRITERS[format].WRITES}; give its name")
+        raise InputError(f"--out: {format} writes {WRITERS[format].writes}; give its name")
     if args.kind is not None and format != "3db":
         raise InputError("--kind: belongs to tables of rows; leave it out")
     told, text = WRITERS[format].write(args, out)
@@ -75,12 +166,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
-    """Write the rows."""
-    # late, so that --help answers at once
-    from advsearch.runs.directory import PARTS, find_run
-    from advsearch.runs.export import FORMATS, write_rows
-    from advsearch.runs.store import NAME, Store
-
     otherwise = by_name if by_name in FORMATS else "json" if args.json and out is None else "csv"
     format = args.format or otherwise
     if args.json and out is None and format != "json":
@@ -101,3 +186,15 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     elif out is not None:
         print(f"{count} rows in {out}", file=sys.stderr)
     return 0
+
+
+EXPORT = Command(
+    _arguments,
+    _export,
+    "",
+    (
+        "export mug-texture-001",
+        "export runs/mug-texture-001 --kind search --out search.parquet",
+        *(one.example for one in WRITERS.values()),
+    ),
+)

@@ -56,16 +56,8 @@ def add_settings(
 
 
 def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any) -> AnyConfig:
-    """Return the configuration that the flags describe.
-
-    Args:
-        args: parsed flags.
-        config: of which kind.
-        **otherwise: values for settings that were not given.
-
-    Raises:
-        InputError: a value is not allowed.
-    """
+    """Return the configuration of a kind that the flags describe, with values for settings that were not given. Raises
+    InputError where a value is not allowed."""
     data = dict(otherwise)
     for one in settings(config):
         if one.field in args:

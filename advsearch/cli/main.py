@@ -1,8 +1,10 @@
 """`advsearch`: find the command, run it, and turn what goes wrong into a message and an exit status.
 
-A command is a module with `HELP` (one line), where there is more to say `MORE` (what the description says after that)
-and `EXAMPLES` (lines of a shell), and a `QuestionCommand` called `COMMAND`, or else `add_arguments(parser)` and
-`run(args) -> int`. It imports what is heavy inside functions, so that `advsearch --help` answers at once.
+A question's command is a module with `HELP` (one line), where there is more to say `MORE` (what the description says
+after that) and `EXAMPLES` (lines of a shell), and a `QuestionCommand` called `COMMAND`, or else `add_arguments(parser)`
+and `run(args) -> int`. It imports what is heavy inside
+functions, so that `advsearch --help` answers at once. Other commands are a `Command` in this package, which is imported
+when it is asked for; the line is here.
 
 Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fell short, 130 interrupted.
 """
@@ -17,8 +19,7 @@ import signal
 import sys
 import textwrap
 from collections.abc import Sequence
-from types import ModuleType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from advsearch import __version__
 from advsearch.cli.output import end_output, open_descriptors, screens, shortened
@@ -38,13 +39,15 @@ GROUPS = {
         "harden": "advsearch.questions.harden",
     },
     "look: at scenes, names and answers": {
-        "render": "advsearch.cli.render",
-        "show": "advsearch.cli.show",
-        "view": "advsearch.cli.view",
-        "dashboard": "advsearch.cli.dashboard",
+        "render": "advsearch.cli.show:RENDER render a picture of a scene, and say what the model sees in it",
+        "show": "advsearch.cli.show:SHOW "
+        "show what a run found, or the details of a control, a policy, a task or a recipe",
+        "view": "advsearch.cli.dashboard:VIEW write the page of a run again, or a folder that any web server can serve",
+        "dashboard": "advsearch.cli.dashboard:DASHBOARD show the pages of runs in a browser on this machine",
         "report": "advsearch.questions.report",
-        "list": "advsearch.cli.list",
-        "labels": "advsearch.cli.labels",
+        "list": "advsearch.cli.names:LIST "
+        "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes",
+        "labels": "advsearch.cli.names:LABELS find the names of a model's classes, as --label takes them",
     },
     "trust: does an answer hold, and is the tool right?": {
         "test": "advsearch.questions.test",
@@ -53,20 +56,23 @@ GROUPS = {
         "plan": "advsearch.questions.plan",
         "precision": "advsearch.questions.precision",
         "stability": "advsearch.questions.stability",
-        "doctor": "advsearch.cli.doctor",
+        "doctor": "advsearch.cli.doctor:DOCTOR check every part that a run needs, with versions and how to mend it",
     },
     "files and runs: repeat, continue, bring in, take out": {
-        "run": "advsearch.cli.run",
-        "resume": "advsearch.cli.resume",
-        "runs": "advsearch.cli.runs",
-        "export": "advsearch.cli.export",
-        "import": "advsearch.cli.import_command",
-        "import-3db": "advsearch.cli.import_3db",
+        "run": "advsearch.cli.run:RUN do what a YAML file describes; the run.yaml of a run repeats it",
+        "resume": "advsearch.cli.run:RESUME continue a run that was stopped, from where it stopped",
+        "runs": "advsearch.cli.run:RUNS list the runs in a folder and how each ended",
+        "export": "advsearch.cli.export:EXPORT "
+        "export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an object as glTF",
+        "import": "advsearch.cli.imports:IMPORT "
+        "show what advsearch reads from a mesh or scene file, as text or as a picture",
+        "import-3db": "advsearch.cli.imports:IMPORT_3DB turn a folder that 3DB wrote into a run",
     },
 }
-"""Each command and its module, in the groups and the order in which the help shows them."""
+"""Each command and its module, in the groups and the order in which the help shows them; of those of this package, the
+`Command` in it and what it does."""
 
-COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items() if there(module)}
+COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items() if there(place)}
 
 OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
@@ -158,11 +164,10 @@ def _run(given: list[str]) -> int:
         args = _parse(given, command)
     except SystemExit as stop:  # --help and --version have printed their text
         return int(stop.code or 0)
-    return int(_command(_module(COMMANDS[args.command])).run(args))
+    return int(found(args.command).run(args))
 
 
 def _parse(given: list[str], command: str | None) -> argparse.Namespace:
-    """Return the arguments of a known command."""
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",
@@ -198,7 +203,7 @@ def _listing() -> str:
         lines.append(title)
         for name in (one for one in commands if one in COMMANDS):
             begin = f"  {name}".ljust(column)
-            lines.append(textwrap.fill(begin + _module(COMMANDS[name]).HELP, width, subsequent_indent=" " * column))
+            lines.append(textwrap.fill(begin + help_of(name), width, subsequent_indent=" " * column))
         lines.append("")
     return "\n".join(lines)
 
@@ -207,47 +212,51 @@ def add_command(
     subparsers: argparse._SubParsersAction[Any], name: str, *, whole: bool = True
 ) -> argparse.ArgumentParser:
     """Return the new parser of a command; if not `whole` it has no arguments, and serves the list of commands."""
-    module = _module(COMMANDS[name])
-    examples = [f"  advsearch {line}\n" for line in getattr(module, "EXAMPLES", ())]
+    if not whole:
+        return cast(argparse.ArgumentParser, subparsers.add_parser(name))
+    command, text = found(name), help_of(name)
+    if " " in COMMANDS[name]:
+        more, lines = command.more, command.examples
+    else:
+        module = importlib.import_module(COMMANDS[name])
+        more, lines = getattr(module, "MORE", ""), getattr(module, "EXAMPLES", ())
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
-        description=f"{module.HELP[0].upper()}{module.HELP[1:]}{getattr(module, 'MORE', '')}.",
-        epilog="".join(["examples:\n", *examples]) if examples else None,
-        formatter_class=argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter,
+        description=f"{text[0].upper()}{text[1:]}{more}.",
+        epilog="".join(["examples:\n", *(f"  advsearch {line}\n" for line in lines)]) if lines else None,
+        formatter_class=argparse.RawDescriptionHelpFormatter if lines else argparse.HelpFormatter,
         allow_abbrev=False,
     )
-    if whole:
-        _command(module).add_arguments(parser)
+    command.add_arguments(parser)
     return parser
 
 
 def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputError:
+    # late, so that --help answers at once
+    from advsearch.config import CONFIGS
+    from advsearch.settings import settings
+
     name = argument.partition("=")[0]
     if not name.startswith("--"):
         return InputError(f"expected flags, got {argument!r}; see {parser.prog} --help")
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
-    owners = _owners(name)
+    owners = [one for one, config in CONFIGS.items() if name in (setting.flag for setting in settings(config))]
     if owners:
         return InputError(f"{parser.prog} has no {name}, a flag of advsearch {', '.join(owners)}; leave it out")
     return UnknownNameError("flag", name, set(known))
 
 
-def _owners(flag: str) -> list[str]:
-    """Commands that have a flag."""
-    # late, so that --help answers at once
-    from advsearch.config import CONFIGS
-    from advsearch.settings import settings
-
-    return [name for name, config in CONFIGS.items() if flag in (one.flag for one in settings(config))]
+def found(name: str) -> Any:
+    """Return what adds the arguments of a command and runs it: its `QuestionCommand` or `Command`, or a module."""
+    module, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
+    imported = importlib.import_module(module)
+    return getattr(imported, attribute or "COMMAND", imported)
 
 
-def _module(path: str) -> ModuleType:
-    return importlib.import_module(path)
-
-
-def _command(module: ModuleType) -> Any:
-    """What adds a command and runs it: its `QuestionCommand`, or the module itself."""
-    return getattr(module, "COMMAND", module)
+def help_of(name: str) -> str:
+    """Return what a command does, in a line."""
+    place, _, text = COMMANDS[name].partition(" ")
+    return text or str(importlib.import_module(place).HELP)
 
 
 if __name__ == "__main__":

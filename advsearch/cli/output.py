@@ -21,8 +21,7 @@ from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
 from advsearch.errors import AdvsearchError, StorageError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.progress import NullProgress, Progress
-from advsearch.watching import bars, lines
+from advsearch.progress import NullProgress, Progress, bars, lines
 
 if TYPE_CHECKING:
     from advsearch.runs.results.base import Result
@@ -35,7 +34,8 @@ LONGEST_WORD = 300
 def escaped(text: str, encoding: str = "utf-8") -> str:
     """Return `text` with everything but line ends and tabs that a terminal would not show written as an escape."""
     if not text.isascii() or not text.isprintable():
-        text = "".join(sign if sign in "\n\t" or _is_shown(sign) else _escape(sign) for sign in text)
+        plain = (one in "\n\t" or one.isprintable() or unicodedata.category(one) == "Zs" for one in text)
+        text = "".join(sign if shown else _escape(sign) for sign, shown in zip(text, plain, strict=True))
     return text.encode(encoding, "backslashreplace").decode(encoding)
 
 
@@ -47,22 +47,14 @@ def shortened(text: str) -> str:
     )
 
 
-def _is_shown(sign: str) -> bool:
-    return sign.isprintable() or (sign >= "\xa0" and unicodedata.category(sign) == "Zs")
-
-
 def _escape(sign: str) -> str:
     code = ord(sign)
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 class Screen:
-    """A text stream that prints text `escaped`. All but writing is the stream's own.
-
-    Args:
-        stream: where it goes.
-        needed: whether a failure to write is an error; what goes to standard error is dropped then.
-    """
+    """A text stream that prints text `escaped`. All but writing is the stream's own. Unless it is `needed`, what cannot
+    be written is dropped."""
 
     def __init__(self, stream: TextIO, *, needed: bool) -> None:
         self.stream = stream
@@ -168,22 +160,13 @@ def print_json(value: Any) -> None:
     from advsearch.runs.results.base import plain
 
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
-    print("".join(sign if sign.isprintable() or sign == "\n" else _json_escape(sign) for sign in text))
-
-
-def _json_escape(sign: str) -> str:
-    """What a terminal would not show, as JSON escapes it."""
-    return "\\u007f" if sign == "\x7f" else json.dumps(sign)[1:-1]
+    text = "".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text)
+    print(text.replace("\x7f", "\\u007f"))  # JSON escapes all others that a terminal would not show
 
 
 def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> int:
-    """Print the last word of a command, and return its exit status.
-
-    Args:
-        result: what came out.
-        answer: makes a text for a person of it.
-        as_json: print the result itself instead.
-    """
+    """Print the last word of a command, as JSON or as the text for a person that `answer` makes, and return its exit
+    status."""
     # late: it imports this module
     from advsearch.cli.main import INTERRUPTED, OK
 
@@ -202,11 +185,7 @@ def go_on_text(result: Result) -> str:
 
 
 def go_on_command(run: str | Path) -> str:
-    """Return the shell command that goes on with a run, with the Python code that its settings name.
-
-    Args:
-        run: its folder.
-    """
+    """Return the shell command that goes on with the run in a folder, with the Python code that its settings name."""
     # late, so that --help answers at once
     from advsearch.runs.directory import CONFIG, typed_name
 
@@ -263,7 +242,11 @@ def shown_text(result: Result) -> str:
         parts.append("\n".join(filter(None, [one.title, "\n\n".join(filter(None, inside))])))
     facts = [[name.lower(), text] for name, text in facts_of(result, given).items()]
     parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))
-    return "\n\n".join(filter(None, parts)) + as_notes(remarks_of(result, given))
+    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+
+    return "\n\n".join(filter(None, parts)) + "".join(
+        f"\n\nNote: {with_flags(text)}" for text in remarks_of(result, given)
+    )
 
 
 def aligned(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:
@@ -291,13 +274,6 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
             ctypes.CDLL(None).fflush(None)
         os.dup2(kept, source)
         os.close(kept)
-
-
-def as_notes(texts: Sequence[str]) -> str:
-    """Return notes below an answer, each a paragraph, with the flags of the settings that they name."""
-    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
-
-    return "".join(f"\n\nNote: {with_flags(text)}" for text in texts)
 
 
 LOADING_STAGES = 2
@@ -333,10 +309,7 @@ class LoadingProgress:
     """A watcher that raises an interrupt which came while something was loaded, when that stage ends.
 
     Modules that are being imported and native code make other errors of an interrupt, or none. After `LOADING_STAGES`
-    all that catches one is ours and answers it.
-
-    Args:
-        progress: is told everything.
+    all that catches one is ours and answers it. Everything is told to `progress`.
     """
 
     def __init__(self, progress: Progress) -> None:
@@ -344,11 +317,7 @@ class LoadingProgress:
         self._begun = 0
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`.
-
-        Raises:
-            KeyboardInterrupt: one came while something was loaded.
-        """
+        """See `Progress.stage`. Raises KeyboardInterrupt where one came while something was loaded."""
         if self._begun <= LOADING_STAGES:
             INTERRUPTS.check()
         self._begun += 1
@@ -361,10 +330,6 @@ class LoadingProgress:
         self._progress.message(text)
 
     def end(self) -> None:
-        """End the work.
-
-        Raises:
-            KeyboardInterrupt: nothing but imports was there, and one came meanwhile.
-        """
+        """End the work. Raises KeyboardInterrupt where nothing but imports was there, and one came meanwhile."""
         if self._begun < LOADING_STAGES:
             INTERRUPTS.check()

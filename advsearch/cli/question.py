@@ -22,15 +22,26 @@ FELL_SHORT = 3
 
 
 @dataclass(frozen=True)
-class Positional:
-    """How a setting is given without its flag.
+class Command:
+    """A command that asks no question.
 
     Attributes:
-        metavar: what the help calls it.
-        expected: what is missing where neither is given.
-        more: what the help says of it.
-        several: whether there may be more than one.
+        add_arguments: adds its arguments to a parser.
+        run: does what they say, and returns the exit status.
+        more: what its help says after what it does.
+        examples: lines of a shell, without `advsearch`.
     """
+
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+    more: str = ""
+    examples: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Positional:
+    """How a setting is given without its flag: what the help calls it and says of it, what is missing where neither is
+    given, and whether there may be several."""
 
     metavar: str
     expected: str
@@ -49,6 +60,7 @@ class QuestionCommand:
         about: the setting that names runs, or a file, which the question is about; Python code that the first of them
             names is imported only if `--code` or `--model` names it too.
         place: how that setting is given without its flag.
+        more, examples: as of `Command`.
     """
 
     name: str
@@ -56,6 +68,8 @@ class QuestionCommand:
     short: Callable[[Any], bool] = lambda result: False
     about: str = ""
     place: Positional | None = None
+    more: str = ""
+    examples: tuple[str, ...] = ()
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add a flag for each of the settings, and those that commands share."""
@@ -77,11 +91,7 @@ class QuestionCommand:
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Ask what the arguments say.
-
-        Raises:
-            InputError: what it is about is missing.
-        """
+        """Ask what the arguments say. Raises InputError where what it is about is missing."""
         # late, so that --help answers at once
         from advsearch.registry import only_named_code
 

@@ -1,20 +1,22 @@
-"""`advsearch run`: do what a YAML file describes, a run's own run.yaml among them."""
+"""`advsearch run`: do what a YAML file describes; `resume`: go on with a run that was stopped; `runs`: those here."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
+import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from advsearch.cli import main, output
-from advsearch.errors import UnknownNameError
-
-if TYPE_CHECKING:
-    from advsearch.settings import Config
-
-HELP = "do what a YAML file describes; the run.yaml of a run repeats it"
+from advsearch.cli.question import Command
+from advsearch.cli.show import show_run
+from advsearch.config import CONFIGS
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.registry import only_named_code
+from advsearch.runs.directory import CONFIG, HOME, find_run, only_here
+from advsearch.runs.listing import finished, listed_runs
+from advsearch.settings import Config, parse_assignment, read_yaml
 
 COMMANDS = (
     *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden", "explain"),
@@ -23,7 +25,7 @@ COMMANDS = (
 """What the `command` of a file may say."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help="YAML with settings and values, such as a run's run.yaml")
     parser.add_argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80")
     parser.add_argument("--run", help="where the run is kept: a name (kept in runs/) or the path of a folder")
@@ -32,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_flags(parser, quiet=True)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Read the file, put the changes over it and do what it says."""
+def _run(args: argparse.Namespace) -> int:
     command = command_in(args.file)
     changes = changes_in(args.change)
     if args.run is not None:
@@ -44,34 +45,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def changes_in(words: Sequence[str]) -> dict[str, object]:
-    """Return setting to value from ``NAME=VALUE``.
-
-    Raises:
-        InputError: a word is no such assignment.
-    """
-    # late, so that --help answers at once
-    from advsearch.settings import parse_assignment
-
+    """Return setting to value from ``NAME=VALUE``. Raises InputError where a word is no such assignment."""
     return dict(parse_assignment(text, f"change {text!r}") for text in words)
 
 
 def command_in(file: str | Path) -> str:
-    """Return the command that a file is for.
-
-    Raises:
-        FileFormatError: it is not a file with settings.
-    """
-    # late, so that --help answers at once
-    from advsearch.settings import read_yaml
-
+    """Return the command that a file is for. Raises FileFormatError where it is not a file with settings."""
     return str(read_yaml(file).get("command", "attack"))
 
 
 def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
     """Return the configuration that a file describes; arguments and errors as for `run_file`."""
-    # late, so that --help answers at once
-    from advsearch.config import CONFIGS
-
     if command not in COMMANDS:
         raise UnknownNameError("command", command, COMMANDS, f"It stands in {file}.")
     return CONFIGS[command].from_yaml(file, changes)
@@ -80,22 +64,93 @@ def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]
 def run_file(
     command: str, file: str | Path, changes: Mapping[str, object], args: argparse.Namespace, resumed: Path | None = None
 ) -> int:
-    """Do what a file describes.
+    """Do what a YAML file describes, with `changes` put over it. Raises UnknownNameError where there is no such
+    command.
 
-    Args:
-        command: what the file says it is.
-        file: YAML.
-        changes: put over it.
-        args: with `json`, `quiet` and `code`.
-        resumed: the folder of the run to go on with, if the file is a run's own.
-
-    Raises:
-        UnknownNameError: there is no such command.
+    If the file is a run's own, `resumed` is its folder; `args` has `json`, `quiet` and `code`.
     """
-    # late, so that --help answers at once
-    from advsearch.registry import only_named_code
-
     config = config_of_file(command, file, changes)
-    module = importlib.import_module(main.COMMANDS[command])
     with only_named_code(file, args.code):
-        return int(module.COMMAND.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+        return int(main.found(command).carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+
+
+RUN = Command(_run_arguments, _run)
+
+
+def _resume_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN", help="a run's name or folder")
+    parser.add_argument(
+        "change", metavar="NAME=VALUE", nargs="*", help="a setting to change that decides no number: threads=2"
+    )
+    output.add_code_flag(parser)
+    output.add_flags(parser, quiet=True)
+
+
+def _resume(args: argparse.Namespace) -> int:
+    """Do what is left of the run and print its answer; of a run that is done, its answer."""
+    path, changes = find_run(args.run), changes_in(args.change)
+    if not (path / CONFIG).is_file():
+        raise InputError(f"{path}: expected a run with its {CONFIG}, got none; it was stopped before it began")
+    command = command_in(path / CONFIG)
+    # the map of a sweep's surface, or a recipe's figures anew, with the photographs that were taken since
+    adds = command == "recipe" or (changes.get("surface") is True and command == "sweep")
+    if finished(path) and not adds:
+        print(f"advsearch: {path} is done already", file=sys.stderr)
+        return show_run(str(path), args.json)
+    if only := only_here(path):
+        raise InputError(
+            f"{path}: cannot go on from here: {', '.join(only)} existed only in the Python session that asked; call "
+            "the same function with the same arguments again, an attack with `resume=True`"
+        )
+    return run_file(command, path / CONFIG, changes, args, resumed=path)
+
+
+RESUME = Command(
+    _resume_arguments,
+    _resume,
+    "; what it has evaluated is not rendered again",
+    (
+        "resume mug-texture-001",
+        "resume mug-plan-001 seconds=600",
+        "resume mug-sweep-001 surface=true",
+        "resume realism-001 photographs=my-photographs",
+    ),
+)
+
+
+MOST_NAMES = 4
+"""Controls of a run that the table names."""
+
+
+def _runs_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)")
+    output.add_flags(parser)
+
+
+def _runs(args: argparse.Namespace) -> int:
+    folder = HOME if args.folder is None else Path(args.folder)
+    if args.folder is not None and not os.path.isdir(folder):
+        raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")
+    runs = listed_runs(folder)
+    if args.json:
+        output.print_json({"schema": 1, "command": "runs", "runs": [vars(one) for one in runs]})
+        return 0
+    if not runs:
+        print(f"no runs in {folder}/ yet; advsearch attack makes one")
+        return 0
+    heads = ["run", "command", "object", "controls", "rows", "state", "answer"]
+    rows = [
+        [one.name, one.command, one.object, _several(one.controls), str(one.rows), one.state, one.answer]
+        for one in runs
+    ]
+    print(output.aligned([heads, *rows]))
+    return 0
+
+
+def _several(names: Sequence[str]) -> str:
+    """The first few of some names, and how many more there are."""
+    more = len(names) - MOST_NAMES
+    return ",".join(names) if more <= 1 else f"{','.join(names[:MOST_NAMES])} and {more} more"
+
+
+RUNS = Command(_runs_arguments, _runs)

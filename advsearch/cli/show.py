@@ -1,38 +1,36 @@
-"""`advsearch show`: what a run found, what a control can vary, the options of a policy or a task, or a recipe."""
+"""`advsearch show`: what a run found, what a control can vary, the options of a policy or a task, or a recipe.
+
+And what `advsearch render` says: a picture of a scene, or a sheet of views around it, with the model's answers.
+"""
 
 from __future__ import annotations
 
 import argparse
-import importlib
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.cli import output
-from advsearch.cli.list import first_doc_line
-from advsearch.cli.main import COMMANDS
-from advsearch.cli.output import at_work
+from advsearch.cli import main, output
+from advsearch.cli.names import first_doc_line
+from advsearch.cli.output import at_work, raw
+from advsearch.cli.question import Command, QuestionCommand
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
+from advsearch.report.phrases import seen_cells, seen_text
+from advsearch.report.wording import count, interval_text
+from advsearch.runs.directory import IMAGES, find_run
+from advsearch.runs.listing import Listed, listed_run
+from advsearch.runs.results.base import RenderResult, plain
+from advsearch.runs.summary import NAME, read_result
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from advsearch.controls import Choice, Parameter
     from advsearch.questions.photographs.answer import PhotoAgreement
-    from advsearch.runs.listing import Listed
 
 
-import sys
-from collections.abc import Callable
-from pathlib import Path
-
-from advsearch.cli.output import raw
-
-HELP = "show what a run found, or the details of a control, a policy, a task or a recipe"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _show_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
     parser.add_argument(
         "what",
@@ -44,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_flags(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def _show(args: argparse.Namespace) -> int:
     """Print the answer of a run, a control's parameters, or the options of a policy or a task."""
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError("--picture: draws a run's pictures beside its answer in words; leave out the rest")
@@ -54,8 +52,7 @@ def run(args: argparse.Namespace) -> int:
         case ["policy" | "task" as kind, name]:
             return _show_options(kind, name, args.json)
         case ["recipe", name]:
-            # late, so that --help answers at once
-            from advsearch.questions.recipe.description import read_recipe, recipe_yaml
+            from advsearch.questions.recipe.description import read_recipe, recipe_yaml  # works without that room
 
             text = recipe_yaml(name)
             if args.json:
@@ -71,16 +68,11 @@ def run(args: argparse.Namespace) -> int:
 
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     """Print the answer of a run, or how far one has come that has none yet, and draw its pictures if wanted."""
-    # late, so that --help answers at once
-    from advsearch.runs.directory import find_run
-    from advsearch.runs.listing import listed_run
-    from advsearch.runs.summary import NAME, read_result
-
     path = find_run(name)
     if not (path / NAME).is_file():
         return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
-    answer = importlib.import_module(COMMANDS[result.command]).COMMAND.answer
+    answer = main.found(result.command).answer
     photos = photos_of(path)
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
@@ -93,22 +85,16 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
 
 def photos_of(run: Path) -> PhotoAgreement | None:
     """Return how photographs agree with the run's renderings; None where there are none."""
-    # late, so that --help answers at once
-    from advsearch.questions.photographs.answer import FOLDER
-    from advsearch.runs.directory import IMAGES
+    from advsearch.questions.photographs.answer import FOLDER  # works without that room
 
     if not (run / IMAGES / FOLDER).is_dir():
         return None
-    # late, so that --help answers at once
-    from advsearch.questions.photographs.carry_out import photo_agreement
+    from advsearch.questions.photographs.carry_out import photo_agreement  # takes seconds
 
     return photo_agreement(run)
 
 
 def _photos_text(table: PhotoAgreement) -> str:
-    # late, so that --help answers at once
-    from advsearch.report.wording import count, interval_text
-
     if table.interval is None:
         return ""
     lines = [
@@ -132,7 +118,7 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
     if run.object:
         what += f" of {run.object}, {' and '.join(run.controls) or 'nothing searched'}"
     how = {"running": "A process is working on it"}.get(run.state, "It was stopped before its end")
-    kept = ", ".join(f"{count} of {kind}" for kind, count in run.kinds.items())
+    kept = ", ".join(f"{number} of {kind}" for kind, number in run.kinds.items())
     lines = [f"{run.name}: {what}.", f"{how}; evaluations kept so far: {kept or 'none'}."]
     if go_on is not None:
         lines += ["", f"Go on with: {go_on}"]
@@ -147,9 +133,7 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
 
 def _show_control(name: str, as_json: bool) -> int:
     with at_work(as_json=True, quiet=False):
-        # late, so that --help answers at once
-        from advsearch.controls import CONTROLS
-        from advsearch.runs.results.base import plain
+        from advsearch.controls import CONTROLS  # takes seconds
 
     if name not in CONTROLS:
         raise UnknownNameError("control", name, CONTROLS)
@@ -170,9 +154,8 @@ def _show_control(name: str, as_json: bool) -> int:
 
 def _show_options(kind: str, name: str, as_json: bool) -> int:
     with at_work(as_json=True, quiet=False):
-        # late, so that --help answers at once
+        # take seconds
         from advsearch.attacks import POLICIES
-        from advsearch.runs.results.base import plain
         from advsearch.tasks import TASKS
 
     registry: Mapping[str, type[Any]] = POLICIES if kind == "policy" else TASKS
@@ -210,7 +193,6 @@ def _of_parameter(one: Parameter) -> dict[str, str]:
 
 
 def _of_choice(one: Choice) -> dict[str, str]:
-    """The same of a setting."""
     allowed = ", ".join(one.options)
     if one.whole:
         allowed = f"{one.whole[0]} to {one.whole[1]}"
@@ -220,7 +202,6 @@ def _of_choice(one: Choice) -> dict[str, str]:
 
 
 def _table(declared: Sequence[Mapping[str, str]]) -> str:
-    """Return what was declared as a table."""
     rows = [list(one.values()) for one in declared]
     return output.aligned([list(declared[0]), *rows])
 
@@ -242,7 +223,7 @@ FIRST = ("clean", "adversarial")
 
 def best_pictures(run: Path) -> list[Path]:
     """Return the pictures of a run that say most; none where it has none."""
-    folder = run / "images"
+    folder = run / IMAGES
     files = [folder / f"{name}.png" for name in FIRST]
     if not all(one.is_file() for one in files):
         files = sorted(folder.glob("*.png"))[:1]
@@ -277,8 +258,36 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
         return None, f"Terminals with kitty's protocol or Sixel draw them here: {EXTRA}"
     if renderable.Image not in (renderable.SixelImage, renderable.TGPImage):
         return None, "This terminal draws no pictures: it has neither kitty's protocol nor Sixel."
-    # late, so that --help answers at once
-    from rich.console import Console
+    from rich.console import Console  # only where pictures are drawn
 
     console = Console(file=raw(sys.stdout))
     return lambda file: console.print(renderable.Image(file, height=HEIGHT)), ""
+
+
+SHOW = Command(_show_arguments, _show)
+
+
+def render_text(result: RenderResult) -> str:
+    """Return what was written, and the model's answers view by view."""
+    height, width = result.size
+    lines = [f"{result.out}: {width} x {height} pixels"]
+    lines += [f"{result.answered}: with the answers drawn in"] if result.answered else []
+    lines += [""]
+    if len(result.views) == 1:
+        rows = [seen_cells(result.task, one) for one in result.views[0].answers]
+        return "\n".join([*lines, f"Model {result.model} sees", output.aligned(rows)])
+    rows = [["azimuth", f"model {result.model} sees"]]
+    for view in result.views:
+        rows.append([f"{view.azimuth:g}", "; ".join(seen_text(result.task, one) for one in view.answers)])
+    return "\n".join([*lines, output.aligned(rows)])
+
+
+RENDER = QuestionCommand(
+    "render",
+    render_text,
+    examples=(
+        "render --object mug --environment kitchen --out mug.png",
+        "render --object mug.obj --environment room.hdr --out around.png --around 8",
+        "render --object mug --control 'pose={yaw: 30}' --set camera.elevation=50 --out mug.exr",
+    ),
+)

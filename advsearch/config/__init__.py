@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from advsearch import rooms
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
-from advsearch.config.rendering import RenderConfig
-from advsearch.config.scene import CLOSE_LOOKS, SceneConfig
+from advsearch.config.scene import CLOSE_LOOKS, RenderConfig, SceneConfig
 from advsearch.config.sweep import SweepConfig
 from advsearch.settings import Config
 

@@ -1,4 +1,4 @@
-"""What every command over a scene and a model needs to know.
+"""What every command over a scene and a model needs to know, and what `render` does.
 
 Some settings are a name, or a name with options: a policy, a task.
 """
@@ -24,6 +24,7 @@ from advsearch.settings import (
     number_or_text,
     parse_assignment,
     setting,
+    setting_as_in,
     shown,
     split_names,
 )
@@ -33,13 +34,8 @@ FOLDERS = ("references",)
 
 
 def read_named(value: Any, setting: str, otherwise: str) -> Any:
-    """Return a name, or a mapping with a `name` and options, from ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping.
-
-    Args:
-        value: as it is given.
-        setting: whose.
-        otherwise: the name of a mapping without one.
-    """
+    """Return a name, or a mapping with a `name` and options, from ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping,
+    which may leave out the name `otherwise`."""
     if isinstance(value, str) and "=" in value:
         name, options = parse_assignment(value, setting)
         value = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}
@@ -82,6 +78,9 @@ DEFAULT_ENVIRONMENT = "studio"
 
 SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_out", "held_out_environment")
 """The settings that may be several names, where a command takes several."""
+
+TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
+"""The settings that are texts, whatever they are given as."""
 
 ControlsByName = dict[str, dict[str, object]]
 """Controls as they are asked for: their names, each with its settings."""
@@ -226,7 +225,6 @@ class SceneConfig(Config):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """Object and controls."""
         return self.object, *self.controls
 
     @property
@@ -272,23 +270,7 @@ class SceneConfig(Config):
         """The models by name; those of several tasks are one together."""
         return (self.model,) if JOINED in self.task_name else split_names(self.model)
 
-    @field_validator(
-        "object",
-        "environment",
-        "model",
-        "labels",
-        "label",
-        "task",
-        "up",
-        "camera",
-        "run",
-        "objective",
-        "target",
-        "held_out",
-        "held_out_environment",
-        mode="before",
-        check_fields=False,
-    )
+    @field_validator(*TEXTS, mode="before", check_fields=False)
     @classmethod
     def _as_text(cls, value: Any, info: Any) -> Any:
         listed = info.field_name == "labels" and isinstance(value, (list, tuple))
@@ -299,7 +281,6 @@ class SceneConfig(Config):
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
-        """Accept several in a list."""
         several = isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value)
         text = " | ".join(value) if several else value
         if isinstance(text, str) and not all(one.strip() for one in text.split("|")):
@@ -364,3 +345,46 @@ def one_only(name: str, names: Sequence[str]) -> InputError:
     """The error for several objects, environments or models where one is looked at."""
     listed = shown(",".join(names))
     return InputError(f"{name}: expected one {name}, got {listed}; give one, or compare several with advsearch sweep")
+
+
+PICTURE_SPP = 64
+"""Samples a pixel of a picture that is made to be looked at."""
+PICTURES = (".png", ".exr")
+"""The pictures that can be written."""
+
+
+class RenderConfig(SceneConfig):
+    """Everything that decides what `render` does: pictures of a scene, and what the model says of them."""
+
+    command: ClassVar[str] = "render"
+    without: ClassVar[tuple[str, ...]] = ("run", "overwrite")
+
+    # fmt: off
+    controls: ControlsByName = setting_as_in(
+        SceneConfig, "controls", default=dict, group="picture",
+        description="what differs from the scene, separated by commas; a range stays where a search would start",
+        expects="names of controls, or NAME={PARAMETER: VALUE}", min_length=None,
+    )
+    around: int | None = setting(
+        None, "picture", "one sheet of so many views, from azimuths all around the object", otherwise="one view",
+        unit="views", ge=2, le=64,
+    )
+    spp: int = setting(PICTURE_SPP, "picture", "samples per pixel", unit="samples", ge=1, le=65536)
+    aov: str | None = setting(
+        None, "picture",
+        "write ground truth of each pixel, names separated by commas, as layers of an EXR beside the picture",
+        "names among mask, depth, normal, uv, id", otherwise="none", metavar="NAMES",
+    )
+    out: str = setting(
+        ..., "picture", "the file to write: a .png holds what the model sees, an .exr linear radiance times the gain",
+        "the path of a .png or .exr file",
+    )
+    # fmt: on
+
+    @field_validator("out", mode="before")
+    @classmethod
+    def _picture_file(cls, value: Any) -> Any:
+        text = str(value) if isinstance(value, Path) else value
+        if not isinstance(text, str) or "\0" in text or Path(text).suffix.lower() not in PICTURES:
+            raise ValueError("not a picture")
+        return text

@@ -8,10 +8,8 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import FEWEST_TRIALS, AttackConfig
-from advsearch.config.derivative import DerivativeConfig
-from advsearch.config.rendering import RenderConfig
-from advsearch.config.scene import ControlsByName, SceneConfig
+from advsearch.config.attack import FEWEST_TRIALS, AttackConfig, DerivativeConfig
+from advsearch.config.scene import ControlsByName, RenderConfig, SceneConfig
 from advsearch.files import MESHES, either
 from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
 
@@ -116,7 +114,6 @@ class SweepConfig(SceneConfig):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The objects, and that it is a sweep."""
         return "-".join(Path(name).stem for name in self.objects), self.command
 
     @property
@@ -127,11 +124,7 @@ class SweepConfig(SceneConfig):
     @classmethod
     def of_answer(cls, theirs: AttackConfig, *, varies: bool) -> dict[str, Any]:
         """Return the settings that a sweep of an attack's answer takes from the attack, where it says nothing else.
-
-        Args:
-            theirs: the attack's settings.
-            varies: whether the sweep says itself what varies; otherwise it is what the attack was over.
-        """
+        Unless it says itself what `varies`, that is what the attack was over."""
         apart = ("controls", "texture_resolution", "spp", "seed", "threads", "deterministic")
         kept = {name: value for name, value in cls.shared(theirs).items() if name not in apart}
         return kept if varies else {**kept, "controls": theirs.over}
@@ -139,7 +132,6 @@ class SweepConfig(SceneConfig):
     @field_validator("answer_of", mode="before")
     @classmethod
     def _run_as_text(cls, value: Any) -> Any:
-        """Accept a path for a folder."""
         return str(value) if isinstance(value, Path) else value
 
     @field_validator("trials")
@@ -167,15 +159,10 @@ def _grid_values(given: Any) -> Any:
         if ":" in text and "," not in text:
             return text
         given = [part.strip() for part in text.split(",") if part.strip()]
-    values = _plain_values(given)
+    given = given.tolist() if hasattr(given, "tolist") else given
+    sequence = isinstance(given, (range, tuple, list))
+    values = [one.item() if hasattr(one, "item") else one for one in given] if sequence else given
     values = values if isinstance(values, list) else [values]
     if not values or any(one is None or isinstance(one, (bool, list, Mapping)) for one in values):
         raise ValueError("not values")
     return [number_or_text(one) for one in values]
-
-
-def _plain_values(given: Any) -> Any:
-    """A sequence, a range or an array as a list of Python numbers and names; one value stays one."""
-    given = given.tolist() if hasattr(given, "tolist") else given
-    sequence = isinstance(given, (range, tuple, list))
-    return [one.item() if hasattr(one, "item") else one for one in given] if sequence else given

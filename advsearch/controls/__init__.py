@@ -12,9 +12,9 @@ from pkgutil import iter_modules
 from typing import Any
 
 from advsearch.controls.base import BoundControl, Budget, Choice, Control, Group, Parameter
-from advsearch.controls.clean import Moved, check_prepared
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
+from advsearch.controls.values import Moved, check_prepared
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import by_key
 from advsearch.registry import Registry
@@ -26,20 +26,15 @@ ORDER = (
 )
 """In which lists have controls; one that is not named comes last."""
 SHARED = (
-    *("base", "clean", "numbers", "space", "values"),
-    *("corruption_filters", "corruption_weather", "geometry_modes", "material_patterns", "patch_sticker"),
+    *("base", "numbers", "space", "values"),
+    *("corruption_filters", "material_patterns", "patch_sticker"),
 )
 """Modules of this folder that are no control."""
 
 
-def _class_of(kind: str) -> str:
-    """Return ``WhiteBalanceControl`` for ``white_balance``."""
-    return "".join(map(str.capitalize, kind.split("_"))) + "Control"
-
-
 _modules = (one.name for one in iter_modules(__path__) if one.name not in SHARED)
 OWN = {
-    kind: _class_of(kind)
+    kind: "".join(map(str.capitalize, kind.split("_"))) + "Control"
     for kind in sorted(_modules, key=lambda kind: (ORDER.index(kind) if kind in ORDER else len(ORDER), kind))
 }
 """The package's own controls, one for each other module: the word on the command line is the module's name, and this is
@@ -105,12 +100,8 @@ def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | No
 
 
 def instance_of(kind: str, name: str) -> str:
-    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where the name is that of a mesh.
-
-    Args:
-        kind: word for the control.
-        name: what stands behind the colon; empty if there is none.
-    """
+    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where the name is that of a mesh; the
+    name is empty where there is no colon."""
     of_a_mesh = kind in CONTROLS and CONTROLS[kind].of_a_mesh
     if not name or (of_a_mesh and name == OBJECT):
         return kind
@@ -118,11 +109,8 @@ def instance_of(kind: str, name: str) -> str:
 
 
 def check_instance(where: str, name: str, colon: str = ":") -> None:
-    """Refuse what can't stand behind the colon of `KIND:NAME`.
-
-    Raises:
-        InputError: it has other characters than letters, digits, dashes and underscores, or is empty.
-    """
+    """Refuse what can't stand behind the colon of `KIND:NAME`. Raises InputError where it has other characters than
+    letters, digits, dashes and underscores, or is empty."""
     if colon and not re.fullmatch(r"[\w-]+", name):
         raise InputError(f"{where}: expected a name of letters, digits, - and _ after the colon, got {name!r}")
 
@@ -141,11 +129,8 @@ def _default_range(control: type[Control], parameter: str) -> object:
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
-    """Return the settings of each control, with ranges of Mitsuba's names under one.
-
-    Raises:
-        InputError: one has something else than settings.
-    """
+    """Return the settings of each control, with ranges of Mitsuba's names under one. Raises InputError where one has
+    something else than settings."""
     found: dict[str, Mapping[str, object]] = {}
     for name, given in by_key(asked).items():
         if given is not None and not isinstance(given, Mapping):
@@ -155,12 +140,9 @@ def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, obje
 
 
 def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
-    """Return settings by control for names as `make_control` takes them.
+    """Return settings by control for names as `make_control` takes them, or with ".parameter" behind.
 
     `camera.azimuth` and `camera.elevation` become one control that searches both.
-
-    Args:
-        asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or "kind:name.parameter".
     """
     found: dict[str, dict[str, object]] = {}
     for name, given in settings_by_name(asked).items():
@@ -176,11 +158,8 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them into something that can be searched.
-
-    Raises:
-        InputError: no control, two of one name, one that the scene cannot take, or nothing that varies.
-    """
+    """Let controls prepare a scene, bind them to it and compose them into something that can be searched. Raises
+    InputError for no control, two of one name, one that the scene cannot take, or nothing that varies."""
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
     space = compose(controls, scene)
@@ -224,11 +203,8 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def check_about(controls: Sequence[Control], scene: SceneDescription) -> None:
-    """Refuse the name of a mesh for a control that is not about one mesh or only about the object.
-
-    Raises:
-        InputError: one has it.
-    """
+    """Refuse the name of a mesh for a control that is not about one mesh or only about the object. Raises InputError
+    where one has it."""
     for control in controls:
         if control.name != control.kind and control.name in scene.around:
             able = ", ".join(kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh)

@@ -2,17 +2,14 @@
 
     sRGB = hsv(hue, saturation, value);   backdrop = linear(sRGB)
 
-The environment keeps lighting the object, so that only what is behind it changes, as in the studies of how much a
-classifier leans on backgrounds (Xiao et al. 2020, Noise or signal, arXiv 2006.09994). Hue, saturation and value are
-the hexcone model of Smith (Color gamut transform pairs, SIGGRAPH 1978), in display-referred values: piecewise linear,
-so that it has a derivative almost everywhere.
+The environment keeps lighting the object (Xiao et al. 2020, Noise or signal, arXiv 2006.09994). Hue, saturation and
+value are the hexcone model of Smith (Color gamut transform pairs, SIGGRAPH 1978), in display-referred values.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -35,10 +32,10 @@ NUMBERS = ("hue", "saturation", "value")
 class BackgroundControl(NumberControl):
     """A plain colour behind the object."""
 
-    kind: ClassVar[str] = "background"
-    amount: ClassVar[str | None] = "what"
-    summary: ClassVar[str] = "A plain colour behind the object; the environment keeps lighting it."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "background"
+    amount = "what"
+    summary = "A plain colour behind the object; the environment keeps lighting it."
+    parameters = (
         Parameter(
             "what", (), "name", 0, len(WHAT) - 1, "colour",
             "What is behind the object: the colour, or the environment as ever.", options=WHAT, estimators=(),
@@ -55,7 +52,7 @@ class BackgroundControl(NumberControl):
             estimators=("image",),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "ground", "hide", "Whether the ground plane stays in the picture: keep or hide.", options=("keep", "hide")
         ),

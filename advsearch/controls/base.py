@@ -1,12 +1,7 @@
 """What a control is: a named family of scene parameters that may vary, and their map from the unit box.
 
-A control declares its parameters as data (unit, range, default, whether periodic, its estimators)
-that the command line, the documentation, the gradient plan and the shared tests read. Bound to a scene it becomes a
-`BoundControl`: a slice of u, its budgets, and the map from that slice to scene inputs, written in torch so that
-autograd runs through it.
-
-Most controls are a handful of numbers: those subclass `advsearch.controls.numbers.NumberControl` and are one small
-file. `docs/controls/writing.md` has a worked example.
+A control declares its parameters as data. Bound to a scene it becomes a `BoundControl`: a slice of u and the map from
+it to scene inputs, in torch. Most controls subclass `numbers.NumberControl` (docs/controls/writing.md).
 """
 
 from __future__ import annotations
@@ -19,8 +14,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from advsearch.controls.clean import Moved
-from advsearch.controls.values import is_number, is_whole
+from advsearch.controls.values import Moved, is_number, is_whole
 from advsearch.described import Value as Value
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import OBJECT, SceneDescription
@@ -63,11 +57,8 @@ class Choice:
     most: float | None = None
 
     def check(self, control: str, given: object) -> None:
-        """Check what was chosen in an instance of a control; None is fine where it is the default.
-
-        Raises:
-            InputError: it cannot be chosen.
-        """
+        """Check what was chosen in an instance of a control; None is fine where it is the default. Raises InputError
+        where it cannot be chosen."""
         allowed, fits = "", True
         if self.options:
             allowed, fits = f"one of {', '.join(self.options)}", given in self.options
@@ -166,12 +157,8 @@ class Control(ABC):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings: those of the class, unless the scene or the
-        settings name them.
-
-        Args:
-            settings: names of what is given, perhaps with the values.
-        """
+        """Return the parameters of an instance that is given settings of these names: those of the class, unless the
+        scene or the settings name them."""
         return cls.parameters
 
     @property
@@ -180,11 +167,7 @@ class Control(ABC):
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene.
-
-        Raises:
-            UnknownNameError: there is none of that name.
-        """
+        """Return that mesh in a scene. Raises UnknownNameError where there is none of that name."""
         mesh = self.mesh
         if mesh in scene.meshes:
             return scene.meshes[mesh]
@@ -205,16 +188,9 @@ class Control(ABC):
         return {**named, **{choice.name: getattr(self, choice.name) for choice in self.choices}}
 
     def chosen_form(self, forms: Sequence[str], form: str | None) -> str:
-        """Return which form of itself a control takes, where each of its parameters stands for one.
-
-        Args:
-            forms: the forms, in the order of the parameters; the first is the default.
-            form: the one that was asked for by name, or None.
-
-        Raises:
-            InputError: two forms are asked for, or a parameter was given a range of its own.
-            UnknownNameError: there is no such form.
-        """
+        """Return which form of itself a control takes, where each of its parameters stands for one: the one that was
+        asked for by name, or else the first. Raises InputError where two are asked for or a parameter was given a range
+        of its own, UnknownNameError where there is no such form."""
         named = []
         for one, stands_for in zip(self.parameters, forms, strict=True):
             given = getattr(self, one.name)
@@ -232,16 +208,10 @@ class Control(ABC):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with whatever this control needs to be in it (a light, a medium); by default unchanged.
-
-        Raises:
-            InputError: the scene cannot take it.
-        """
+        Raises InputError where the scene cannot take it."""
         return scene
 
     @abstractmethod
     def bind(self, scene: SceneDescription) -> BoundControl:
-        """Fit the control to a scene that all controls of the space have prepared.
-
-        Raises:
-            InputError: a setting of the control is impossible in this scene.
-        """
+        """Fit the control to a scene that all controls of the space have prepared. Raises InputError where a setting of
+        the control is impossible in this scene."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -42,9 +41,9 @@ def _coefficient(name: str) -> Parameter:
 class CameraControl(NumberControl):
     """An orbit around the object, the lens, and the exposure."""
 
-    kind: ClassVar[str] = "camera"
-    summary: ClassVar[str] = "An orbit around the object, the lens, and the exposure."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "camera"
+    summary = "An orbit around the object, the lens, and the exposure."
+    parameters = (
         *CAMERA[:-1],
         moving(ORBIT, "focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
         moving(ORBIT, "shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
@@ -77,11 +76,7 @@ class CameraControl(NumberControl):
         return scene
 
     def _check_model(self, model: CameraModel, bent: list[str]) -> None:
-        """Refuse what the camera's model has not.
-
-        Raises:
-            InputError: it was asked for.
-        """
+        """Refuse what the camera's model has not. Raises InputError where it was asked for."""
         lacking = [name for name in bent if name not in OF_KIND[model.kind]]
         if lacking:
             has = ", ".join(OF_KIND[model.kind]) or "none"
@@ -121,7 +116,7 @@ class CameraControl(NumberControl):
         fov = values["fov"]
         if "focal_length" in self.specs:
             fov = _fov_of(values["focal_length"])
-        if self._distance_is_free(scene):
+        if "distance" in self.specs or not self.asked or "camera.distance" in scene.given:
             distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
@@ -149,9 +144,6 @@ class CameraControl(NumberControl):
         found |= {name: values[name] for name in COEFFICIENTS if name in self.specs}
         found |= {"cx": found["cx"] + values["shift_x"], "cy": found["cy"] + values["shift_y"]}
         return torch.stack([found[name].to(fov) for name in NUMBERS])
-
-    def _distance_is_free(self, scene: SceneDescription) -> bool:
-        return "distance" in self.specs or not self.asked or "camera.distance" in scene.given
 
     def _described(self, scene: SceneDescription) -> SceneDescription:
         """The scene with a fixed lens, for which the distance is worked out as for the same setting."""

@@ -1,17 +1,12 @@
 """The `contents` control: what a vessel is filled with, and how high: water, coffee and milk in any proportions.
 
-Rain that falls on the mesh from above and cannot run off (a height map with its basins filled: Barnes, Lehman and
-Mulla 2014, arXiv 1511.04463, section 2) marks the inside and its brim; rays from the axis of that basin then find the
-wall all around at a few heights. A lamp shade catches rain as seen from above, but its wall has a gap below: the rays
-tell. The surface of the liquid is a level disc that follows the wall. Its colour is worked out in linear light from
-the proportions: absorption and scattering of coffee and milk add up by their amounts (Kubelka and Munk 1931), and
-water lets the vessel show through:
+Rain that cannot run off the mesh (a height map with its basins filled: Barnes, Lehman and Mulla 2014, arXiv 1511.04463,
+section 2) marks the inside; rays from its axis find the wall. Colours are in linear light (Kubelka and Munk 1931):
 
     K / S = sum(p_i K_i) / sum(p_i S_i),   milky coffee = 1 + K/S - sqrt((K/S)^2 + 2 K/S)
     color = opacity * milky coffee + (1 - opacity) * vessel * tint of water,   opacity = 1 - exp(-DENSITY (1 - water))
 
-Proportions add up to one in every configuration. The two that are free are cut off a stick of length one in turn, each
-from what the ones before leave; a range for an ingredient narrows where the stick may be cut.
+Proportions add up to one: the two that are free are cut off a stick of length one in turn, each from what is left.
 """
 
 from __future__ import annotations
@@ -19,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -232,10 +226,10 @@ class ContentsControl(NumberControl):
         InputError: proportions that cannot add up to one.
     """
 
-    kind: ClassVar[str] = "contents"
-    amount: ClassVar[str | None] = "level"
-    summary: ClassVar[str] = "What a vessel is filled with, and how high: water, coffee and milk."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "contents"
+    amount = "level"
+    summary = "What a vessel is filled with, and how high: water, coffee and milk."
+    parameters = (
         moving(
             ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is empty, 1 is full to the brim.", (0.0, 0.95)
         ),
@@ -307,12 +301,8 @@ class ContentsControl(NumberControl):
         """An ingredient's coordinate is where the stick is cut, from 0 to 1 of what is possible there."""
         if parameter.name not in INGREDIENTS:
             return super()._spec(scene, parameter, value)
-        return Range(0.0, 1.0) if parameter.name in self._free() else Fixed(0.0)
-
-    def _free(self) -> tuple[str, ...]:
-        """The ingredients that have a coordinate."""
         wide = [name for name in INGREDIENTS if self.bounds[name][1] > self.bounds[name][0]]
-        return tuple(wide[:-1])
+        return Range(0.0, 1.0) if parameter.name in wide[:-1] else Fixed(0.0)
 
     def proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Cut the stick: coordinates in [0, 1] by ingredient to shares that add up to one; differentiable."""
@@ -362,12 +352,8 @@ class ContentsControl(NumberControl):
 
 
 class BoundContents(BoundNumbers):
-    """A filled vessel: coordinates are cuts of a stick, values are proportions.
-
-    Args:
-        control: the control.
-        bound: the same, bound as plain numbers.
-    """
+    """A filled vessel: coordinates are cuts of a stick, values are proportions. `bound` is the control, bound as plain
+    numbers."""
 
     control: ContentsControl
 
@@ -399,12 +385,8 @@ def _said(low: float, high: float) -> str:
 
 
 def liquid(shares: Tensor, vessel: Tensor) -> Tensor:
-    """Return the linear reflectance (3,) of a cup of water, milk and coffee.
-
-    Args:
-        shares: (3,) proportions in the order of `INGREDIENTS`.
-        vessel: (3,) linear reflectance of the vessel's inside.
-    """
+    """Return the linear reflectance (3,) of a cup of water, milk and coffee: of their proportions (3,) in the order of
+    `INGREDIENTS`, and the linear reflectance (3,) of the vessel's inside."""
     amounts = dict(zip(INGREDIENTS, shares, strict=True))
     absorbed, scattered = shares.new_zeros(3), shares.new_tensor(1e-6)
     for name, reflectance in REFLECTANCE.items():

@@ -3,18 +3,14 @@
     severity 0: the picture as it is;  0 to 1: mixed with that of severity 1;  1 to 5: the published severities, and
     between two of them their parameters interpolated
 
-The corruptions and the numbers that a severity stands for are those of ImageNet-C (Hendrycks & Dietterich 2019,
-Benchmarking neural network robustness to common corruptions and perturbations, arXiv 1903.12261, section 4 and
-appendix A). They were made for a fixed list of pictures on disk; here they are functions of the picture in torch, so
-that a search can follow them back into the scene. Those of brightness, contrast, colour and file formats are here,
-the others in `corruption_filters` and `corruption_weather`.
+They are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261, section 4 and appendix A) as functions of
+the picture in torch; those by noise, blur, shifted pixels and weather are in `corruption_filters`.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -22,27 +18,9 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
+from advsearch.controls import corruption_filters as filters
 from advsearch.controls.base import Choice, Parameter, Value
-from advsearch.controls.corruption_filters import (
-    LEVELS,
-    REFERENCE,
-    at_level,
-    defocus_blur,
-    elastic,
-    gaussian_blur,
-    gaussian_noise,
-    glass_blur,
-    impulse_noise,
-    motion_blur,
-    picture,
-    planes,
-    shot_noise,
-    speckle_noise,
-    zoom_blur,
-)
-from advsearch.controls.corruption_weather import fog, frost, snow
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, OneOf
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import levels_of
 
@@ -62,21 +40,21 @@ _GREY = 1.0 / 512.0
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Raise the value, keep hue and saturation."""
-    (more,) = at_level(BRIGHTNESS, level)
+    (more,) = filters.at_level(BRIGHTNESS, level)
     value = image.amax(dim=-1, keepdim=True)
     return image + ((value + more).clamp(max=1.0) - value) * (image + _GREY) / (value + _GREY)
 
 
 def contrast(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pull every value towards its channel's mean."""
-    (factor,) = at_level(CONTRAST, level)
+    (factor,) = filters.at_level(CONTRAST, level)
     mean = image.mean(dim=(0, 1))
     return mean + factor * (image - mean)
 
 
 def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Scale the saturation, keep hue and value; grey stays grey."""
-    factor, more = at_level(SATURATE, level)
+    factor, more = filters.at_level(SATURATE, level)
     value = image.amax(dim=-1, keepdim=True)
     saturation = (value - image.amin(dim=-1, keepdim=True)) / (value + _GREY)
     wanted = (factor * saturation + more).clamp(max=1.0)
@@ -89,10 +67,10 @@ def pixelate(image: Tensor, whole: int) -> Tensor:
     A cell has 1.7 to 4 pixels of a picture of the reference size, more in a larger one, and as many in a smaller one.
     """
     height, width = image.shape[:2]
-    share = PIXELATE[whole - 1] / max(1.0, min(height, width) / REFERENCE)
+    share = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
     cells = (max(1, int(height * share)), max(1, int(width * share)))
-    return picture(
-        F.interpolate(F.interpolate(planes(image), cells, mode="area"), (height, width), mode="nearest-exact")
+    return filters.picture(
+        F.interpolate(F.interpolate(filters.planes(image), cells, mode="area"), (height, width), mode="nearest-exact")
     )
 
 
@@ -122,25 +100,25 @@ def coded(image: Tensor, quality: int) -> Tensor:
 SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
     one.__name__: one
     for one in (
-        gaussian_noise,
-        shot_noise,
-        impulse_noise,
-        speckle_noise,
-        defocus_blur,
-        glass_blur,
-        motion_blur,
-        zoom_blur,
-        gaussian_blur,
-        snow,
-        frost,
-        fog,
+        filters.gaussian_noise,
+        filters.shot_noise,
+        filters.impulse_noise,
+        filters.speckle_noise,
+        filters.defocus_blur,
+        filters.glass_blur,
+        filters.motion_blur,
+        filters.zoom_blur,
+        filters.gaussian_blur,
+        filters.snow,
+        filters.frost,
+        filters.fog,
         brightness,
         contrast,
         saturate,
     )
 }
 """Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity and the seed."""
-FROM_NOTHING: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {"elastic": elastic}
+FROM_NOTHING: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {"elastic": filters.elastic}
 """Corruptions of every severity in [0, 5]: a mix of a warped and an unwarped picture would show the object twice."""
 STEPPED: Mapping[str, Callable[[Tensor, int], Tensor]] = {"pixelate": pixelate, "jpeg": jpeg}
 """Corruptions of whole severities only: of the picture and the severity."""
@@ -150,21 +128,21 @@ NAMES = (*SMOOTH, *FROM_NOTHING, *STEPPED)
 class CorruptionControl(NumberControl):
     """One of the common image corruptions, by name and severity."""
 
-    kind: ClassVar[str] = "corruption"
-    amount: ClassVar[str | None] = "severity"
-    summary: ClassVar[str] = "A common image corruption (noise, blur, weather, digital) by name and severity."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "corruption"
+    amount = "severity"
+    summary = "A common image corruption (noise, blur, weather, digital) by name and severity."
+    parameters = (
         Parameter(
             "which", (), "name", 0, len(NAMES) - 1, NAMES[0], "Which corruption.", search=(0, len(NAMES) - 1),
             options=NAMES, estimators=(),
         ),
         Parameter(
-            "severity", (), "1", 0.0, float(LEVELS), 0.0,
-            "How strong it is: 0 is none, 1 to 5 are the published severities.", search=(0.0, float(LEVELS)),
+            "severity", (), "1", 0.0, float(filters.LEVELS), 0.0,
+            "How strong it is: 0 is none, 1 to 5 are the published severities.", search=(0.0, float(filters.LEVELS)),
             estimators=("image",),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0.", whole=(0, 2**32 - 1)
         ),
@@ -176,16 +154,8 @@ class CorruptionControl(NumberControl):
         self.asked = False
 
     def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
-        if parameter.name == "severity" and self.possible() <= set(STEPPED):
-            return ()
-        return super().estimators(scene, parameter)
-
-    def possible(self) -> set[str]:
-        """Return the corruptions that a search may come to."""
-        spec = self.specs.get("which")
-        if isinstance(spec, Fixed):
-            return {str(spec.value)}
-        return {str(value) for value in spec.values} if isinstance(spec, OneOf) else set(NAMES)
+        stepped = {*self.allowed("which", *NAMES)} <= {*STEPPED}
+        return () if parameter.name == "severity" and stepped else super().estimators(scene, parameter)
 
     def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
         seed = int(self.chosen["seed"])  # type: ignore[call-overload]
@@ -234,6 +204,6 @@ def _stepped(image: Tensor, at: Callable[[Tensor, int], Tensor], severity: Tenso
     out = at(image, whole) if whole else image
     if not severity.requires_grad:
         return out
-    below = min(int(severity.detach()), LEVELS - 1)
+    below = min(int(severity.detach()), filters.LEVELS - 1)
     low, high = at(image, below).detach() if below else image.detach(), at(image, below + 1).detach()
     return out + (severity - severity.detach()) * (high - low)

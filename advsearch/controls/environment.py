@@ -1,13 +1,11 @@
 """The `environment` control: which map lights the scene, how it is turned, how bright it is, and its colour.
 
-Mitsuba's own derivative of an environment's rotation has the wrong sign: the sampling of the light is detached from it
-(docs/gradients.md). Here the map itself is resampled along its columns by torch, and the adjoint differentiates its
-texels, which is right:
+Mitsuba's own derivative of a rotation has the wrong sign (docs/gradients.md). So the map is resampled by torch:
 
     map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1],    rotation / 360 * columns = k + f
 
-`harmonics` adds light of low order: real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan 2001,
-section 3), 9 coefficients for each colour channel as multiples of the map's mean radiance, inside an L2 ball.
+`harmonics` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan 2001, section 3), 9 coefficients
+for each colour channel as multiples of the map's mean radiance, inside an L2 ball.
 """
 
 from __future__ import annotations
@@ -17,14 +15,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, Number, OneOf
+from advsearch.controls.values import Fixed, Number
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.assets import EnvironmentAsset
@@ -40,9 +37,9 @@ COEFFICIENTS = 27
 class EnvironmentControl(NumberControl):
     """Which environment lights the scene, how it is turned, how bright it is, and its colour."""
 
-    kind: ClassVar[str] = "environment"
-    summary: ClassVar[str] = "Which environment lights the scene, how it is turned, how bright it is, and its colour."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "environment"
+    summary = "Which environment lights the scene, how it is turned, how bright it is, and its colour."
+    parameters = (
         Parameter(
             "which", (), "name", 0.0, float(len(library.list_environments())), OWN_MAP,
             "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr file.",
@@ -59,7 +56,7 @@ class EnvironmentControl(NumberControl):
             estimators=LIT,
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon", "harmonics",
             most=100.0,
@@ -87,7 +84,7 @@ class EnvironmentControl(NumberControl):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """An environment that is fixed is the scene's; so is the first of several where these are files, and the
         scene's own is none of them."""
-        spec, allowed = self.specs.get("which"), self._allowed()
+        spec, allowed = self.specs.get("which"), self.allowed("which", OWN_MAP)
         files = [str(one) for one in allowed if _is_file(one)]
         found = {name: _loaded(name) for name in files}
         notes = [note for one in found.values() for note in one.warnings]
@@ -108,24 +105,19 @@ class EnvironmentControl(NumberControl):
         """Of `which`, the scene's own environment, by its name where only that is allowed."""
         if parameter.name != "which":
             return super().default(scene, parameter)
-        return OWN_MAP if OWN_MAP in self._allowed() else self._own_name(scene) or OWN_MAP
+        return OWN_MAP if OWN_MAP in self.allowed("which", OWN_MAP) else self._own_name(scene) or OWN_MAP
 
     def setting(self, parameter: Parameter) -> str:
         return ENVIRONMENT if parameter.name == "which" else super().setting(parameter)
 
     def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        if parameter.name == "which" and OWN_MAP not in self._allowed():
+        if parameter.name == "which" and OWN_MAP not in self.allowed("which", OWN_MAP):
             return self._own_name(scene) or scene.environment_spec
         return super().unchanged(scene, parameter)
 
-    def _allowed(self) -> tuple[Number, ...]:
-        """The environments that can be chosen."""
-        spec = self.specs.get("which")
-        return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else (OWN_MAP,)
-
     def _own_name(self, scene: SceneDescription) -> str | None:
         """What the scene's own environment is called among those that can be chosen; None if it is none of them."""
-        return next((str(one) for one in self._allowed() if _is_own(one, scene)), None)
+        return next((str(one) for one in self.allowed("which", OWN_MAP) if _is_own(one, scene)), None)
 
     def budget(self, scene: SceneDescription, parameter: Parameter) -> Budget:
         if parameter.name != "harmonics":

@@ -4,26 +4,313 @@
     large-steps    d = g R (I + lambda L)^-2 (2 u - 1)         a push for each vertex, spread out over its surroundings
     offsets        epsilon s(d) d                              s: one factor that keeps the mesh whole
 
-u = 0.5 leaves the shape as it is. See `geometry_modes` for the fields, for `s`, and where they come
-from. No vertex moves by more than epsilon, no face turns over and no wall meets the other, for any u.
+No vertex moves by more than epsilon, no face turns over and no wall meets the other, for any u. A mode varies slowly
+over SPACE, so that close walls move together: diffusion maps (Coifman and Lafon 2006, "Diffusion maps", sections 2 and
+3, alpha = 1) of points spread over the surface, extended to the vertices by the Nystrom formula, without rigid motions.
+R (I + lambda L)^-2 is Nicolet et al.'s (2021, "Large Steps in Inverse Rendering of Geometry", section 3.2), with edges
+weighted by their length and links through thin walls added to L.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
+from scipy import linalg, sparse
+from scipy.sparse import linalg as sparse_linalg
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Choice, Control, Group, Parameter, Value
-from advsearch.controls.geometry_modes import Limits, Preconditioner, body, shape_modes
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.raster import welded
+
+Doubles = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+CELL = 0.035
+"""Side of the cubes that the surface is thinned to one point in, in extents of the mesh; larger if that is too many."""
+LANDMARKS = 900
+"""Largest number of such points."""
+SAMPLES = 20000
+"""Points spread over the surface before they are thinned, so that large triangles count as what they cover."""
+BANDWIDTH = 1.8
+"""Standard deviation of the kernel, in cells."""
+FACE_STRAIN = 0.7
+"""Largest displacement gradient along a face; below 1 no face can turn over."""
+WALL_STRAIN = 0.5
+"""Largest change of the distance between two walls, as a share of it."""
+WALL_REACH = 0.3
+"""Walls further apart than this, in extents, are not held together."""
+OPPOSITE = -0.3
+"""Largest cosine between the normals of the two sides of a wall."""
+THIN_FACE = 2e-3
+"""Faces whose height is less than this share of their longest edge are slivers: their strain is not looked at."""
+SHARPNESS = 32
+"""Exponent p of the norm that stands in for a maximum."""
+SMOOTHING_LENGTH = 0.1
+"""Distance over which a push on one vertex spreads, in extents (form large-steps)."""
+WALL_WEIGHT = 4.0
+"""Weight of a link through a wall, in edges of the mesh."""
+
+
+class Body:
+    """A mesh whose seams are welded: what a displacement acts on.
+
+    Attributes:
+        places: (P, 3) float64 distinct vertex positions.
+        index: (V,) the place of each vertex.
+        faces: (F, 3) faces over places, without those that have no area.
+        normals: (P, 3) area-weighted unit normals.
+        extent: the mesh's largest extent.
+        walls: (W, 2) pairs of places on opposite sides of a wall or of a gap.
+
+    Args:
+        mesh: the mesh.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.index, count = welded(mesh)
+        self.places = np.zeros((count, 3))
+        self.places[self.index] = mesh.vertices
+        self.extent = float(np.ptp(self.places, axis=0).max())
+        faces = self.index[mesh.faces]
+        corners = self.places[faces]
+        turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.faces = faces[np.linalg.norm(turned, axis=1) > 0.0]
+        summed = np.zeros((count, 3))
+        np.add.at(summed, faces.reshape(-1), np.repeat(turned, 3, axis=0))
+        self.normals = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
+        self.walls = self._walls()
+
+    def _walls(self) -> Ints:
+        """The nearest place with an opposite normal for each place, where there is one.
+
+        Nearest in `|x - y|^2 + b^2 |n + m|^2`: a search in six dimensions.
+        """
+        turn = 0.1 * self.extent * self.normals
+        tree = cKDTree(np.hstack([self.places, turn]))
+        partner = tree.query(np.hstack([self.places, -turn]))[1]
+        distance = np.linalg.norm(self.places - self.places[partner], axis=1)
+        opposite = (self.normals * self.normals[partner]).sum(axis=1) < OPPOSITE
+        found = np.flatnonzero(opposite & (distance > 1e-5 * self.extent) & (distance < WALL_REACH * self.extent))
+        return np.stack([found, partner[found]], axis=1)
+
+
+# ---- modes over space ------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def body(mesh: Mesh) -> Body:
+    """Return the welded mesh; kept in memory."""
+    return Body(mesh)
+
+
+@lru_cache(maxsize=8)
+def shape_modes(mesh: Mesh, count: int) -> Doubles:
+    """Return the `count` smoothest displacement fields of a mesh that are no rigid motion; kept in memory.
+
+    They are (P, 3, count), for each place of `body(mesh)`, smoothest first; the largest length is 1 in each.
+    """
+    welded_mesh = body(mesh)
+    points, cell = _landmarks(welded_mesh)
+    scalars = min(math.ceil(count / 3) + 2, len(points) - 1)
+    width = BANDWIDTH * cell
+    kernel = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * width**2))
+    density = kernel.sum(axis=1)
+    kernel /= density[:, None] * density[None, :]
+    mass = kernel.sum(axis=1)
+    values, vectors = _largest(kernel / np.sqrt(mass[:, None] * mass[None, :]), scalars + 1)
+    values, vectors = values[1:], vectors[:, 1:]  # the first is constant
+    functions = vectors / np.sqrt(mass)[:, None]
+    combination = _without_rotation(points, functions, mass, (1.0 - values) / width**2, count)
+    reach = -cdist(welded_mesh.places, points, "sqeuclidean") / (2.0 * width**2)
+    weights = np.exp(reach - reach.max(axis=1, keepdims=True)) / density
+    extended = (weights / weights.sum(axis=1, keepdims=True)) @ (functions / np.maximum(values, 0.05))
+    fields = np.einsum("ps,sck->pck", extended, combination)
+    return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
+
+
+def _largest(symmetric: Doubles, count: int) -> tuple[Doubles, Doubles]:
+    """The largest eigenvalues of a symmetric matrix, falling, and their vectors with the largest entry positive.
+
+    Entries too small to matter are dropped and the rest goes through Lanczos: dense solvers wait for all threads, which
+    takes ten times as long on a machine with other work.
+    """
+    sparse_matrix = sparse.csr_matrix(np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0))
+    begin = np.cos(np.arange(len(symmetric)))
+    values, vectors = sparse_linalg.eigsh(
+        sparse_matrix, count, which="LA", v0=begin, ncv=min(len(symmetric), 4 * count)
+    )
+    order = np.argsort(-values)
+    return values[order], _signed(vectors[:, order])
+
+
+def _signed(vectors: Doubles) -> Doubles:
+    largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])]
+    return np.asarray(vectors * np.where(largest < 0.0, -1.0, 1.0))
+
+
+def _landmarks(solid: Body) -> tuple[Doubles, float]:
+    """Points (N, 3) evenly spread over the surface, at most `LANDMARKS`, and the side of the cubes that hold one."""
+    corners = solid.places[solid.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    generator = np.random.default_rng(0)
+    face = np.searchsorted(np.cumsum(areas) / areas.sum(), (np.arange(SAMPLES) + 0.5) / SAMPLES).clip(
+        max=len(areas) - 1
+    )
+    shares = generator.dirichlet((1.0, 1.0, 1.0), SAMPLES)
+    pool = np.concatenate([np.einsum("nk,nkc->nc", shares, corners[face]), solid.places])
+    cell = CELL * solid.extent
+    while True:
+        cubes = np.floor((pool - pool.min(axis=0)) / cell).astype(np.int64)
+        owner = np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
+        count = int(owner.max()) + 1
+        if count <= LANDMARKS:
+            break
+        cell *= 1.15
+    members = np.bincount(owner)
+    return np.stack([np.bincount(owner, pool[:, axis]) / members for axis in range(3)], axis=1), cell
+
+
+def _without_rotation(points: Doubles, functions: Doubles, mass: Doubles, energy: Doubles, count: int) -> Doubles:
+    """Combine scalar modes (N, S), orthonormal under `mass` (N,), to vector fields that hold no rotation, smoothest
+    first: (S, 3, count), the weight of each mode along each axis. `energy` (S,) is how fast each varies."""
+    scalars = functions.shape[1]
+    middle = (points * mass[:, None]).sum(axis=0) / mass.sum()
+    turns = [np.cross(axis, points - middle) for axis in np.eye(3)]
+    rotations = np.stack([(functions.T @ (mass[:, None] * turn)).reshape(-1) for turn in turns])
+    free = linalg.null_space(rotations)
+    reduced = free.T @ (np.repeat(energy, 3)[:, None] * free)
+    vectors = linalg.eigh(reduced)[1][:, : min(count, free.shape[1])]
+    combined = _signed(free @ vectors)
+    return np.asarray(combined.reshape(scalars, 3, -1))
+
+
+# ---- one push per vertex ---------------------------------------------------------------------------------------------
+
+
+class Preconditioner:
+    """Spreads pushes over the neighbourhood of a welded mesh and takes rigid motions out: `d = R (I + lambda L)^-2
+    p`."""
+
+    def __init__(self, solid: Body) -> None:
+        count = len(solid.places)
+        edges = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
+        edges = np.unique(np.sort(edges, axis=1), axis=0)
+        lengths = np.linalg.norm(solid.places[edges[:, 0]] - solid.places[edges[:, 1]], axis=1)
+        mean = float(lengths.mean())
+        links = np.concatenate([edges, solid.walls])
+        weights = np.concatenate([(mean / lengths.clip(0.1 * mean)) ** 2, np.full(len(solid.walls), WALL_WEIGHT)])
+        adjacency = sparse.coo_matrix((weights, (links[:, 0], links[:, 1])), shape=(count, count)).tocsr()
+        adjacency = adjacency + adjacency.T
+        laplacian = sparse.diags(np.asarray(adjacency.sum(axis=1)).reshape(-1)) - adjacency
+        strength = (SMOOTHING_LENGTH * solid.extent / mean) ** 2
+        self._factor = sparse_linalg.splu((sparse.identity(count) + strength * laplacian).tocsc())
+        centred = solid.places - solid.places.mean(axis=0)
+        shifts = [np.broadcast_to(axis, solid.places.shape) for axis in np.eye(3)]
+        turns = [np.cross(axis, centred) for axis in np.eye(3)]
+        rigid_motions = np.asarray(linalg.orth(np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)))
+        self._rigid = torch.from_numpy(rigid_motions)
+
+    def __call__(self, pushes: Tensor) -> Tensor:
+        """Return displacements (P, 3) for pushes (P, 3), float64; differentiable."""
+        once: Tensor = _Solve.apply(pushes, self._factor)  # type: ignore[no-untyped-call]
+        smooth: Tensor = _Solve.apply(once, self._factor)  # type: ignore[no-untyped-call]
+        flat = smooth.reshape(-1)
+        rigid = self._rigid.to(flat.device)
+        return (flat - rigid @ (rigid.T @ flat)).reshape(smooth.shape)
+
+
+class _Solve(torch.autograd.Function):
+    """Solution of a symmetric sparse system; its derivative is the same solution."""
+
+    @staticmethod
+    def forward(ctx: Any, right: Tensor, factor: Any) -> Tensor:
+        ctx.factor = factor
+        return torch.from_numpy(factor.solve(right.detach().cpu().numpy())).to(right.device)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor, None]:
+        right = np.ascontiguousarray(cotangent.cpu().numpy())
+        return torch.from_numpy(ctx.factor.solve(right)).to(cotangent.device), None
+
+
+# ---- how far ---------------------------------------------------------------------------------------------------------
+
+
+class Limits:
+    """Holds displacements where the mesh stays whole, by one factor for all of it.
+
+        offsets = epsilon s d,    s = (1 + sum_i r_i^p)^(-1/p)
+
+    with `r_i` what each bound would be used up to, 1 being all of it: the length of d at each place (1), the gradient
+    of the displacement along each face (`FACE_STRAIN`), and between the two sides of each wall (`WALL_STRAIN`). As
+    `s max r < 1`, no place moves further than epsilon, no face turns over (its tangent map is I + B with ||B|| < 1,
+    and so has a positive determinant), and walls and gaps between places keep more than half their width.
+
+    Args:
+        solid: the welded mesh.
+        epsilon: largest displacement, in the mesh's units.
+    """
+
+    def __init__(self, solid: Body, epsilon: float) -> None:
+        self.epsilon = epsilon
+        corners = solid.places[solid.faces]
+        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        longest = np.linalg.norm(np.stack([first, second, first - second]), axis=-1).max(axis=0)
+        double_area = np.linalg.norm(np.cross(first, second), axis=1)
+        sound = double_area > THIN_FACE * longest**2
+        first, second, double_area = first[sound], second[sound], double_area[sound]
+        length = np.linalg.norm(first, axis=1)
+        along = (first * second).sum(axis=1) / length
+        # gradient along the face's two axes: [d1 d2] [[length, along], [0, height]]^-1
+        self._faces = torch.from_numpy(solid.faces[sound])
+        self._across = torch.from_numpy(np.stack([1.0 / length, along / length, length / double_area], axis=1))
+        self._walls = torch.from_numpy(solid.walls)
+        gaps = np.linalg.norm(solid.places[solid.walls[:, 0]] - solid.places[solid.walls[:, 1]], axis=1)
+        self._gaps = torch.from_numpy(gaps)
+        self._places = torch.from_numpy(solid.places)
+
+    def used(self, field: Tensor) -> Tensor:
+        """Return the squares (N,) of how far each bound is used up by `epsilon d` for d (P, 3)."""
+        faces_of, across, walls_of, gaps = (
+            held.to(field.device) for held in (self._faces, self._across, self._walls, self._gaps)
+        )
+        # index_select, for its derivative is ten times faster than that of an index
+        corners = [field.index_select(0, corner) for corner in faces_of.T]
+        first, second = corners[1] - corners[0], corners[2] - corners[0]
+        one = first * across[:, :1]
+        other = (second - first * across[:, 1:2]) * across[:, 2:]
+        faces = (one.square() + other.square()).sum(dim=1) * (self.epsilon / FACE_STRAIN) ** 2
+        apart = field.index_select(0, walls_of[:, 0]) - field.index_select(0, walls_of[:, 1])
+        walls = apart.square().sum(dim=1) * (self.epsilon / WALL_STRAIN / gaps).square()
+        return torch.cat([field.square().sum(dim=1), faces, walls])
+
+    def held(self, field: Tensor) -> Tensor:
+        """Return the offsets (P, 3) for a field d (P, 3), float64; differentiable."""
+        squares = self.used(field)
+        largest = squares.detach().max().clamp_min(1.0)  # keeps the power within the numbers' range
+        total = (squares / largest).pow(SHARPNESS // 2).sum() + largest ** (-SHARPNESS // 2)
+        return self.epsilon * field * (total ** (-1.0 / SHARPNESS) / largest.sqrt())
+
+    def thinnest(self, offsets: Tensor) -> float:
+        """Return the smallest width of a wall or gap after a displacement (P, 3), as a share of what it was."""
+        if not len(self._walls):
+            return 1.0
+        moved = (self._places + offsets.cpu())[self._walls]
+        return float(((moved[:, 0] - moved[:, 1]).norm(dim=1) / self._gaps).min())
+
 
 FORMS = ("modes", "large-steps")
 DEFAULT_EPSILON = 0.03
@@ -56,10 +343,10 @@ class GeometryControl(Control):
     pushes: object = None
     name: str = "geometry"
 
-    kind: ClassVar[str] = "geometry"
-    of_a_mesh: ClassVar[bool] = True
-    summary: ClassVar[str] = "A smooth change of the object's shape, at most so far."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "geometry"
+    of_a_mesh = True
+    summary = "A smooth change of the object's shape, at most so far."
+    parameters = (
         Parameter(
             "amplitudes", (None,), "1", -1.0, 1.0, 0.0,
             "How much of each smooth mode of the shape is added (form modes).", moves_silhouettes=True,
@@ -70,7 +357,7 @@ class GeometryControl(Control):
             moves_silhouettes=True, search=(-1.0, 1.0), estimators=ESTIMATORS,
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "epsilon", DEFAULT_EPSILON, "Largest displacement of a vertex, in object sizes.", "epsilon",
             most=LARGEST_EPSILON,
@@ -85,76 +372,35 @@ class GeometryControl(Control):
         object.__setattr__(self, "form", self.chosen_form(FORMS, self.form))
 
     def bind(self, scene: SceneDescription) -> BoundControl:
-        mesh = self.mesh_in(scene).mesh
-        shaper: Shaper = Moded(mesh, int(self.modes)) if self.form == "modes" else Pushed(mesh)
-        return BoundGeometry(self.name, self.mesh, mesh, shaper, float(self.epsilon))
-
-
-class Shaper(ABC):
-    """One form of the control: a map from its slice of u to a field of displacements.
-
-    Attributes:
-        group: the slice as a group.
-    """
-
-    group: Group
-
-    @abstractmethod
-    def field(self, u: Tensor) -> Tensor:
-        """Map (d,) in [0, 1] to (P, 3) float64, before it is held inside its limits; zero at 0.5; differentiable."""
-
-
-class Moded(Shaper):
-    """A sum of smooth modes."""
-
-    def __init__(self, mesh: Mesh, count: int) -> None:
-        self._modes = torch.from_numpy(shape_modes(mesh, count))
-        self.group = Group("amplitudes", self._modes.shape[2], ESTIMATORS)
-
-    def field(self, u: Tensor) -> Tensor:
-        return self._modes.to(u.device) @ (2.0 * u.double() - 1.0)
-
-
-class Pushed(Shaper):
-    """A push for each vertex, spread out."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        solid = body(mesh)
-        self._spread = Preconditioner(solid)
-        self._count = len(solid.places)
-        self.group = Group("pushes", 3 * self._count, ESTIMATORS)
-
-    def field(self, u: Tensor) -> Tensor:
-        return PUSH * self._spread((2.0 * u.double() - 1.0).reshape(self._count, 3))
+        return BoundGeometry(self, self.mesh_in(scene).mesh)
 
 
 class BoundGeometry(BoundControl):
-    """The shape of one mesh.
+    """The shape of one mesh."""
 
-    Args:
-        name: the instance's name.
-        on: name of the mesh.
-        mesh: its geometry.
-        shaper: maps u to a field of displacements.
-        epsilon: largest displacement, in the mesh's units.
-    """
-
-    def __init__(self, name: str, on: str, mesh: Mesh, shaper: Shaper, epsilon: float) -> None:
-        self.name = name
-        self._offsets = f"{on}.offsets"
-        self._mesh, self._shaper = mesh, shaper
-        solid = body(mesh)
+    def __init__(self, control: GeometryControl, mesh: Mesh) -> None:
+        self.name = control.name
+        self._offsets = f"{control.mesh}.offsets"
+        self._mesh, solid = mesh, body(mesh)
         self._index = torch.from_numpy(solid.index)
-        self._limits = Limits(solid, epsilon)
-        self.groups = (shaper.group,)
-        self.start = torch.full((shaper.group.size,), 0.5)
+        self._limits = Limits(solid, float(control.epsilon))
+        if control.form == "modes":
+            modes = torch.from_numpy(shape_modes(mesh, int(control.modes)))
+            group = Group("amplitudes", modes.shape[2], ESTIMATORS)
+            self._field: Callable[[Tensor], Tensor] = lambda a: modes.to(a.device) @ a
+        else:
+            spread = Preconditioner(solid)
+            group = Group("pushes", 3 * len(solid.places), ESTIMATORS)
+            self._field = lambda a: PUSH * spread(a.reshape(-1, 3))
+        self.groups = (group,)
+        self.start = torch.full((group.size,), 0.5)
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {self._offsets: self.offsets(u).index_select(0, self._index.to(u.device)).float()}
 
     def offsets(self, u: Tensor) -> Tensor:
         """Displacement of each place, (P, 3) float64."""
-        return self._limits.held(self._shaper.field(u))
+        return self._limits.held(self._field(2.0 * u.double() - 1.0))
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         offsets = self.offsets(u.detach())
@@ -168,20 +414,11 @@ class BoundGeometry(BoundControl):
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
         moving = MovingMesh(self._mesh, np.eye(4))
         vertices, normals = moving.place(None, self.inputs(u.detach())[self._offsets])
-        return {f"{self.name}.obj": obj_bytes(vertices, normals, self._mesh)}
-
-
-def obj_bytes(vertices: Tensor, normals: Tensor, mesh: Mesh) -> bytes:
-    """Return a mesh as a Wavefront OBJ file, z up, with the texture coordinates and faces of another.
-
-    Args:
-        vertices: (V, 3).
-        normals: (V, 3).
-        mesh: with V vertices.
-    """
-    lines = ["# advsearch: z is up; texture coordinates as of the original object"]
-    lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
-    lines += [f"vt {u:.7g} {v:.7g}" for u, v in mesh.uvs.tolist()]
-    lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in normals.tolist()]
-    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (mesh.faces.astype(np.int64) + 1).tolist()]
-    return ("\n".join(lines) + "\n").encode("ascii")
+        lines = ["# advsearch: z is up; texture coordinates as of the original object"]
+        lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
+        lines += [f"vt {u:.7g} {v:.7g}" for u, v in self._mesh.uvs.tolist()]
+        lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in normals.tolist()]
+        lines += [
+            f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (self._mesh.faces.astype(np.int64) + 1).tolist()
+        ]
+        return {f"{self.name}.obj": ("\n".join(lines) + "\n").encode("ascii")}

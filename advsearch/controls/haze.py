@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, Number, Range
+from advsearch.controls.values import Number, Range
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
@@ -35,10 +34,10 @@ THIN_HAZE = 0.1
 class HazeControl(NumberControl):
     """A uniform haze around camera and object."""
 
-    kind: ClassVar[str] = "haze"
-    amount: ClassVar[str | None] = "density"
-    summary: ClassVar[str] = "A uniform haze around camera and object: how dense it is, and its colour."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "haze"
+    amount = "density"
+    summary = "A uniform haze around camera and object: how dense it is, and its colour."
+    parameters = (
         Parameter(
             "density", (), "per object size", 0.0, 2.0, 0.0,
             "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.", search=(0.0, 0.3),
@@ -50,19 +49,13 @@ class HazeControl(NumberControl):
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         if (own := _haze_of(scene)) is not None and own.density:
             return own.density if parameter.name == "density" else _display(own)[CHANNELS.index(parameter.name)]
-        if parameter.name == "density" and self.asked and not self.searches_density:
+        if parameter.name == "density" and self.asked and not self.searches("density"):
             return THIN_HAZE
         return parameter.default
 
     def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
         own = _haze_of(scene)
         return parameter.default if own is None or not own.density else self.default(scene, parameter)
-
-    @property
-    def searches_density(self) -> bool:
-        """Whether the density is among what is searched."""
-        spec = self.specs.get("density")
-        return not self.asked if spec is None else not isinstance(spec, Fixed)
 
     def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
         if parameter.name != "density":
@@ -83,7 +76,6 @@ class HazeControl(NumberControl):
 
 
 def _haze_of(scene: SceneDescription) -> HazePart | None:
-    """The haze that a scene has, if it has one."""
     return next((one for one in scene.parts if isinstance(one, HazePart)), None)
 
 

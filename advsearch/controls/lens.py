@@ -3,18 +3,13 @@
     opacity_k(p) = opacity_k * exp(-(|p - centre_k|^2 / radius_k^2) ^ falloff)
     light(p)    <- (1 - opacity_k(p)) light(p) + opacity_k(p) color_k,     for each dot k in turn
 
-The model of a dot, a colour that is mixed in with an opacity that falls off exponentially with the squared distance,
-is that of Li, Schmidt and Kolter (Adversarial camera stickers, ICML 2019, arXiv 1904.00759, section 3): a dot on the
-glass is so far out of focus that all that is left of its outline is a smooth blob. They mix display values. Here the
-mixing is of linear light, because what a lens adds up on the sensor is light; the colours are given as sRGB.
-
-Dots are part of the camera, not of the scene: they are put on the finished picture, and nothing is rendered anew.
+The dots are those of Li, Schmidt and Kolter (Adversarial camera stickers, ICML 2019, arXiv 1904.00759, section 3), who
+mix display values; here linear light is mixed. They are put on the finished picture, and nothing is rendered anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -50,10 +45,10 @@ def _per_dot(name: str, unit: str, default: float, description: str, **more: obj
 class LensControl(NumberControl):
     """Translucent dots on the camera's lens."""
 
-    kind: ClassVar[str] = "lens"
-    amount: ClassVar[str | None] = "opacity"
-    summary: ClassVar[str] = "Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "lens"
+    amount = "opacity"
+    summary = "Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."
+    parameters = (
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
         _per_dot(
@@ -70,9 +65,7 @@ class LensControl(NumberControl):
             estimators=("image",),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),
-    )
+    choices = (Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),)
 
     @property
     def dots(self) -> int:
@@ -95,7 +88,9 @@ class LensControl(NumberControl):
         return with_dots(image, self._placed(values))
 
     def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {self.name: with_dots(_board(), self._placed(values))}
+        square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
+        dark = (square[:, None] + square[None, :]) % 2
+        return {self.name: with_dots((0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3), self._placed(values))}
 
     def _placed(self, values: Values) -> dict[str, Tensor]:
         """The values, with the dots spread over the picture along an axis about which nothing was said."""
@@ -139,13 +134,6 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
     ):
         light = light + cover[..., None] * (shade - light)
     return linear_to_srgb(light)
-
-
-def _board() -> Tensor:
-    """A grey chequerboard, on which white and black dots both show; (STICKER_SIDE, STICKER_SIDE, 3) sRGB."""
-    square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
-    dark = (square[:, None] + square[None, :]) % 2
-    return (0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3)
 
 
 def _covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:

@@ -1,21 +1,18 @@
 """The `light` control: one lamp with a place, a colour, a power and, if it is a ball, a size.
 
 Power is in multiples of the irradiance `E` with which a white surface (reflectance 0.8) gets the display value
-`LIT_WHITE`; the exposure is metered for the environment alone. A lamp of power p and linear colour c puts `p c E / d^2`
-on a surface that faces it at distance d (object sizes):
+`LIT_WHITE`. A lamp of power p and linear colour c puts `p c E / d^2` on a surface that faces it at distance d:
 
     point:  intensity I = p c E                      ball of radius r:  radiance L = p c E / (pi r^2)
 
-The second is the irradiance of a uniform ball, `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity and Realistic Image
-Synthesis, section 2.4), solved for L, so that size changes how soft the shadows are and not how bright the lamp is. One
-lamp is one instance; a second one needs a name of its own.
+The irradiance of a uniform ball is `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity and Realistic Image Synthesis,
+section 2.4), so that size changes how soft the shadows are and not how bright the lamp is.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -50,10 +47,10 @@ def _place(name: str, low: float, high: float, default: float, description: str)
 class LightControl(NumberControl):
     """One lamp beside the environment."""
 
-    kind: ClassVar[str] = "light"
-    amount: ClassVar[str | None] = "power"
-    summary: ClassVar[str] = "A lamp: where it stands, its colour, its power, and the size of an area light."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "light"
+    amount = "power"
+    summary = "A lamp: where it stands, its colour, its power, and the size of an area light."
+    parameters = (
         _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
         _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
         _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
@@ -68,7 +65,7 @@ class LightControl(NumberControl):
             (0.05, 0.6), log=True,
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "type", "area", "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
             options=("area", "point"),
@@ -83,7 +80,7 @@ class LightControl(NumberControl):
             )
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        if parameter.name == "power" and self.asked and isinstance(self.specs.get("power", Fixed(0.0)), Fixed):
+        if parameter.name == "power" and self.asked and not self.searches("power"):
             return LIT_POWER
         return parameter.default
 

@@ -1,19 +1,15 @@
 """The `material` control: how the object's surface reflects, its tint, and which named material it is made of.
 
-The numbers are those of the principled BSDF (Burley, *Physically based shading at Disney*, SIGGRAPH 2012 course notes).
-A tint multiplies reflectance:
-
     base_color = linear(tint) * (the object's texture, or the named material's pattern)
 
-A named material is a seamless pattern of `patterns` with numbers of its own: the shape of one thing and
-the surface of another, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
+The numbers are those of the principled BSDF (Burley, *Physically based shading at Disney*, SIGGRAPH 2012 course notes).
+A named material has a seamless pattern and numbers of its own, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -21,7 +17,7 @@ from torch import Tensor
 from advsearch.controls.base import Parameter
 from advsearch.controls.material_patterns import PATTERNS, covering
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, Number, OneOf
+from advsearch.controls.values import Number
 from advsearch.errors import InputError
 from advsearch.scene.assets import Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
@@ -41,10 +37,10 @@ exactly 0 it is 0, and towards a specular of 0 it grows without bound (the refra
 class MaterialControl(NumberControl):
     """The object's gloss, metal, coat and tint, and which named material covers it."""
 
-    kind: ClassVar[str] = "material"
-    of_a_mesh: ClassVar[bool] = True
-    summary: ClassVar[str] = "The object's gloss, metal, coat and tint, and which named material covers it."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "material"
+    of_a_mesh = True
+    summary = "The object's gloss, metal, coat and tint, and which named material covers it."
+    parameters = (
         Parameter(
             "which", (), "name", 0.0, float(len(PATTERNS)), OWN,
             "The object's own surface, or a named material in its place.", options=(OWN, *PATTERNS),
@@ -55,7 +51,7 @@ class MaterialControl(NumberControl):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         numbers = [name for name in NUMBERS if self._varies(name)]
-        if self.mesh_in(scene).surface is not None and (numbers or self._names_a_material()):
+        if self.mesh_in(scene).surface is not None and (numbers or self._names != (OWN,)):
             raise InputError(
                 f"`controls` {self.name}: the {self.mesh} has a surface of Mitsuba's own; search red, green or blue, "
                 f"or its numbers by Mitsuba's names, mitsuba:{self.mesh}.bsdf.KEY=[low, high]"
@@ -64,7 +60,8 @@ class MaterialControl(NumberControl):
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         if parameter.name in NUMBERS:
-            return float(getattr(self._own(scene, self._fixed()), parameter.name))
+            first = OWN if OWN in self._names else str(self._names[0])  # the fixed or first material
+            return float(getattr(self._own(scene, first), parameter.name))
         return parameter.default
 
     def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
@@ -80,8 +77,10 @@ class MaterialControl(NumberControl):
         inputs: dict[str, Tensor] = {}
         for name in NUMBERS:
             if self._varies(name):
-                inputs[f"{self.mesh}.{name}"] = _rendered(name, values[name]).reshape(1)
-            elif self._names_a_material():
+                value = values[name]
+                low, high = RENDERED.get(name, (0.0, 1.0))
+                inputs[f"{self.mesh}.{name}"] = (value + (value.clamp(low, high) - value).detach()).reshape(1)
+            elif self._names != (OWN,):
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(own, name))])
         if self._colours():
             tint = torch.stack([values[name] for name in CHANNELS])
@@ -97,27 +96,16 @@ class MaterialControl(NumberControl):
     def _base_color(self) -> str:
         return f"{self.mesh}.base_color"
 
+    @property
+    def _names(self) -> tuple[Number, ...]:
+        return self.allowed("which", OWN)
+
     def _varies(self, name: str) -> bool:
         """Whether a parameter was set or is searched; otherwise it is the named material's own."""
         return name in self.specs or not self.asked
 
-    def _fixed(self) -> str:
-        """The material that the numbers start from: the fixed or first one of `which`."""
-        spec = self.specs.get("which")
-        if isinstance(spec, Fixed):
-            return str(spec.value)
-        if isinstance(spec, OneOf) and OWN not in spec.values:
-            return str(spec.values[0])
-        return OWN
-
-    def _names_a_material(self) -> bool:
-        """Whether anything but the object's own surface can be chosen."""
-        spec = self.specs.get("which")
-        names = spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else (OWN,)
-        return names != (OWN,)
-
     def _colours(self) -> bool:
-        return self._names_a_material() or any(self._varies(name) for name in CHANNELS)
+        return self._names != (OWN,) or any(self._varies(name) for name in CHANNELS)
 
     def _own(self, scene: SceneDescription, which: str) -> Material:
         return self.mesh_in(scene).material if which == OWN else PATTERNS[which].material
@@ -129,12 +117,6 @@ class MaterialControl(NumberControl):
             own = self.mesh_in(scene).base_color
             return srgb_to_linear(torch.from_numpy(own.copy())) if before is None else before
         return _linear_covering(self.mesh_in(scene).mesh, which)
-
-
-def _rendered(name: str, value: Tensor) -> Tensor:
-    """Move a value into the range that is rendered; the derivative passes as if it had not been moved."""
-    low, high = RENDERED.get(name, (0.0, 1.0))
-    return value + (value.clamp(low, high) - value).detach()
 
 
 @lru_cache(maxsize=len(PATTERNS))

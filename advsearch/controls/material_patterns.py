@@ -1,11 +1,8 @@
 """Named materials made by procedure: seamless patterns with a surface of their own, and how they cover an object.
 
-Each pattern is a square tile that repeats in both directions without a visible seam: it is built from noise, cells and
-waves on a torus. They are what "texture against shape" needs (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4:
-an object keeps its shape and wears another's surface).
-
-Ingredients, all periodic: gradient noise (Perlin 1985), cells (Worley 1996), and iterated band-pass filtering, which
-makes the stripes and spots of animals (Turing 1952; as a filter: Young 1984).
+Each is a square tile that repeats without a visible seam (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4), made
+of periodic gradient noise (Perlin 1985), cells (Worley 1996), and iterated band-pass filtering (Turing 1952; Young
+1984).
 """
 
 from __future__ import annotations
@@ -32,14 +29,8 @@ BLEND = 20.0
 
 @dataclass(frozen=True)
 class Pattern:
-    """A named material.
-
-    Attributes:
-        name: the word for it.
-        size: side of one tile in object sizes.
-        material: the surface beside its colour.
-        paint: draws the tile: (SIDE, SIDE, 3) display-referred sRGB, any overshoot clipped later.
-    """
+    """A named material: the side of a tile in object sizes, the surface beside its colour, and what draws the tile:
+    (SIDE, SIDE, 3) display-referred sRGB, any overshoot clipped later."""
 
     name: str
     size: float
@@ -114,13 +105,11 @@ def _cells(at: Grid, points: Doubles, count: int = 2) -> tuple[Doubles, npt.NDAr
 
 
 def _turing(wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12) -> Doubles:
-    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and again.
+    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and again; after about ten rounds the
+    pattern has settled.
 
-    Args:
-        wavelength: in tiles, along x and along y; unequal ones make stripes across the shorter.
-        bias: added before saturation: stripes break up into spots away from 0.
-        seed: of the noise.
-        rounds: how often; after about ten the pattern has settled.
+    Wavelengths are in tiles, along x and along y; unequal ones make stripes across the shorter. The bias is added
+    before saturation: stripes break up into spots away from 0.
     """
     frequency = np.fft.fftfreq(SIDE, 1.0 / SIDE)
     radius = np.hypot(frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1])

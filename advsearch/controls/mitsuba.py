@@ -1,25 +1,20 @@
-"""The `mitsuba` control: any number or colour of a scene by Mitsuba's own name.
+"""The `mitsuba` control: any number or colour of a scene by Mitsuba's own name, a key of `mitsuba.traverse`.
 
-The names are the keys of `mitsuba.traverse` for the scene inside Mitsuba, where the object under test is called
-`object` whatever it was called in a file. Of a colour, each channel is a number of its own in the same range, and
-`KEY.red` is one of them. Whether
-Mitsuba's derivative of a number is right nobody knows beforehand: `advsearch check` compares it with differences, and a
-plan that is measured takes what is nearer to them.
+The object under test is called `object` there. Of a colour, each channel is a number in the same range; `KEY.red` is
+one. Whether Mitsuba's derivative is right nobody knows beforehand: `advsearch check` compares it with differences.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from advsearch.controls.base import Parameter
-from advsearch.controls.clean import Moved
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Slot, Values
-from advsearch.controls.values import LARGEST, Fixed, OneOf
+from advsearch.controls.values import LARGEST, Fixed, Moved, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.keys import plugin_numbers
@@ -30,9 +25,9 @@ from advsearch.scene.settings import CHANNELS
 class MitsubaControl(NumberControl):
     """Anything else in the scene: numbers and colours by Mitsuba's own names."""
 
-    kind: ClassVar[str] = "mitsuba"
-    summary: ClassVar[str] = "Anything else in the scene: numbers and colours by Mitsuba's own names."
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    kind = "mitsuba"
+    summary = "Anything else in the scene: numbers and colours by Mitsuba's own names."
+    parameters = ()
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)

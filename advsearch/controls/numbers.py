@@ -22,17 +22,21 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, WHOLE_RANGE, BoundControl, Budget, Choice, Control, Group, Parameter, Value
-from advsearch.controls.clean import Moved, apart, check_start, nearest, same
 from advsearch.controls.values import (
     Fixed,
+    Moved,
     Number,
     OneOf,
     Range,
     Spec,
+    apart,
+    check_start,
     in_words,
+    nearest,
     option_index,
     plain,
     read,
+    same,
     to_unit,
     to_value,
 )
@@ -86,14 +90,20 @@ class NumberControl(Control, ABC):
     def settings(self) -> dict[str, object]:
         return {"kind": self.kind, **self._given} if self.name != self.kind else dict(self._given)
 
+    def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
+        """Return the values, one by one, that a parameter was set to; others where nothing was said of it."""
+        spec = self.specs.get(parameter)
+        return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else otherwise
+
+    def searches(self, parameter: str) -> bool:
+        """Return whether a parameter with a range of its own is among what is searched."""
+        return not isinstance(self.specs[parameter], Fixed) if parameter in self.specs else not self.asked
+
     # ---- what a subclass says ---------------------------------------------------------------------------------------
 
     def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing.
-
-        Raises:
-            InputError: a choice is out of range.
-        """
+        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing. Raises InputError
+        where a choice is out of range."""
 
     def in_scene(self, scene: SceneDescription, parameter: Parameter) -> Parameter:
         """Return a parameter as this scene has it, where its unit depends on that."""
@@ -165,11 +175,8 @@ class NumberControl(Control, ABC):
         return BoundNumbers(self, scene, tuple(slots))
 
     def moved(self, scene: SceneDescription, slots: Sequence[Slot]) -> Iterator[Moved]:
-        """Yield the values of the clean scene that the start has not.
-
-        Raises:
-            InputError: one of them was asked for.
-        """
+        """Yield the values of the clean scene that the start has not. Raises InputError where one of them was asked
+        for."""
         for slot in slots:
             parameter = slot.parameter
             if self.amount not in (None, parameter.name):
@@ -240,11 +247,8 @@ class Slot:
 
 
 class BoundNumbers(BoundControl):
-    """A `NumberControl` in a scene.
-
-    Attributes:
-        slots: each parameter with what it is set to, in the order of its coordinates.
-    """
+    """A `NumberControl` in a scene. `slots` has each parameter with what it is set to, in the order of its
+    coordinates."""
 
     def __init__(self, control: NumberControl, scene: SceneDescription, slots: tuple[Slot, ...]) -> None:
         self.control = control

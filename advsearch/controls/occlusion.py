@@ -1,13 +1,11 @@
 """The `occlusion` control: a second object between the camera and the object, hiding a wanted share of it.
 
-The occluder is a card, a sphere, a bundled object or a mesh from a file. It comes in from one side of the picture and
-stops where it hides as much as was asked for. It moves on a sphere around the camera and keeps its side towards it, so
-its distance and its size in the picture stay the same:
+The occluder comes in from one side of the picture, on a sphere around the camera, and stops where it hides as much as
+was asked for (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4):
 
     place = camera + distance * turned(line of sight, direction, angle),    hidden(angle) = coverage
 
-`angle` is found by bisection on rasterised silhouettes (`scene.silhouettes`). How much a classifier loses to an
-occluder at a known share is a standard question of robustness (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4).
+`angle` is found by bisection on rasterised silhouettes (`scene.silhouettes`).
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,10 +23,9 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, OneOf
 from advsearch.errors import InputError
 from advsearch.files import reading
-from advsearch.scene import library
+from advsearch.scene import library, silhouettes
 from advsearch.scene.assets import Material, Mesh, ObjectAsset, normalised
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.description import SceneDescription
@@ -37,16 +33,6 @@ from advsearch.scene.geometry import affine, camera_to_world, object_to_world
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT, moving
-from advsearch.scene.silhouettes import (
-    GRID,
-    RASTER,
-    Frame,
-    Passage,
-    Silhouette,
-    angle_outside,
-    middle_axes,
-    silhouette,
-)
 
 Doubles = npt.NDArray[np.float64]
 _moving = partial(moving, ORBIT)
@@ -66,11 +52,8 @@ SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "camera.lens", 
 
 @cache
 def loaded(spec: str) -> ObjectAsset:
-    """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin.
-
-    Raises:
-        InputError: there is no such object, or the file cannot be used.
-    """
+    """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin. Raises InputError
+    where there is no such object, or the file cannot be used."""
     is_file = "/" in spec or "\\" in spec or Path(spec).suffix != ""
     with reading(spec):
         return centred(import_object(Path(spec)) if is_file else library.load_object(spec))
@@ -90,17 +73,13 @@ def made(name: str) -> ObjectAsset:
     if name == "card":
         texels = np.array([0.70, 0.53, 0.36]) + generator.normal(0.0, 0.012, (64, 64, 1)) * np.ones(3)
         texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]  # the flutes under the paper
-        return ObjectAsset(name, _card(), texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
+        uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
+        vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
+        normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
+        card = Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
+        return ObjectAsset(name, card, texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
     return ObjectAsset(name, sphere(24, 48), grey, Material(roughness=0.6))
-
-
-def _card() -> Mesh:
-    """A square in the y-z plane that faces +x."""
-    uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
-    vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
-    normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
-    return Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
 
 
 def sphere(rows: int, columns: int) -> Mesh:
@@ -146,10 +125,10 @@ class Placement:
 class OcclusionControl(NumberControl):
     """A second object between the camera and the object."""
 
-    kind: ClassVar[str] = "occlusion"
-    amount: ClassVar[str | None] = "coverage"
-    summary: ClassVar[str] = "A second object between the camera and the object, hiding a wanted share of it."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "occlusion"
+    amount = "coverage"
+    summary = "A second object between the camera and the object, hiding a wanted share of it."
+    parameters = (
         Parameter(
             "which", (), "name", 0.0, len(OPTIONS) - 1.0, "card",
             "What it is: a piece of cardboard, a grey sphere, or a bundled object.", moves_silhouettes=True,
@@ -174,7 +153,7 @@ class OcclusionControl(NumberControl):
             periodic=True,
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice("object", None, "Another occluder in place of `which`: any bundled object, or a path to a mesh file."),
     )
 
@@ -229,9 +208,7 @@ class OcclusionControl(NumberControl):
         """Every occluder that can be chosen; each is a part of the scene."""
         if self.chosen["object"] is not None:
             return (str(self.chosen["object"]),)
-        spec = self.specs.get("which")
-        names = spec.values if isinstance(spec, OneOf) else (spec.value if isinstance(spec, Fixed) else MADE[0],)
-        return tuple(dict.fromkeys(str(name) for name in names))
+        return tuple(map(str, self.allowed("which", MADE[0])))
 
     def _option(self, values: Values) -> str:
         return self._candidates()[0] if self.chosen["object"] is not None else OPTIONS[int(values["which"])]
@@ -244,13 +221,8 @@ class OcclusionControl(NumberControl):
         return made(option) if option in MADE else loaded(option)
 
     def placement(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
-        """Work out where the occluder goes; without derivatives.
-
-        Args:
-            scene: the scene.
-            values: the configuration.
-            so_far: where other controls put the camera and the object.
-        """
+        """Work out where the occluder goes, with camera and object where other controls put them; without
+        derivatives."""
         asked = {name: float(value.detach()) for name, value in values.items()}
         seen = _Seen.of(scene, so_far)
         mesh = self._asset(self._option(values)).mesh
@@ -258,7 +230,8 @@ class OcclusionControl(NumberControl):
             return Placement(np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True)
         points = mesh.vertices.astype(np.float64) @ _about_upright(asked["turn"]).T
         size, distance = _fitting(points, asked["size"], asked["distance"] * seen.far, seen.near)
-        cover = silhouette(_ahead(points, size, distance), mesh.faces)
+        ahead = np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
+        cover = silhouettes.silhouette(ahead, mesh.faces)
         if cover is None:
             return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
         return _solved(seen, cover, asked, size, distance)
@@ -294,13 +267,13 @@ class _Seen:
         points = _from_camera(vertices @ pose[:3, :3].T + pose[:3, 3], camera)
         if (model := scene.camera_model) is not None:
             model = model.with_numbers(so_far["camera.lens"].detach().cpu()) if "camera.lens" in so_far else model
-            shown = rim = _looked(model, (0.0, 1.0), (0.0, 1.0), GRID)
+            shown = rim = _looked(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
             directions = _through(model, points, mesh.faces)
         else:
             fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
             shift = _numpy(so_far, "camera.shift", np.zeros(2))
-            frame = Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
-            found = silhouette(points, mesh.faces, frame)
+            frame = silhouettes.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
+            found = silhouettes.silhouette(points, mesh.faces, frame)
             shown, rim = frame.spread(), frame.corners()
             directions = None if found is None else found.directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
@@ -309,15 +282,10 @@ class _Seen:
 
 
 def _through(model: CameraModel, points: Doubles, faces: npt.NDArray[np.uint32]) -> Doubles | None:
-    """Unit directions (N, 3) in which a mesh is seen through a lens, each for the same area of the picture, or None.
-
-    Args:
-        model: the lens.
-        points: (V, 3) vertices in camera coordinates.
-        faces: (F, 3) vertex indices.
-    """
-    axes = middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
-    cover = silhouette(points @ axes.T, faces)
+    """Unit directions (N, 3) in which a mesh, with vertices (V, 3) in camera coordinates, is seen through a lens, each
+    for the same area of the picture, or None."""
+    axes = silhouettes.middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
+    cover = silhouettes.silhouette(points @ axes.T, faces)
     if cover is None:
         return None
     places, seen = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
@@ -326,7 +294,7 @@ def _through(model: CameraModel, points: Doubles, faces: npt.NDArray[np.uint32])
         if bool(seen.all())
         else ((0.0, 0.0), (1.0, 1.0))
     )
-    looked = _looked(model, (left, right), (top, bottom), RASTER)
+    looked = _looked(model, (left, right), (top, bottom), silhouettes.RASTER)
     hidden = looked[cover.contains(*(looked @ axes.T).T)]
     return hidden if len(hidden) else None
 
@@ -356,12 +324,14 @@ def _from_camera(world: Doubles, camera: Doubles) -> Doubles:
 # ---- where the occluder goes ----------------------------------------------------------------------------------------
 
 
-def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: float, distance: float) -> Placement:
+def _solved(
+    seen: _Seen, cover: silhouettes.Silhouette, asked: Mapping[str, float], size: float, distance: float
+) -> Placement:
     """Find the angle at which the wanted share is hidden."""
     assert seen.directions is not None
-    axes = middle_axes(seen.directions)
-    sweep = Passage(seen.directions, cover, axes, asked["direction"])
-    outside = angle_outside(seen.shown, seen.rim, cover, axes, asked["direction"])
+    axes = silhouettes.middle_axes(seen.directions)
+    sweep = silhouettes.Passage(seen.directions, cover, axes, asked["direction"])
+    outside = silhouettes.angle_outside(seen.shown, seen.rim, cover, axes, asked["direction"])
     angle = sweep.solve(max(asked["coverage"], EASE), outside)
     if asked["coverage"] < EASE:
         angle = outside + (angle - outside) * asked["coverage"] / EASE
@@ -369,22 +339,12 @@ def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: fl
     return Placement(axes, angle, size, distance, hidden, False)
 
 
-def _ahead(points: Doubles, size: float, distance: float) -> Doubles:
-    """Mesh points in camera coordinates when the occluder is straight ahead: its x axis points to the camera."""
-    return np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
-
-
 def _fitting(points: Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
-    """Return a size and a distance close to those asked for with which the occluder is between camera and object.
+    """Return a size and a distance close to those asked for with which an occluder with points (V, 3), one object size
+    large around the origin, is between the camera and the object, whose nearest vertex is at `near`.
 
     It keeps `CLEARANCE` from the camera, and no vertex is farther from the camera than the object's nearest one. Where
     its size leaves no such place, it is made smaller.
-
-    Args:
-        points: (V, 3) of the occluder, one object size large around the origin.
-        size: asked for.
-        distance: asked for.
-        near: distance of the object's nearest vertex.
     """
     front, back = float(points[:, 0].max()), float(-points[:, 0].min())
     aside = float(np.hypot(points[:, 1], points[:, 2]).max())
@@ -429,5 +389,4 @@ def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
 
 
 def _put_away(camera: Tensor) -> Tensor:
-    """A pose (4, 4) behind the camera, very small."""
     return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])

@@ -10,18 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, WHOLE_RANGE, BoundControl, Budget, Choice, Control, Group, Parameter, Value
-from advsearch.controls.clean import Moved
 from advsearch.controls.numbers import BoundNumbers, NumberControl
 from advsearch.controls.patch_sticker import Sticker, towards_camera
 from advsearch.controls.texture import resampled
-from advsearch.controls.values import LARGEST_EPSILON, Fixed, Number, OneOf, Range, in_words, read
+from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, Range, in_words, read
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -52,9 +50,9 @@ class PatchControl(Control):
         InputError: a value is out of range.
     """
 
-    kind: ClassVar[str] = "patch"
-    summary: ClassVar[str] = "A printed square stuck onto the object: its pixels, place, size and turn."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "patch"
+    summary = "A printed square stuck onto the object: its pixels, place, size and turn."
+    parameters = (
         Parameter(
             "pixels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture underneath",
             "Display-referred colours of the patch; a narrower range is a printer's gamut.", search=(0.0, 1.0),
@@ -79,7 +77,7 @@ class PatchControl(Control):
             estimators=("adjoint", "differences"),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice("resolution", 32, "Side of the patch in pixels.", whole=(2, 512)),
         Choice(
             "norm", "box",
@@ -190,9 +188,9 @@ class PatchControl(Control):
 class _Placement(NumberControl):
     """The numbers of a patch; those not given are fixed."""
 
-    kind: ClassVar[str] = PatchControl.kind
-    summary: ClassVar[str] = "Where a patch is, how large and how turned."
-    parameters: ClassVar[tuple[Parameter, ...]] = PatchControl.parameters[1:]
+    kind = PatchControl.kind
+    summary = "Where a patch is, how large and how turned."
+    parameters = PatchControl.parameters[1:]
 
     @property
     def given(self) -> dict[str, object]:

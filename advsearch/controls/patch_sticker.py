@@ -2,11 +2,9 @@
 
     base colour = (1 - m) base colour + m linear(pixels at (a, b)),     m = soft square in (a, b), front of the surface
 
-A place is where a ray from outside towards the middle of the object meets the surface. Every texel of the object's
-base-colour map around it has a 3-D position and a normal (`advsearch.scene.raster`); its coordinates (a, b) are
-those in the tangent plane, unrolled along the direction in which the surface bends (exact for cylinders and spheres;
-Schmidt et al. 2006, "Interactive Decal Compositing with Discrete Exponential Maps", do it for any surface). Only the
-connected part of the surface that faces the same way is painted, so that nothing bleeds through a wall.
+A place is where a ray from outside towards the middle of the object meets the surface; (a, b) are those in the tangent
+plane, unrolled along the direction in which the surface bends (exact for cylinders and spheres; Schmidt et al. 2006,
+"Interactive Decal Compositing with Discrete Exponential Maps"). Only what is connected and faces that way is painted.
 """
 
 from __future__ import annotations
@@ -73,13 +71,7 @@ class Spot:
 
 
 class Sticker:
-    """Paints a patch into the object's base-colour map.
-
-    Args:
-        scene: the scene.
-        resting: the numbers at the start.
-        side: of the patch in pixels.
-    """
+    """Paints a patch of `side` pixels into the object's base-colour map; the resting numbers are those at the start."""
 
     def __init__(self, scene: SceneDescription, resting: Mapping[str, float], side: int) -> None:
         mesh = scene.object.mesh
@@ -102,13 +94,9 @@ class Sticker:
         self._spot = lru_cache(maxsize=4)(self._find_spot)
 
     def paint(self, base: Tensor | None, pixels: Tensor, numbers: Mapping[str, Tensor]) -> Tensor:
-        """Return the base colour (h, w, 3), linear, with the patch on it; differentiable except in the place.
-
-        Args:
-            base: (any, any, 3) what other controls made of it; None takes the object's own.
-            pixels: (n, n, 3) sRGB.
-            numbers: azimuth, height, size and rotation.
-        """
+        """Return the base colour (h, w, 3), linear, with the patch of pixels (n, n, 3) sRGB on it; differentiable
+        except in the place (azimuth, height, size and rotation). The base is what other controls made of it; None takes
+        the object's own."""
         device = pixels.device
         base = self._own.to(device) if base is None else _fitted(base, len(self._own))
         size = numbers["size"]
@@ -184,13 +172,8 @@ class Sticker:
 
 
 def _fine_enough(mesh: Mesh, own: int, pixel: float) -> Charts:
-    """Rasterise the charts at the side of a base-colour map whose texels are smaller than the square's pixels.
-
-    Args:
-        mesh: of the object.
-        own: side of the object's own base-colour map.
-        pixel: side of a pixel in object sizes.
-    """
+    """Rasterise the charts at the side of a base-colour map whose texels are smaller than the square's pixels, whose
+    side is `pixel` object sizes; `own` is the side of the object's own map."""
     smallest, largest = BASE_SIDES
     side = max(smallest, own)
     charts = rasterised(mesh, side)
@@ -217,11 +200,7 @@ def unrolled(offsets: Doubles, normals: Doubles, frame: Doubles) -> tuple[Double
 
     In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its arc is `R phi`, phi being the
     angle that the normal has turned. So the component along the direction of turning is stretched by `phi / sin(phi)`.
-
-    Args:
-        offsets: (N, 3) points minus the middle.
-        normals: (N, 3) unit normals there.
-        frame: (3, 3) rows right, up, normal at the middle.
+    Offsets are (N, 3) from the middle; the rows of `frame` are right, up and normal there.
     """
     plane, tilt = offsets @ frame[:2].T, normals @ frame[:2].T
     cosine = normals @ frame[2]

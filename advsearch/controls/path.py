@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -84,12 +84,12 @@ Way = str | Waypoints
 class PathControl(NumberControl):
     """The camera, the object or both travel along a path."""
 
-    kind: ClassVar[str] = "path"
-    summary: ClassVar[str] = "The camera, the object or both travel along a path; a frame is a time."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "path"
+    summary = "The camera, the object or both travel along a path; a frame is a time."
+    parameters = (
         moving(ORBIT, "time", "s", 0.0, LONGEST, "where the scene is as it is", "Time since the path began."),
     )
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "path",
             APPROACH,
@@ -246,18 +246,11 @@ def _is_path(name: str) -> bool:
 
 
 def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, Waypoints]:
-    """Read a file of waypoints.
+    """Return the way of all that travels, from a .csv file with the columns time, x, y, z, and look_x, look_y, look_z
+    or heading. It is about the `mover`; unless `alone`, one about the camera may say what the object does at the same
+    times.
 
-    Args:
-        path: a .csv file with the columns time, x, y, z, and look_x, look_y, look_z or heading.
-        mover: what they are about, "camera" or "object".
-        alone: whether a file about the camera may say what the object does at the same times.
-
-    Returns:
-        The way of all that travels.
-
-    Raises:
-        FileFormatError: it is no table of numbers with the columns that a path needs, or its times do not ascend.
+    Raises FileFormatError: it is no table of numbers with the columns that a path needs, or its times do not ascend.
     """
     further = (HEADING,) if mover == THING else (*LOOKING, *SHIFT, TURNING) if alone else LOOKING
     try:

@@ -2,11 +2,8 @@
 
     world = scale * exp([rotation]) Rz(yaw) Ry(pitch) Rx(roll) (v - middle), then put on the ground and shifted
 
-A mesh around the object is put back on the height at which it stood, and shifted from where it stood.
-
-The three angles are those of the scene's settings. `rotation` is a rotation vector on top of them (axis times angle):
-angles alone lock at a pitch of 90 degrees, where yaw and roll turn about one axis, while the vector is well conditioned
-up to half a turn (its differential has condition number 1.6 at 180 degrees, that of the angles 115 at a pitch of 89).
+A mesh around the object is put back on the height at which it stood, and shifted from there. `rotation` is a rotation
+vector (axis times angle) on top of the angles, which lock at a pitch of 90 degrees.
 """
 
 from __future__ import annotations
@@ -14,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -31,10 +27,10 @@ from advsearch.scene.settings import GEOMETRIC, POSE
 class PoseControl(NumberControl):
     """Where the object stands, how it is turned, and how large it is."""
 
-    kind: ClassVar[str] = "pose"
-    of_a_mesh: ClassVar[bool] = True
-    summary: ClassVar[str] = "Where the object stands, how it is turned, and how large it is."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "pose"
+    of_a_mesh = True
+    summary = "Where the object stands, how it is turned, and how large it is."
+    parameters = (
         *POSE[:3],
         Parameter(
             "rotation", (3,), "degrees", -180.0, 180.0, 0.0, "Rotation vector on top of the angles.",
@@ -42,7 +38,7 @@ class PoseControl(NumberControl):
         ),
         *POSE[3:],
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice("on_ground", "yes", "yes: the lowest point stays at height z however it turns; no: its middle stays."),
     )
 
@@ -70,11 +66,7 @@ class PoseControl(NumberControl):
 @lru_cache(maxsize=16)
 def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, float]:
     """Where a mesh stands before it is posed: from its own coordinates (4, 4), its vertices (V, 3) there, their floor.
-
-    Args:
-        mesh: as the settings have it.
-        placed: as it came, of a mesh around the object; the object's own coordinates are those of the scene.
-    """
+    `placed` is a mesh around the object as it came; the object's own coordinates are those of the scene."""
     if placed is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
     places = standing(placed)

@@ -1,4 +1,4 @@
-"""The `sensor` control: what a camera's sensor and its processing do to a picture.
+"""The `sensor` control: what a camera's sensor and its processing do to the finished picture.
 
     vignetting light / (1 + a r^2)^2,    r from the middle of the picture, 1 in its corners: cos^4 of the angle there
     light      the red and blue picture are a little larger or smaller than the green one (lateral aberration)
@@ -7,22 +7,16 @@
     balance    red and blue times 2^red, 2^blue
     file       the tone curve, then JPEG
 
-The noise is the usual model of a raw image, Gaussian with a variance that is affine in the light (Foi, Trimeche,
-Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise modeling and fitting for single-image raw-data,
-section II). The pattern is Bayer's (1976, US patent 3971065); interpolation is bilinear. Chromatic aberration as a
-difference of magnification: Kang 2007, Automatic removal of chromatic aberration from a single image, section 2.
-Vignetting is that of light from off the axis: Kang and Weiss 2000, Can we calibrate a camera using an image of a flat,
-textureless Lambertian surface, section 2, with as much of it as is asked for.
-
-It happens to the finished picture, and nothing is rendered anew. Searched by default is what cameras do at their worst:
-noise of a tenth of white, a white balance half a stop off, a file of quality 40.
+Noise: Foi, Trimeche, Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise modeling and fitting for
+single-image raw-data, section II. Pattern: Bayer 1976, US patent 3971065. Aberration: Kang 2007, Automatic removal of
+chromatic aberration from a single image, section 2. Vignetting: Kang and Weiss 2000, Can we calibrate a camera using an
+image of a flat, textureless Lambertian surface, section 2.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -56,9 +50,9 @@ def _number(name: str, unit: str, low: float, high: float, description: str, **m
 class SensorControl(NumberControl):
     """Noise, mosaic, white balance, chromatic aberration and compression of a camera."""
 
-    kind: ClassVar[str] = "sensor"
-    summary: ClassVar[str] = "What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "sensor"
+    summary = "What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."
+    parameters = (
         _number(
             "vignetting", "1", 0.0, 0.95, "Share of the light that is missing in the corners.", search=None,
         ),
@@ -81,9 +75,7 @@ class SensorControl(NumberControl):
             search=(0.0, 60.0), estimators=(),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),
-    )
+    choices = (Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),)
 
     def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
         return through_sensor(image, values, int(self.chosen["seed"]))  # type: ignore[call-overload]

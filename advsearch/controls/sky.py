@@ -1,21 +1,13 @@
 """The `sky` control: a clear sky with a sun instead of the environment; where the sun stands and how hazy the air is.
 
-The map is a differentiable function in torch. The sky dome is Hosek and Wilkie's (2012, An Analytic Model for Full
-Spectral Sky-Dome Radiance, equation 8), the sun theirs of 2013 (Adding a Solar Radiance Function to the Hosek Skylight
-Model), with the RGB coefficients that Mitsuba ships for its `sunsky` plugin. The plugin itself is not used: Mitsuba's
-samples of an emitter do not carry derivatives, so a moving sun has a wrong one, while a map under `environment.data`
-has a right one and does all that other environments do. What differs from the plugin: the sun is wider (`SUN_RADIUS`)
-with the same irradiance, so that a map can hold it; negative radiance is cut off; and below the horizon there is an
-infinite diffuse ground, not blackness.
-
-The same sun is hundreds of times darker at the horizon than at noon, so exposure matters. By default every
-configuration is metered, as an automatic camera would: the sky is scaled so that a surface facing the sun receives the
-same irradiance `M` always,
+The map is a differentiable function in torch: the dome of Hosek and Wilkie (2012, An Analytic Model for Full Spectral
+Sky-Dome Radiance, equation 8), their sun of 2013 (Adding a Solar Radiance Function to the Hosek Skylight Model), with
+the coefficients of Mitsuba's `sunsky` plugin. Unlike there, the sun is wider (`SUN_RADIUS`), so that a map can hold it,
+negative radiance is cut off, below is a diffuse ground, and a moving sun has a derivative. By default each is metered,
 
     radiance = map(azimuth, elevation, turbidity) M / m(azimuth, elevation, turbidity),
 
-with m the map's irradiance towards the sun. With `exposure: fixed` the divisor is that of the start, and a low sun is a
-dark picture.
+with m the map's irradiance towards the sun. With `exposure: fixed` the divisor is that of the start.
 """
 
 from __future__ import annotations
@@ -24,7 +16,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache, lru_cache
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -98,11 +89,7 @@ def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
 
 
 class Sky:
-    """Sky maps over one ground.
-
-    Args:
-        ground: (3,) linear reflectance of the ground, in [0, 1]; its device is the maps'.
-    """
+    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1]; its device is the maps'."""
 
     def __init__(self, ground: Tensor) -> None:
         self.ground = ground
@@ -116,13 +103,8 @@ class Sky:
         self.solid_angles = torch.cos(torch.deg2rad(rows))[..., None] * texel
 
     def dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
-        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon without the sun's disk.
-
-        Args:
-            sun: (3,) unit vector towards it.
-            elevation: () of the sun, degrees, over 0.
-            turbidity: () in `TURBIDITIES`.
-        """
+        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon without the sun's disk. The sun is a
+        unit vector (3,) towards it, its elevation () in degrees, over 0, and the turbidity () in `TURBIDITIES`."""
         a, b, c, d, e, f, g, i, h = self._interpolated(tables(sun.device)[0], elevation, turbidity).unbind(-1)
         level = self._interpolated(tables(sun.device)[1], elevation, turbidity)
         cosine = (self.directions @ sun)[..., None]
@@ -151,16 +133,8 @@ class Sky:
         return bump / (bump * self.solid_angles).sum().clamp_min(NEARLY_NOTHING)
 
     def __call__(self, azimuth: Tensor, elevation: Tensor, turbidity: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the map (ROWS, COLUMNS, 3) of linear radiance and its metered irradiance ().
-
-        Args:
-            azimuth: () of the sun, degrees.
-            elevation: () of the sun, degrees, over 0 and at most 90.
-            turbidity: () in `TURBIDITIES`.
-
-        Returns:
-            The map, and the mean channel of the irradiance on a surface that faces the sun.
-        """
+        """Return the map (ROWS, COLUMNS, 3) of linear radiance, and the mean channel () of the irradiance on a surface
+        that faces the sun, which stands at an azimuth () and an elevation (), over 0 and at most 90 degrees."""
         sun = direction(azimuth, elevation)
         upper = self.dome(sun, elevation, turbidity) + self.disk(sun) * sun_irradiance(elevation, turbidity)
         arriving = upper * self.solid_angles
@@ -184,9 +158,9 @@ METERED_IRRADIANCE = 0.9 * math.pi / 0.8
 class SkyControl(NumberControl):
     """A sun and a clear sky in place of the environment."""
 
-    kind: ClassVar[str] = "sky"
-    summary: ClassVar[str] = "A clear sky instead of the environment: where the sun stands, and how hazy the air is."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "sky"
+    summary = "A clear sky instead of the environment: where the sun stands, and how hazy the air is."
+    parameters = (
         Parameter(
             "azimuth", (), "degrees", -3600.0, 3600.0, 90.0, "Direction of the sun about the vertical; 0 is +x.",
             periodic=True, search=(0.0, 360.0), estimators=("differences",),
@@ -201,7 +175,7 @@ class SkyControl(NumberControl):
             estimators=("adjoint", "differences"),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "exposure", "metered", "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
             options=("metered", "fixed"),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Group, Value
-from advsearch.controls.clean import Moved
+from advsearch.controls.values import Moved
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
 
@@ -143,14 +143,8 @@ class Space:
         return {f"{name}.{one}": value for name, numbers in each for one, value in numbers.items()}
 
     def holding(self, u: Tensor) -> Space:
-        """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
-
-        Args:
-            u: (d,) of as many whole controls.
-
-        Raises:
-            InputError: no number of controls has so many coordinates.
-        """
+        """Return the space whose first controls stay where u, (d,) of as many whole controls, has them, so that the
+        others vary. Raises InputError where no number of controls has so many coordinates."""
         sizes = self.sizes
         count = next((k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)), None)
         if count is None:
@@ -161,11 +155,8 @@ class Space:
         return replace(self, controls=(*held, *self.controls[count:]), environment=lit_by)
 
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
-        """Return what lights a configuration in the place of the scene's environment; None if nothing does.
-
-        Args:
-            values: the configuration as it is described.
-        """
+        """Return what lights a described configuration in the place of the scene's environment; None if nothing
+        does."""
         for group in self.groups:
             if group.setting == ENVIRONMENT:
                 chosen = str(values[group.name]["value"])

@@ -4,27 +4,18 @@
     palette    u = k colours in a ball around those of the original;   texel = original + sum_i w_i(texel) (u_i - c_i)
     waves      u = (a + 1) / 2 per wave and channel;   texel = original + r tanh(sum_mn s_mn a_mn cos_m(x) cos_n(y))
 
-and reflectance = linear(texel). Values are display-referred because that is what a person sees and a printer prints: a
-step of 0.1 is as visible in a dark texel as in a bright one. The threat model of a bounded change of texture is
-REVAMP's and Athalye et al.'s (2018, arXiv 1707.07397, section 3); here the ball is around the texture, not around the
-picture.
-
-The L2 radius is the plain Euclidean norm over all texel values. A search over many texels moves each by little: a
-radius of `r * sqrt(3 h w)` lets the root-mean-square change reach r.
-
-The palette follows Chang et al. (2015, "Palette-based Photo Recoloring", sections 3.2 and 3.4): k-means colours, and
-weights that fall off with the distance of a texel's colour from each, so that shades inside a surface survive. Ours are
-in sRGB instead of CIELAB, and normalised, so that no texel moves further than the palette does. The waves are the
-low-frequency search of Guo et al. (2019, arXiv 1809.08758, section 3) carried over from pictures to textures.
+and reflectance = linear(texel). A bounded change of texture is REVAMP's and Athalye et al.'s (2018, arXiv 1707.07397,
+section 3). L2 is the plain Euclidean norm over all texel values: `r * sqrt(3 h w)` lets their root-mean-square reach r.
+The palette follows Chang et al. (2015, "Palette-based Photo Recoloring", sections 3.2 and 3.4), in sRGB and normalised;
+the waves are the low-frequency search of Guo et al. (2019, arXiv 1809.08758, section 3).
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -88,10 +79,10 @@ class TextureControl(Control):
     amplitudes: object = None
     name: str = "texture"
 
-    kind: ClassVar[str] = "texture"
-    of_a_mesh: ClassVar[bool] = True
-    summary: ClassVar[str] = "The base-colour map of the object or another mesh, inside a ball around the original."
-    parameters: ClassVar[tuple[Parameter, ...]] = (
+    kind = "texture"
+    of_a_mesh = True
+    summary = "The base-colour map of the object or another mesh, inside a ball around the original."
+    parameters = (
         Parameter(
             "texels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture", "Display-referred texel values.",
             search=(0.0, 1.0), estimators=("adjoint",),
@@ -106,7 +97,7 @@ class TextureControl(Control):
             "Strength of each wave in each colour channel (form waves).", search=(-1.0, 1.0), estimators=("adjoint",),
         ),
     )  # fmt: skip
-    choices: ClassVar[tuple[Choice, ...]] = (
+    choices = (
         Choice(
             "epsilon", DEFAULT_EPSILON, "Radius of the ball around the original texture, display-referred.", "epsilon",
             most=LARGEST_EPSILON,
@@ -196,11 +187,11 @@ class TextureControl(Control):
         if self.form == "palette":
             area = np.where(mask.numpy(), texel_area(mesh, shape), 0.0).astype(np.float32)
             centres = palette(original, area if area.any() else mask.numpy().astype(np.float32), int(self.colors))
-            return Recoloured(texels, centres, Budget(self.norm, self._radius(centres.numel())))
+            return recoloured(texels, centres, Budget(self.norm, self._radius(centres.numel())))
         if self.form == "waves":
             flat = self._radius(texels.numel()) / (math.sqrt(texels.numel()) if self.norm == "l2" else 1.0)
-            return Waved(texels, mask, int(self.waves), flat)
-        return Repainted(texels, Budget(self.norm, self._radius(texels.numel())))
+            return waved(texels, mask, int(self.waves), flat)
+        return repainted(texels, Budget(self.norm, self._radius(texels.numel())))
 
     def _radius(self, count: int) -> float:
         """Radius of the ball over `count` numbers."""
@@ -209,56 +200,45 @@ class TextureControl(Control):
         return DEFAULT_EPSILON * (math.sqrt(count) if self.norm == "l2" else 1.0)
 
 
-class Painter(ABC):
+class Painter(NamedTuple):
     """One form of the control: a map from its slice of u to the n texels that it paints, row by row.
 
     Attributes:
         start: (d,) float32, the slice that gives the original.
         group: the slice as a group.
+        texels: maps (d,) in [0, 1] to (n, 3) display-referred sRGB in [0, 1]; differentiable.
     """
 
     start: Tensor
     group: Group
-
-    @abstractmethod
-    def texels(self, u: Tensor) -> Tensor:
-        """Map (d,) in [0, 1] to (n, 3) display-referred sRGB in [0, 1]; differentiable."""
+    texels: Callable[[Tensor], Tensor]
 
 
-class Repainted(Painter):
-    """Each texel value on its own."""
-
-    def __init__(self, original: Tensor, budget: Budget) -> None:
-        self.start = original.reshape(-1)
-        self.group = Group("texels", original.numel(), ("adjoint",), budget)
-
-    def texels(self, u: Tensor) -> Tensor:
-        return u.reshape(-1, 3)
+def repainted(original: Tensor, budget: Budget) -> Painter:
+    """Return what paints each texel value on its own."""
+    group = Group("texels", original.numel(), ("adjoint",), budget)
+    return Painter(original.reshape(-1), group, lambda u: u.reshape(-1, 3))
 
 
-class Recoloured(Painter):
-    """A few colours, from which each texel takes its change by how much it resembles them.
+def recoloured(original: Tensor, centres: Tensor, budget: Budget) -> Painter:
+    """Return a few colours, from which each texel of the original (n, 3) sRGB takes its change by how much it resembles
+    them: within a ball around the original's palette, the centres (k, 3)."""
+    squared = (original[..., None, :] - centres).square().sum(dim=-1)
+    spread = 1.0  # over which a colour's influence falls off: half the mean distance to the nearest other one
+    if len(centres) > 1:
+        apart = torch.cdist(centres, centres) + torch.diag(torch.full((len(centres),), 10.0))
+        spread = max(0.5 * float(apart.min(dim=1).values.mean()), 1e-3)
+    weights = torch.softmax(-squared / (2.0 * spread**2), dim=-1)
 
-    Args:
-        original: (n, 3) sRGB.
-        centres: (k, 3) sRGB, the palette of the original.
-        budget: ball around the palette.
-    """
+    def texels(u: Tensor) -> Tensor:
+        change = weights.to(u.device) @ (u.reshape(-1, 3) - centres.to(u.device))
+        return (original.to(u.device) + change).clamp(0.0, 1.0)
 
-    def __init__(self, original: Tensor, centres: Tensor, budget: Budget) -> None:
-        self._original, self._centres = original, centres
-        squared = (original[..., None, :] - centres).square().sum(dim=-1)
-        self._weights = torch.softmax(-squared / (2.0 * _spread(centres) ** 2), dim=-1)
-        self.start = centres.reshape(-1)
-        self.group = Group("palette", centres.numel(), ("adjoint", "differences"), budget)
-
-    def texels(self, u: Tensor) -> Tensor:
-        original, weights, centres = (held.to(u.device) for held in (self._original, self._weights, self._centres))
-        return (original + weights @ (u.reshape(-1, 3) - centres)).clamp(0.0, 1.0)
+    return Painter(centres.reshape(-1), Group("palette", centres.numel(), ("adjoint", "differences"), budget), texels)
 
 
-class Waved(Painter):
-    """Cosine waves along both sides of the texture, added up and held inside a radius by a tanh.
+def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter:
+    """Return cosine waves along both sides of the texture, added up and held inside a radius by a tanh.
 
     Args:
         original: (n, 3) sRGB.
@@ -267,37 +247,23 @@ class Waved(Painter):
             end of its range gives falls as 1 / (1 + the wave's frequency).
         radius: largest change of a texel value.
     """
+    number = torch.arange(count)
+    down, across = (torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * number / side) for side in where.shape)
+    reach = (WAVE_REACH / (1.0 + torch.hypot(number[:, None].float(), number[None, :].float())))[..., None]
 
-    def __init__(self, original: Tensor, where: Tensor, count: int, radius: float) -> None:
-        height, width = where.shape
-        self._original, self._where, self._count, self._radius = original, where, count, radius
-        number = torch.arange(count)
-        self._down = torch.cos(math.pi * (torch.arange(height) + 0.5)[:, None] * number / height)
-        self._across = torch.cos(math.pi * (torch.arange(width) + 0.5)[:, None] * number / width)
-        self._reach = (WAVE_REACH / (1.0 + torch.hypot(number[:, None].float(), number[None, :].float())))[..., None]
-        self.start = torch.full((count * count * 3,), 0.5)
-        self.group = Group("amplitudes", len(self.start), ("adjoint",))
+    def texels(u: Tensor) -> Tensor:
+        amplitudes = (2.0 * u - 1.0).reshape(count, count, 3) * reach.to(u.device)
+        summed = torch.einsum("hm,wn,mnc->hwc", down.to(u.device), across.to(u.device), amplitudes)[where.to(u.device)]
+        return (original.to(u.device) + radius * torch.tanh(summed)).clamp(0.0, 1.0)
 
-    def texels(self, u: Tensor) -> Tensor:
-        original, where, reach, down, across = (
-            held.to(u.device) for held in (self._original, self._where, self._reach, self._down, self._across)
-        )
-        amplitudes = (2.0 * u - 1.0).reshape(self._count, self._count, 3) * reach
-        summed = torch.einsum("hm,wn,mnc->hwc", down, across, amplitudes)[where]
-        return (original + self._radius * torch.tanh(summed)).clamp(0.0, 1.0)
+    start = torch.full((count * count * 3,), 0.5)
+    return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
 
 
 class BoundTexture(BoundControl):
-    """The base-colour map of one mesh.
-
-    Args:
-        name: the instance's name.
-        on: name of the mesh.
-        original: (h, w, 3) float32 display-referred sRGB in [0, 1].
-        painter: maps u to the texels that are painted.
-        where: (h, w) bool, which these are; None for all.
-        materials: whose they are, in words.
-    """
+    """The base-colour map of one mesh: the original (h, w, 3) float32 display-referred sRGB in [0, 1], of which a
+    painter paints the texels where `where` (h, w) says, or all. `on` is the mesh, and `materials` says whose they
+    are."""
 
     def __init__(
         self, name: str, on: str, original: Tensor, painter: Painter, where: Bools | None = None, materials: str = ""
@@ -380,11 +346,3 @@ def palette(image: Tensor, weight: Floats, count: int) -> Tensor:
         centres = np.where(share[:, None] > 0.0, means / np.maximum(share[:, None], 1e-12), centres)
     order = np.argsort(-share, kind="stable")
     return torch.from_numpy(centres[order].clip(0.0, 1.0).astype(np.float32))
-
-
-def _spread(centres: Tensor) -> float:
-    """Distance over which a palette colour's influence falls off: half the mean distance to the nearest other one."""
-    if len(centres) < 2:
-        return 1.0
-    apart = torch.cdist(centres, centres) + torch.diag(torch.full((len(centres),), 10.0))
-    return max(0.5 * float(apart.min(dim=1).values.mean()), 1e-3)

@@ -1,24 +1,27 @@
-"""What a parameter was set to: fixed, a range to search, or a list of values to choose from.
+"""What a parameter was set to: fixed, a range to search, or a list of values to choose from (docs/controls/README.md).
 
     pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
 
-The same form in Python, YAML and on the command line (docs/controls/README.md). Two numbers in a list are a range;
-three or more, or names, are a choice.
+Two numbers in a list are a range; three or more, or names, are a choice. Where a control leaves out a value of the
+clean scene that was asked for, the two contradict each other, and that is refused. Where it leaves out only a default,
+the clean scene has the nearest value that the control allows, and that is said: a `Moved`.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TypeGuard
 
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.settings import Parameter
+from advsearch.scene.description import ENVIRONMENT, SceneDescription, check_one_environment
+from advsearch.scene.settings import SETTINGS, Parameter
 
 Number = float | str
 
@@ -97,14 +100,8 @@ def _choices(where: str, values: Sequence[Number]) -> OneOf:
     """The values, of which none may come twice: it would be drawn twice as often."""
     twice = [value for value, count in Counter(values).items() if count > 1]
     if twice:
-        raise InputError(f"{where}: expected different choices, got {_shown(twice[0])} twice; leave one of them out")
+        raise InputError(f"{where}: expected different choices, got {shown(twice[0])} twice; leave one of them out")
     return OneOf(tuple(values))
-
-
-def _shown(value: Number) -> str:
-    if isinstance(value, int) and not is_number(value):
-        return f"a whole number of {value.bit_length()} bits"
-    return value if isinstance(value, str) else f"{value:g}"
 
 
 def _is_list(given: object) -> bool:
@@ -112,7 +109,6 @@ def _is_list(given: object) -> bool:
 
 
 def _value(where: str, parameter: Parameter, given: object) -> Number:
-    """Check one value."""
     if parameter.options:
         if not isinstance(given, str):
             raise InputError(f"{where}: expected one of {', '.join(parameter.options)}, got {given!r}")
@@ -126,7 +122,7 @@ def _value(where: str, parameter: Parameter, given: object) -> Number:
     if not (is_number(given) and parameter.low <= given <= parameter.high):
         raise InputError(
             f"{where}: expected a number from {parameter.low:g} to {parameter.high:g} ({parameter.unit}), "
-            f"got {_shown(given)}"
+            f"got {shown(given)}"
         )
     return float(given)
 
@@ -146,7 +142,7 @@ def in_words(spec: Spec) -> str:
     if isinstance(spec, Range):
         return f"from {spec.low:g} to {spec.high:g}"
     values = (spec.value,) if isinstance(spec, Fixed) else spec.values
-    written = ", ".join(value if isinstance(value, str) else f"{value:g}" for value in values)
+    written = ", ".join(map(shown, values))
     return written if isinstance(spec, Fixed) else f"one of {written}"
 
 
@@ -170,3 +166,103 @@ def to_unit(spec: Range, log: bool, value: float) -> float:
 def option_index(count: int, u: Tensor) -> int:
     """Return which of `count` options a coordinate chooses: equal shares of [0, 1]."""
     return min(count - 1, max(0, int(float(u.detach()) * count)))
+
+
+TURN = 360.0
+CLOSE = 1e-6
+"""Relative difference up to which two values are the same."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A value of the clean scene that a control leaves out, although nobody asked for it: that of a parameter
+    (``pose.yaw``, ``ground.size``, ``environment``), in a unit ("name" of names), as the scene described it, and the
+    one that is used instead."""
+
+    control: str
+    parameter: str
+    unit: str
+    scene: Number
+    used: Number
+
+
+def sentences(moved: Sequence[Moved]) -> list[str]:
+    """Return what is said of the values that had to move: one sentence a control."""
+    found = []
+    for control, several in groupby(moved, key=lambda one: one.control):
+        values = " and ".join(map(_instead, several))
+        found.append(f"The clean scene has {values}, which the control {control} leaves out.")
+    return found
+
+
+def check_prepared(control: str, before: SceneDescription, after: SceneDescription) -> Iterator[Moved]:
+    """Yield what a control has replaced in a scene by what it needs there, and nobody has described. Raises InputError
+    where it was asked for."""
+    if after.environment is not None and after.environment is not before.environment:
+        check_one_environment(after.parts, f"`controls` {control}")
+        if ENVIRONMENT in before.given:
+            raise InputError(
+                f"`environment={before.environment_spec}` and `controls` {control} contradict each other: the control "
+                f"puts {after.environment.name} in its place; leave one of the two out"
+            )
+        if after.environment_spec == before.environment_spec:
+            yield Moved(control, ENVIRONMENT, "name", before.environment_spec, after.environment.name)
+    for name, value in after.values.items():
+        scene = before.values[name]
+        if value is None or scene is None or same(value, scene):
+            continue
+        if name in before.given:
+            raise InputError(
+                f"`set` {name}={shown(scene)} and `controls` {control} contradict each other: the control makes it "
+                f"{shown(value)}; change one of the two, or leave one out"
+            )
+        yield Moved(control, name, SETTINGS[name].unit, scene, value)
+
+
+def check_start(
+    control: str, parameter: str, allowed: str, setting: str, scene: SceneDescription, wanted: Number
+) -> None:
+    """Raise InputError where a value `wanted` of a control's parameter, which is outside what is `allowed` (in words)
+    and so cannot be that of the clean scene, was asked for in the scene's `setting` that says the same."""
+    if setting not in scene.given:
+        return
+    asked = f"`environment={scene.environment_spec}`"
+    if setting != ENVIRONMENT:
+        asked = f"`set` {setting}={shown(scene.number(setting))}"
+    raise InputError(
+        f"{asked} and `controls` {control} contradict each other: {control}.{parameter} is {allowed}, which leaves "
+        f"{shown(wanted)} out; change one of the two, or leave one out"
+    )
+
+
+def same(one: Number, other: Number, *, turns: bool = False) -> bool:
+    """Whether two values are the same, up to a rounding error and, of an angle that turns, up to whole turns."""
+    if isinstance(one, str) or isinstance(other, str):
+        return one == other
+    return apart(one, other, turns=turns) <= CLOSE * max(1.0, abs(one), abs(other))
+
+
+def apart(one: float, other: float, *, turns: bool = False) -> float:
+    """How far two numbers are from each other; angles that turn, the nearer way around."""
+    return abs(math.remainder(one - other, TURN) if turns else one - other)
+
+
+def nearest(value: float, low: float, high: float, *, turns: bool = False) -> float:
+    """Return the value in a range that is nearest to one, of an angle that turns the nearest way around."""
+    if turns:
+        value = low + (value - low) % TURN
+        if value > high and value - high > low + TURN - value:
+            value = low
+    return min(max(value, low), high)
+
+
+def shown(value: Number) -> str:
+    """A value as it is written."""
+    if isinstance(value, int) and not is_number(value):
+        return f"a whole number of {value.bit_length()} bits"
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _instead(one: Moved) -> str:
+    unit = "" if one.unit in ("1", "name") or isinstance(one.used, str) else f" {one.unit}"
+    return f"{one.parameter} {shown(one.used)}{unit} instead of {shown(one.scene)}"

@@ -25,7 +25,7 @@ from advsearch.config.attack import OVER_NUMBERS, OVER_ONE, OVER_PREDICTED, OVER
 from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
-from advsearch.controls.clean import sentences
+from advsearch.controls.values import sentences
 from advsearch.engine.judging import Described, Looked, Metrics, check_truth, facts_of, load_metrics, shown
 from advsearch.engine.loading import SCENE, Controls, Scene, framed, lent, make_renderer
 from advsearch.engine.naming import AnyModel, check_run_settings, given_to, load_models, scene_of, several
@@ -34,7 +34,6 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.models.ensemble import together
 from advsearch.options import as_setting
 from advsearch.progress import Progress
 from advsearch.runs.directory import CONFIG
@@ -43,7 +42,7 @@ from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Together, together
 
 LOADING = "loading the scene and the model"
 """What a person who waits is told first."""

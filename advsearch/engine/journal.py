@@ -29,11 +29,11 @@ from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model
-from advsearch.models.ensemble import Ensemble
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
 from advsearch.tasks import Answer, Judgement
+from advsearch.tasks.together import Ensemble
 
 Sent: TypeAlias = tuple[str, Prepared | None, Query]
 """The name of the problem, what it has been prepared with, and what is asked."""

@@ -18,13 +18,12 @@ from advsearch.controls.values import is_number
 from advsearch.engine.loading import CONTROL, MODEL, Controls, Scene, as_controls, controls_by_name, lent, load_scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
-from advsearch.models.ensemble import together
 from advsearch.models.guards import plainly
 from advsearch.models.loading import named_code
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
 from advsearch.tasks import Task
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Together, together
 
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:

@@ -19,12 +19,11 @@ from advsearch.controls import Space
 from advsearch.controls.base import BoundControl
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
-from advsearch.models.ensemble import Ensemble, Outputs, of_each
 from advsearch.models.features import features_of
 from advsearch.runs.results.attack import PrintTerms
 from advsearch.scene.renderer import Renderer
 from advsearch.tasks import Task
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Ensemble, Outputs, Together, of_each
 
 
 def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **more: Any) -> Domain:

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.config import SceneConfig
-from advsearch.config.rendering import PICTURE_SPP, PICTURES
+from advsearch.config.scene import PICTURE_SPP, PICTURES
 from advsearch.controls import Space, compose
-from advsearch.controls.clean import sentences
+from advsearch.controls.values import sentences
 from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError

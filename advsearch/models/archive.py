@@ -1,11 +1,13 @@
-"""The zip archive of a model file, checked before anything that could run or swell is made of it.
+"""Archives of model files, checked before torch, which trusts them, makes anything of them that could run or swell.
 
-torch's own readers trust an archive. So it is opened here first: its members have distinct, plain names in one folder,
-are not encrypted, and unpack to no more than a limit; a member is unpacked to no more than its stated size.
+Members have distinct, plain names in one folder, are not encrypted, and unpack to no more than a limit. TorchScript is
+rewritten: torch runs a part of its code (`__setstate__`) while it loads, which can call operators that touch files.
 """
 
 from __future__ import annotations
 
+import io
+import pickle
 import re
 import zipfile
 import zlib
@@ -13,6 +15,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import torch
 
 from advsearch import files
 from advsearch.errors import FileFormatError
@@ -36,13 +40,8 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 @dataclass(frozen=True, eq=False)
 class Archive:
-    """An open archive that has passed the checks. Made by `open_archive`.
-
-    Args:
-        path: of the file, for messages.
-        zip: the open zip file.
-        members: each member by its name without the root folder.
-    """
+    """An open archive that has passed the checks, with its members by name without the root folder. Made by
+    `open_archive`."""
 
     path: Path
     zip: zipfile.ZipFile
@@ -52,11 +51,8 @@ class Archive:
         return name in self.members
 
     def read(self, name: str, limit: int = LARGEST) -> bytes:
-        """Return the content of a member.
-
-        Raises:
-            FileFormatError: there is none of that name, it is larger than `limit`, or it is damaged.
-        """
+        """Return the content of a member. Raises FileFormatError where there is none of that name, it is larger than
+        `limit`, or it is damaged."""
         if name not in self.members:
             raise refused(self.path, f"has no {name!r}, so it is not complete")
         size = self.members[name].file_size
@@ -76,16 +72,8 @@ class Archive:
 
 
 def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
-    """Return the archive in an open file of `size` bytes.
-
-    Args:
-        path: for messages.
-        file: the archive; it stays open as long as the answer is used.
-        size: bytes of the file.
-
-    Raises:
-        FileFormatError: it is damaged, unpacks to too much, or has members that torch's archives never have.
-    """
+    """Return the archive in an open file of `size` bytes, which stays open as long as that is used. Raises
+    FileFormatError: it is damaged, unpacks to too much, or has members that torch's archives never have."""
     try:
         archive = zipfile.ZipFile(file)
         entries = archive.infolist()
@@ -124,3 +112,189 @@ def _check_size(path: Path, entries: list[zipfile.ZipInfo], size: int) -> None:
     if unpacked > files.scaled(LARGEST_RATIO) * size + SLACK:
         limit = f"a model that unpacks to at most {files.scaled(LARGEST_RATIO)} times its size"
         raise files.too_large(path, limit, f"{size:,} bytes that unpack to {unpacked:,}")
+
+
+LARGEST_PICKLE = 8 << 20
+"""Most bytes of a pickle that describes the modules."""
+
+LARGEST_CODE = 16 << 20
+"""Most bytes of source code, all files together."""
+
+DEPTH = 200
+"""Deepest nesting of modules and values."""
+
+PICKLES = {"data.pkl": "data", "constants.pkl": "constants"}
+"""The pickles that torch reads, and the folder of their tensors."""
+
+_HARMFUL = re.compile(
+    r"\b(save|load|from_file|load_tensor|read_file|write_file|set_data|print|debugprims|symm_mem|inductor|profiler"
+    r"|c10d|_c10d_functional|dist_c10d|dist_rpc|static_runtime|_TorchScriptTesting)\b"
+)
+"""Operators that touch files, the terminal or other processes, and families of such; as whole words anywhere."""
+
+_ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{1,2}|u|U|N|[0-7]{1,3})")
+_CLASS = re.compile(r"torch\s*\.\s*classes\s*\.\s*(\w*)")
+_CLASSES = frozenset(["quantized", "rnn", "mkldnn", "sparse"])
+_WHITE = frozenset((9, 10, 13))
+
+_ITEM_BYTES = {
+    **dict.fromkeys(("ByteStorage", "CharStorage", "BoolStorage", "QInt8Storage", "QUInt8Storage"), 1),
+    **dict.fromkeys(("HalfStorage", "BFloat16Storage", "ShortStorage"), 2),
+    **dict.fromkeys(("FloatStorage", "IntStorage", "QInt32Storage"), 4),
+    **dict.fromkeys(("DoubleStorage", "LongStorage", "ComplexFloatStorage"), 8),
+    "ComplexDoubleStorage": 16,
+}
+
+
+def rewritten_torchscript(archive: Archive) -> io.BytesIO:
+    """Return an archive for `torch.jit.load` that holds the code, the pickles and the tensors of this one. Raises
+    FileFormatError where its code calls what a network has no use for, or its pickles state what is not there."""
+    code = {name: archive.read(name, LARGEST_CODE) for name in archive.members if _is_code(name)}
+    _check_code(archive, code)
+    for name in PICKLES:
+        _check_pickle(archive, name)
+    tensors = [name for name in archive.members if name.partition("/")[0] in PICKLES.values()]
+    buffer = io.BytesIO()
+    writer = torch._C.PyTorchFileWriter(buffer)
+    writer.set_min_version(_version(archive))
+    for name, content in code.items():
+        writer.write_record(name, content, len(content))
+    for name in (*PICKLES, *tensors):
+        content = archive.read(name)
+        writer.write_record(name, content, len(content))
+    writer.write_end_of_file()
+    buffer.seek(0)
+    return buffer
+
+
+def runs_while_loading(archive: Archive) -> bool:
+    """Whether torch runs a part of the code while it loads the archive, which has been checked."""
+    return any(b"__setstate__" in archive.read(name, LARGEST_CODE) for name in archive.members if _is_code(name))
+
+
+def _is_code(name: str) -> bool:
+    return name.startswith("code/") and name.endswith(".py")
+
+
+def _version(archive: Archive) -> int:
+    name = "version" if "version" in archive else ".data/version"
+    text = archive.read(name, 100).decode("ascii", "replace").strip()
+    if not re.fullmatch("[0-9]{1,3}", text):
+        raise refused(archive.path, f"expected a version number in {name!r}, got {text[:20]!r}")
+    return int(text)
+
+
+def _check_code(archive: Archive, code: dict[str, bytes]) -> None:
+    if sum(map(len, code.values())) > LARGEST_CODE:
+        raise refused(archive.path, f"has more than {LARGEST_CODE:,} bytes of source code")
+    for name, content in code.items():
+        if wrong := _code_problem(content):
+            raise refused(archive.path, f"{name!r} {wrong}, which no plain network does")
+
+
+def _code_problem(content: bytes) -> str:
+    """Return what source code does that a network has no use for, or nothing."""
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        return "is not text"
+    if found := _HARMFUL.search(text):
+        return f"uses {found[0]!r}"
+    if any(family not in _CLASSES for family in _CLASS.findall(text)):
+        return "uses native classes other than those of quantized networks"
+    if any(ord(sign) < 32 and ord(sign) not in _WHITE for sign in text) or any(map(_hides, _ESCAPE.findall(text))):
+        return "has text with hidden characters"
+    return ""
+
+
+def _hides(escape: str) -> bool:
+    """Whether an escape in a text stands for something that torch writes plainly, or that steers a terminal."""
+    if not escape.isdigit():
+        return True
+    value = int(escape, 8)
+    return value < 128 and value not in _WHITE
+
+
+class _Inert:
+    """Stands for whatever a pickle makes. Does nothing."""
+
+    name = ""
+    parts: list[Any]
+
+    def __new__(cls, *parts: Any) -> _Inert:
+        """Make one as `__reduce__` or as ``cls.__new__`` would; there is no `__init__`."""
+        made = super().__new__(cls)
+        made.parts = list(parts)
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        self.parts.append(state)
+
+
+class _Unpickler(pickle._Unpickler):
+    """Reads a pickle without making anything that it names: every class and every function is an `_Inert`.
+
+    It is Python's own slow reader, since the fast one makes room for any number that a pickle gives its memory.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(io.BytesIO(data))
+        self.storages: list[Any] = []
+        self.names: set[str] = set()
+
+    def find_class(self, module: str, name: str) -> Any:
+        self.names.add(f"{module}.{name}")
+        return type("_Named", (_Inert,), {"name": name})
+
+    def persistent_load(self, pid: Any) -> Any:
+        self.storages.append(pid)
+        return _Inert()
+
+
+def _check_pickle(archive: Archive, name: str) -> None:
+    """Check that a pickle is no deeper than a network, and that the tensors that it names are as large as it says."""
+    reader = _Unpickler(archive.read(name, LARGEST_PICKLE))
+    try:
+        value = reader.load()
+    except Exception as error:  # a damaged pickle raises nearly anything
+        raise refused(archive.path, f"{name!r} is damaged ({first_line(error)})") from None
+    if any(family not in _CLASSES for text in reader.names for family in _CLASS.findall(text)):
+        raise refused(archive.path, f"{name!r} holds native objects, which are never loaded")
+    _check_values(archive, name, value)
+    for storage in reader.storages:
+        _check_storage(archive, PICKLES[name], storage)
+
+
+def _check_values(archive: Archive, name: str, value: Any) -> None:
+    level, seen = [value], {id(value)}
+    for _ in range(DEPTH):
+        if any(
+            isinstance(item, str) and not all(ord(sign) in _WHITE or sign.isprintable() for sign in item)
+            for item in level
+        ):
+            raise refused(archive.path, f"{name!r} has text with hidden characters")
+        level = [inner for outer in level for inner in _inside(outer) if id(inner) not in seen]
+        seen.update(map(id, level))
+        if not level:
+            return
+    raise refused(archive.path, f"{name!r} is nested deeper than {DEPTH}")
+
+
+def _inside(value: Any) -> list[Any]:
+    if isinstance(value, dict):
+        return [*value, *value.values()]
+    if isinstance(value, _Inert):
+        return value.parts
+    return list(value) if isinstance(value, (list, tuple)) else []
+
+
+def _check_storage(archive: Archive, folder: str, storage: Any) -> None:
+    """torch reads as many numbers as are stated, be they there or not."""
+    parts = storage if isinstance(storage, tuple) and len(storage) == 5 else (None,) * 5
+    kind, key, count = getattr(parts[1], "name", ""), f"{folder}/{parts[2]}", parts[4]
+    if kind not in _ITEM_BYTES or not isinstance(count, int) or count < 0:
+        raise refused(archive.path, f"has a tensor of another kind in {key[:80]!r}")
+    size = archive.members[key].file_size if key in archive else 0
+    if count * _ITEM_BYTES[kind] > size:
+        got = f"{key[:80]!r} has {size:,} bytes, but should hold {count:,} numbers"
+        raise refused(archive.path, f"is damaged: {got}")

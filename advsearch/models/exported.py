@@ -1,13 +1,9 @@
 """`torch.export` archives (.pt2), rewritten before torch reads them.
 
-torch's reader evaluates the expressions of sizes and the guards as Python, writes names of the graph into code that it
-runs, looks operators up by any dotted name, imports modules for containers, and unpickles. So it never sees the file:
-from its description of the network (`models/model.json`) and its weights a new archive is made in memory. What cannot
-be checked is left out (example inputs, guards, notes on where an operator came from), and all else has to have the form
-that `torch.export.save` gives it.
-
-Expressions of sizes are arithmetic with whole numbers and symbols. torch hands these texts to sympy, which evaluates
-them as Python. Only what sympy itself writes passes: names, numbers, operators, and calls of the functions listed here.
+torch's reader evaluates expressions and guards as Python, writes names of the graph into code that it runs, imports
+modules for containers, and unpickles. So it never sees the file: a new archive is made in memory of its description of
+the network and its weights. What cannot be checked is left out, and all else has to have the form that
+`torch.export.save` gives it; expressions of sizes are arithmetic with whole numbers, symbols and listed functions.
 """
 
 from __future__ import annotations
@@ -69,12 +65,9 @@ def problem(text: object) -> str:
         tree = ast.parse(text.strip(), mode="eval")
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        return f"expected arithmetic with whole numbers and symbols, got {text[:60]!r} ({_reason(error)})"
+        reason = str(error.args[0]) if type(error) is ValueError else "it cannot be read"
+        return f"expected arithmetic with whole numbers and symbols, got {text[:60]!r} ({reason})"
     return ""
-
-
-def _reason(error: BaseException) -> str:
-    return str(error.args[0]) if type(error) is ValueError else "it cannot be read"
 
 
 def _check(node: ast.expr, depth: int, power: int) -> None:
@@ -82,7 +75,11 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
     if depth <= 0:
         raise ValueError("it is nested too deeply")
     if isinstance(node, ast.Constant):
-        _check_number(node.value)
+        number = node.value
+        if not isinstance(number, (int, float)):
+            raise ValueError("text")
+        if isinstance(number, int) and abs(number) >= NUMBER:
+            raise ValueError("a number that is too large")
     elif isinstance(node, ast.Name):
         if not (node.id in NAMES or (is_symbol(node.id) and node.id[-1].isdigit())):
             raise ValueError(f"the name {node.id[:40]!r}")
@@ -167,12 +164,6 @@ def _powered(base: ast.expr, exponent: ast.expr, power: int) -> tuple[list[ast.e
     return [base], power // max(value, 1)
 
 
-def _check_number(value: object) -> None:
-    if isinstance(value, (bool, float)) or (isinstance(value, int) and abs(value) < NUMBER):
-        return
-    raise ValueError("a number that is too large" if isinstance(value, int) else "text")
-
-
 PROGRAM = "models/model.json"
 
 OLD_NAMES = {
@@ -205,7 +196,7 @@ _GLOBALS = re.compile(
 """What the pickle of a tensor names; nothing of it runs anything."""
 
 _CONTAINERS = frozenset([None, "builtins.tuple", "builtins.list", "builtins.dict", "collections.OrderedDict"])
-_FORGOTTEN = {"metadata": dict, "guards_code": list}
+_FORGOTTEN: JsonObject = {"metadata": {}, "guards_code": []}
 _IDENTIFIERS = frozenset(
     "name as_name user_input_name forward_arg_names tensor_values sym_int_values sym_float_values "
     "sym_bool_values".split()
@@ -214,14 +205,15 @@ _IDENTIFIERS = frozenset(
 
 def rewritten(archive: Archive) -> io.BytesIO:
     """Return an archive for `torch.export.load` that holds what is harmless of this one: the network and its weights.
-
-    Raises:
-        FileFormatError: it has something in it that a plain network has not; the message says what.
-    """
+    Raises FileFormatError where it has something in it that a plain network has not; the message says what."""
     from torch.export.pt2_archive import PT2ArchiveWriter  # a second of compilers, which no other model needs
 
     names = {new: old if old in archive else new for new, old in OLD_NAMES.items()}
-    program = _checked_program(archive, names[PROGRAM])
+    program = archive.read_json(names[PROGRAM])
+    if not isinstance(program, dict) or not isinstance(program.get("graph_module"), dict):
+        expected = f"expected a network in {names[PROGRAM]!r}, got other JSON"
+        raise refused(archive.path, f"cannot be read as torch.export ({expected})")
+    program = _checked_object(archive.path, program, "")
     for name in EXAMPLE:
         if name in archive:
             _check_pickle(archive, name)
@@ -277,14 +269,6 @@ def _check_tensor(archive: Archive, record: str, meta: Any) -> None:
 # ---- the description of the network ----------------------------------------------------------------------------------
 
 
-def _checked_program(archive: Archive, name: str) -> JsonObject:
-    """Return the description of the network as torch may see it."""
-    program = archive.read_json(name)
-    if not isinstance(program, dict) or not isinstance(program.get("graph_module"), dict):
-        raise refused(archive.path, f"cannot be read as torch.export (expected a network in {name!r}, got other JSON)")
-    return _checked_object(archive.path, program, "")
-
-
 def _checked(path: Path, value: JsonValue, key: str) -> JsonValue:
     """Return a value of the description, which stands under `key`, without what is left out."""
     if isinstance(value, dict):
@@ -298,18 +282,15 @@ def _checked(path: Path, value: JsonValue, key: str) -> JsonValue:
 
 
 def _checked_object(path: Path, value: JsonObject, key: str) -> JsonObject:
-    return {name: _checked_item(path, name, inner, key) for name, inner in value.items()}
-
-
-def _checked_item(path: Path, name: str, inner: JsonValue, key: str) -> JsonValue:
-    if name in _FORGOTTEN:
-        return {} if _FORGOTTEN[name] is dict else []
-    wrong = "" if name == "" else _problem(name, key)
-    if name in ("as_custom_obj", "custom_obj") or (name == "custom_obj_values" and inner):
-        wrong = "holds a custom object, which is never loaded"
-    if wrong:
-        raise refused(path, wrong)
-    return _checked(path, inner, name)
+    checked: JsonObject = {}
+    for name, inner in value.items():
+        wrong = "" if name in ("", *_FORGOTTEN) else _problem(name, key)
+        if name in ("as_custom_obj", "custom_obj") or (name == "custom_obj_values" and inner):
+            wrong = "holds a custom object, which is never loaded"
+        if wrong:
+            raise refused(path, wrong)
+        checked[name] = _FORGOTTEN[name] if name in _FORGOTTEN else _checked(path, inner, name)
+    return checked
 
 
 def _problem(value: Any, key: str) -> str:
@@ -330,11 +311,6 @@ def _plain_problem(text: str) -> str:
 def _identifier_problem(text: str) -> str:
     proper = text == "" or (text.isascii() and text.isidentifier() and not keyword.iskeyword(text) and len(text) < 1000)
     return "" if proper else f"expected a name of a value, got {text[:60]!r}"
-
-
-def _range_problem(text: str) -> str:
-    """A symbol or an expression whose range is stated."""
-    return "" if is_symbol(text) else problem(text)
 
 
 def _argument_problem(text: str) -> str:
@@ -379,7 +355,7 @@ _TEXTS: dict[str, Callable[[str], str]] = {
     "out_spec": _tree_problem,
     "as_string": _argument_problem,
     "as_strings": _argument_problem,
-    "range_constraints": _range_problem,
+    "range_constraints": lambda text: "" if is_symbol(text) else problem(text),
 }
 
 

@@ -1,17 +1,8 @@
 """What a network sees before it decides: the numbers that its last layer turns into logits.
 
-Which layer that is, is found by running the network once and watching, so it depends neither on names nor on the order
-in which layers were declared. Four kinds of network, in this order:
-
-1. An `nn.Module` that calls `nn.Linear` or convolutions: a hook on the last of them that answers with one value per
-   class reads its input. A network whose last layer has another width (a head written with `@`, say) gives the
-   output of that layer.
-2. A program of `torch.export`, or any other graph of operators: the same, with the last linear, matrix product or
-   convolution of the graph.
-3. TorchScript, a plain function, or a network with no such layer: its logits, less their mean over the classes, which
-   no answer depends on. `Features.source` says so.
-
-Maps and sequences of features are averaged over their positions.
+It is found by running the network once: a hook on the last `nn.Linear` or convolution of an `nn.Module`, or the last
+such operator of a graph (`torch.export`), reads its input where it answers with one value per class, else its output.
+For any other network it is the logits less their mean. Maps and sequences are averaged over their positions.
 """
 
 from __future__ import annotations
@@ -92,7 +83,12 @@ def features_of(model: Model) -> Features:
                 size = read(x).shape[1]
                 return Features(model, read, size, f"the {where}, {size} numbers")
     why = f"the logits, {model.classes} numbers: no layer before them can be read in a {type(model.module).__name__}"
-    return Features(model, _centred_logits(model), model.classes, why, penultimate=False)
+
+    def centred(x: Tensor) -> Tensor:
+        logits: Tensor = model.ask(x)
+        return logits - logits.mean(dim=1, keepdim=True)
+
+    return Features(model, centred, model.classes, why, penultimate=False)
 
 
 def _layer(model: Model, x: Tensor) -> tuple[Read, str] | None:
@@ -185,11 +181,3 @@ def _pooled(value: Tensor, axis: int) -> Tensor:
     """Return features (N, F): the mean over all axes but the first and `axis`."""
     channels_last = value.movedim(axis, -1)
     return channels_last.flatten(1, -2).mean(dim=1) if value.dim() > 2 else channels_last
-
-
-def _centred_logits(model: Model) -> Read:
-    def read(x: Tensor) -> Tensor:
-        logits: Tensor = model.ask(x)
-        return logits - logits.mean(dim=1, keepdim=True)
-
-    return read

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import io
 import logging
 import os
 import re
@@ -16,15 +15,15 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError
 from advsearch.files import open_regular
-from advsearch.models import exported, torchscript
-from advsearch.models.archive import LARGEST, Archive, open_archive, refused
+from advsearch.models import exported
+from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript, runs_while_loading
 from advsearch.models.guards import TookTooLong, try_torchscript
 from advsearch.models.labels import names_in
 from advsearch.models.probe import first_line
@@ -51,7 +50,13 @@ def load_file(path: Path) -> Source:
         FileFormatError: missing, empty, truncated, damaged, a pickle, or of another kind; the message names the file.
         ModelError: a program that does not take one floating-point image.
     """
-    with _opened(path) as file:
+    try:
+        opened = open_regular(path, "a model file", LARGEST)
+    except FileNotFoundError:
+        raise FileFormatError(f"model file {path}: no such file.{_near_files(path)}") from None
+    except OSError as error:
+        raise FileFormatError(f"model file {path}: cannot be read ({error.strerror or error})") from None
+    with opened as file:
         head = file.read(16)
         if not head:
             raise FileFormatError(f"model file {path}: expected a model, got an empty file")
@@ -62,16 +67,14 @@ def load_file(path: Path) -> Source:
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
         if _kind(archive) == "torchscript":
             return _load_torchscript(path, archive)
-        return _load_exported(path, archive)
-
-
-def _opened(path: Path) -> BinaryIO:
-    try:
-        return open_regular(path, "a model file", LARGEST)
-    except FileNotFoundError:
-        raise FileFormatError(f"model file {path}: no such file.{_near_files(path)}") from None
-    except OSError as error:
-        raise FileFormatError(f"model file {path}: cannot be read ({error.strerror or error})") from None
+        checked = exported.rewritten(archive)
+        logger = logging.getLogger("torch.export")  # prints a traceback of what is refused with a message anyway
+        with _damaged(path, "torch.export"), without_unpickling(), contextlib.ExitStack() as stack:
+            stack.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
+            program = torch.export.load(checked)
+            module = program.module()
+        return _with_signature(source_of(module, path.stem), program)
 
 
 def _kind(archive: Archive) -> str:
@@ -117,31 +120,19 @@ def _near_files(path: Path) -> str:
 
 
 def _load_torchscript(path: Path, archive: Archive) -> Source:
-    checked = torchscript.rewritten(archive)
-    if torchscript.runs_while_loading(archive):
-        _try_to_load(path, checked)
+    checked = rewritten_torchscript(archive)
+    if runs_while_loading(archive):
+        try:
+            wrong = try_torchscript(checked)
+        except TookTooLong as error:
+            wrong = str(error)
+        if wrong:
+            raise FileFormatError(f"model file {path}: {wrong}")
     with warnings.catch_warnings(), _damaged(path, "TorchScript"):
         for kind in (DeprecationWarning, FutureWarning):  # the second from torch 2.14 on
             warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=kind)
         module = torch.jit.load(checked, map_location="cpu")
     return source_of(module, path.stem)
-
-
-def _try_to_load(path: Path, checked: io.BytesIO) -> None:
-    try:
-        wrong = try_torchscript(checked)
-    except TookTooLong as error:
-        wrong = str(error)
-    if wrong:
-        raise FileFormatError(f"model file {path}: {wrong}")
-
-
-def _load_exported(path: Path, archive: Archive) -> Source:
-    checked = exported.rewritten(archive)
-    with _damaged(path, "torch.export"), without_unpickling(), _quiet_export():
-        program = torch.export.load(checked)
-        module = program.module()
-    return _with_signature(source_of(module, path.stem), program)
 
 
 def _with_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
@@ -185,18 +176,6 @@ def _damaged(path: Path, kind: str) -> Iterator[None]:
         ) from error
 
 
-@contextlib.contextmanager
-def _quiet_export() -> Iterator[None]:
-    """Silence the log of `torch.export`, which prints a traceback for files that are refused with a message anyway."""
-    logger = logging.getLogger("torch.export")
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
-
-
 FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
 
 OLDEST = (1, 24)
@@ -205,11 +184,7 @@ OLDEST = (1, 24)
 
 class OnnxNetwork(nn.Module):
     """A session of onnxruntime as a function from a batch of images to its outputs; no gradient goes through it.
-
-    Args:
-        session: the session.
-        new_options: makes options of a run, by which it can be ended.
-    """
+    `new_options` makes options of a run, by which it can be ended."""
 
     def __init__(self, session: Any, new_options: Callable[[], Any]) -> None:
         super().__init__()
@@ -237,7 +212,12 @@ def load_onnx(path: Path) -> Source:
         ModelError: onnxruntime is missing or too old, or the network does not take one batch of images.
     """
     runtime = library("onnxruntime", str(path), "onnx")
-    _check_version(path, runtime.__version__)
+    release = re.match(r"(\d+)\.(\d+)", runtime.__version__)
+    if release is None or (int(release[1]), int(release[2])) < OLDEST:
+        raise ModelError(
+            f"model {path}: needs onnxruntime {'.'.join(map(str, OLDEST))} or newer, got {runtime.__version__}, which "
+            "may read weights from anywhere that a file names: pip install -U 'advsearch[onnx]'"
+        )
     options = runtime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 4  # what is wrong is raised as well
@@ -265,8 +245,10 @@ def load_onnx(path: Path) -> Source:
     layout = "NHWC" if shape[3] == 3 and shape[1] != 3 else "NCHW"
     sides = shape[1:3] if layout == "NHWC" else shape[2:4]
     said = session.get_modelmeta().custom_metadata_map
-    if not all(isinstance(side, int) for side in sides):
-        sides = sizes_in(said.get("imgsz", ""))
+    if not all(isinstance(side, int) for side in sides):  # YOLO's exporters write it, such as "[640, 640]"
+        written = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", said.get("imgsz", ""))
+        sides = [int(side) for side in written.groups()] if written else []
+        sides = sides if all(sides) else []
     return Source(
         OnnxNetwork(session, runtime.RunOptions),
         path.stem,
@@ -276,19 +258,3 @@ def load_onnx(path: Path) -> Source:
         batch_limits=(shape[0], shape[0]) if isinstance(shape[0], int) else (1, LARGEST_BATCH),
         dtype=FLOATS[inputs[0].type],
     )
-
-
-def sizes_in(text: str) -> tuple[int, int] | None:
-    """Return (height, width) of what YOLO's exporters write as `imgsz`, such as "[640, 640]"; None of anything else."""
-    found = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", text)
-    return (int(found[1]), int(found[2])) if found and min(int(found[1]), int(found[2])) > 0 else None
-
-
-def _check_version(path: Path, version: str) -> None:
-    """Refuse an onnxruntime before `OLDEST`."""
-    found = re.match(r"(\d+)\.(\d+)", version)
-    if found is None or (int(found[1]), int(found[2])) < OLDEST:
-        raise ModelError(
-            f"model {path}: needs onnxruntime {'.'.join(map(str, OLDEST))} or newer, got {version}, which may read "
-            "weights from anywhere that a file names: pip install -U 'advsearch[onnx]'"
-        )

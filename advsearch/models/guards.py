@@ -1,9 +1,7 @@
 """What code of others must not do to us: never end, or leave torch's global switches turned.
 
-Neither a signal nor an exception ends torch's own loops, so a call goes on in a thread of its own, which is left behind
-when the time is up; what would also hold Python up is tried in a process of its own first. All our own code runs with
-torch's switches as torch comes. A network is called with the type and device for new tensors that its own code has
-chosen. Gradients are ours to switch.
+A call goes on in a thread of its own, left behind when the time is up, for nothing ends torch's loops; what would hold
+Python up too is tried in a process of its own. A network has the type and device for new tensors that its code chose.
 """
 
 from __future__ import annotations
@@ -44,14 +42,10 @@ class TookTooLong(Exception):
 
 
 def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -> Result:
-    """Return what `call` returns, or raise what it raises.
+    """Return what `call`, which may never end, returns, or raise what it raises; `stop` asks it to end when the time is
+    up.
 
-    Args:
-        call: what may never end.
-        stop: asks it to end when the time is up; None where nothing can.
-
-    Raises:
-        TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
+    Raises TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
     """
     results: list[Result] = []
     errors: list[BaseException] = []
@@ -99,14 +93,8 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Switches:
-    """The state of torch's switches.
-
-    Attributes:
-        dtype, device: of new tensors.
-        gradients: whether operations are recorded, in this thread.
-        deterministic: 0, 1 where operations that are not deterministic warn, 2 where they raise.
-        anomalies: whether NaN in a derivative raises.
-    """
+    """The state of torch's switches: dtype and device of new tensors, whether this thread records gradients, whether
+    operations that are not deterministic warn (1) or raise (2), and whether NaN in a derivative does."""
 
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU

@@ -101,7 +101,8 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet".
     """
     table = {name: indices for name, indices in _name_table(labels).items() if "," not in name}
-    same = [name for name in _synonyms(word) if name in table]
+    everyday = [[_key(name) for name in names] for names in json.loads((DATA / "synonyms.json").read_text("utf-8"))]
+    same = [name for names in everyday if _key(word) in names for name in names if name in table]
     like = resembling(word, table)
     if same and not any(_key(word) in name for name in like):  # nothing but other spellings
         like = []
@@ -112,16 +113,7 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     return list(parts.items())
 
 
-def _synonyms(word: str) -> Iterator[str]:
-    """Yield what else an everyday thing is called, as a key of the table of names."""
-    for names in json.loads((DATA / "synonyms.json").read_text("utf-8")):
-        keys = [_key(name) for name in names]
-        if _key(word) in keys:
-            yield from keys
-
-
 def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> int:
-    """Return the one class index that `term` stands for."""
     explicit = re.fullmatch(r"#\s*(-?\d+)", term)
     if explicit:
         return _checked_index(int(explicit[1]), labels)
@@ -203,14 +195,9 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
 
 
 def names_in(said: Any) -> tuple[str, ...] | None:
-    """Return the names that a network says its classes have: as YOLO's do in `names`, and their files in metadata.
-
-    Args:
-        said: a mapping from 0, 1, ... to names, a list of names, or the text of one of these; from a stranger.
-
-    Returns:
-        The names in order; None of anything else.
-    """
+    """Return the names that a network says its classes have, in order: as YOLO's do in `names`, and their files in
+    metadata. A stranger says them: a mapping from 0, 1, ... to names, a list of names, or the text of one; None of
+    anything else."""
     if isinstance(said, str):
         if len(said) > LONGEST_NAMES or not _FLAT.fullmatch(said):
             return None
@@ -245,11 +232,8 @@ def labels_origin(given: object) -> str:
 
 
 def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
-    """Return the texts that a model is given beside a picture, from a list or a text with | between them.
-
-    Raises:
-        InputError: one is no text, or empty.
-    """
+    """Return the texts that a model is given beside a picture, from a list or a text with | between them. Raises
+    InputError where one is no text, or empty."""
     if given is None:
         return None
     listed = [part.strip() for part in given.split("|")] if isinstance(given, str) else list(given)
@@ -260,11 +244,8 @@ def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
 
 
 def patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the texts that a name is put into, ``{}`` in its place; one of our own for None.
-
-    Raises:
-        InputError: one has no ``{}``.
-    """
+    """Return the texts that a name is put into, ``{}`` in its place; one of our own for None. Raises InputError where
+    one has no ``{}``."""
     for one in prompts or ():
         if "{}" not in one:
             raise InputError(f"prompt: expected a text with {{}} where the name goes, such as {PROMPT!r}, got {one!r}")
@@ -284,14 +265,8 @@ def _label_sets() -> dict[str, tuple[str, ...]]:
 
 
 def fitting_labels(classes: int, labels: tuple[str, ...] | None, source: str, model: str) -> tuple[str, ...]:
-    """Return the labels, or placeholders for None; InputError (FileFormatError, for a file) if their number is wrong.
-
-    Args:
-        classes: how many the model has.
-        labels: the names.
-        source: where they came from, e.g. ``"label file x.json"``.
-        model: the model's name.
-    """
+    """Return the labels, or placeholders for None; InputError (FileFormatError, for a file) if their number is not that
+    of a model's classes. The source, such as ``"label file x.json"``, is for the message."""
     if labels is None:
         return tuple(f"class {index}" for index in range(classes))
     if len(labels) == classes:

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
 
 from advsearch.errors import InputError, UnknownNameError, resembling
-from advsearch.models import files, imported, reference
-from advsearch.models import preprocessing as pre
+from advsearch.models import files, reference
 from advsearch.models.guards import called_under, plainly, turned_by_code
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
-from advsearch.models.model import Model, Preprocessing, Read
+from advsearch.models.model import PRESETS, Model, Preprocessing, Read, Triple
 from advsearch.models.probe import probe
-from advsearch.models.source import Purpose, Source, source_of
-from advsearch.models.zoo import timm, torchvision, transformers
+from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
+from advsearch.models.zoo import named, transformers
 from advsearch.registry import Registry
 
 #: Size of the input where neither the model nor the caller says.
@@ -27,7 +28,7 @@ DEFAULT_INPUT_SIZE = (224, 224)
 
 SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
     "advsearch.models",
-    {"torchvision": torchvision.load, "timm": timm.load, "hf": transformers.load},
+    {"torchvision": named.load_torchvision, "timm": named.load_timm, "hf": transformers.load},
     "a function from the whole text, such as 'zoo:resnet18', to a Source or a Model",
     lambda name, entry: callable(entry),
 )
@@ -155,22 +156,21 @@ def named_code(spec: str) -> str | None:
     text = spec.strip()
     if text.partition(":")[0].lower() in SOURCES or not re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text):
         return None
-    return imported.split_weights(text)[0]
+    return split_weights(text)[0]
 
 
 def _find(spec: object) -> Source | Model:
-    """Return what `spec` names."""
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
-        return transformers.of_network(spec) or timm.of_network(spec) or source_of(spec, type(spec).__name__)
+        return transformers.of_network(spec) or named.of_timm(spec) or source_of(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
         got = f"the class {spec.__name__} (pass an instance)" if isinstance(spec, type) else type(spec).__name__
         raise InputError(f"model: expected a name, a path, an nn.Module or a Model, got {got}. {FORMS}")
     text = spec.strip()
-    network, weights = imported.split_weights(text)
+    network, weights = split_weights(text)
     if network == "reference":
         return reference.load(weights=weights)
     source = text.partition(":")[0].lower()
@@ -179,7 +179,7 @@ def _find(spec: object) -> Source | Model:
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'")
     if named_code(text) is not None:
-        return imported.load_callable(text, SOURCES)
+        return load_callable(text, SOURCES)
     if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
     known = ["reference", *(f"{source}:{'REPOSITORY' if source == 'hf' else 'NAME'}" for source in SOURCES)]
@@ -194,15 +194,14 @@ def _by_library(text: str) -> str:
 
 
 def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
-    """Return the source's own preprocessing with the caller's options on top."""
     made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE, processor=found.processor)
     instead = [key for key in ("mean", "std", "value_range", "channels") if found.processor and key in given]
     if instead:
         raise InputError(f"{instead[0]}: model {found.name} has a processor that does all of this; leave it out")
-    own = {"mean": found.mean, "std": found.std, **pre.parse_normalisation(given.get("mean"), given.get("std"))}
+    own = {"mean": found.mean, "std": found.std, **parse_normalisation(given.get("mean"), given.get("std"))}
     made = dataclasses.replace(made, mean=own["mean"] or made.mean, std=own["std"] or made.std)
     made = dataclasses.replace(made, layout=found.layout or made.layout, channels=found.channels or made.channels)
-    return dataclasses.replace(made, **{key: parse(given[key]) for key, parse in pre.READERS.items() if key in given})
+    return dataclasses.replace(made, **{key: parse(given[key]) for key, parse in READERS.items() if key in given})
 
 
 def _relabelled(
@@ -227,3 +226,84 @@ def _positive(key: str, value: int | None, default: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise InputError(f"{key}: expected a whole number of at least 1, got {value!r}")
     return value
+
+
+# ---- what a user writes of preprocessing: Python values, or strings from a command line ------------------------------
+
+LAYOUTS = ("NCHW", "NHWC")
+CHANNELS = ("RGB", "BGR")
+
+
+def parse_input_size(value: Any) -> tuple[int, int]:
+    """Return (height, width) from one positive integer, two, or text such as ``"224"`` and ``"240,320"``."""
+    parts = _numbers("input_size", value, (1, 2), "one whole number or (height, width)")
+    if any(part != int(part) or part < 1 for part in parts):
+        raise InputError(f"input_size: expected whole numbers of at least 1, got {value!r}")
+    return int(parts[0]), int(parts[-1])
+
+
+def parse_value_range(value: Any) -> tuple[float, float]:
+    """Return (low, high) from two numbers or text such as ``"0,255"``."""
+    low, high = _numbers("value_range", value, (2,), "two numbers (low, high), such as (0, 255)")
+    if low >= high:
+        raise InputError(f"value_range: expected low < high, got {value!r}")
+    return low, high
+
+
+def parse_normalisation(mean: Any, std: Any) -> dict[str, Triple]:
+    """Return the fields among `mean` and `std` that were given.
+
+    A preset's name (``"imagenet"``, ``"half"``, ``"clip"``) in one of the two also fills the other if that one is None.
+    """
+    fields: dict[str, Triple] = {}
+    for position, (key, value) in enumerate((("mean", mean), ("std", std))):
+        if value is None:
+            continue
+        if isinstance(value, str) and value.strip().lower() in PRESETS:
+            preset = PRESETS[value.strip().lower()]
+            fields[key] = preset[position]
+            if (mean, std)[1 - position] is None:
+                fields[("std", "mean")[position]] = preset[1 - position]
+        else:
+            expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
+            numbers = _numbers(key, value, (1, 3), expected)
+            fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
+    if any(number <= 0 for number in fields.get("std", ())):
+        raise InputError(f"std: expected numbers greater than 0, got {std!r}")
+    return fields
+
+
+def parse_choice(key: str, value: Any, choices: Sequence[str]) -> str:
+    """Return the member of `choices` that `value` names in any case."""
+    text = str(value).strip().upper()
+    if text not in choices:
+        raise InputError(f"{key}: expected one of {', '.join(choices)}, got {value!r}")
+    return text
+
+
+READERS: dict[str, Callable[[Any], Any]] = {
+    "input_size": parse_input_size,
+    "value_range": parse_value_range,
+    "layout": partial(parse_choice, "layout", choices=LAYOUTS),
+    "channels": partial(parse_choice, "channels", choices=CHANNELS),
+}
+"""What reads the fields that have a form of their own."""
+
+
+def _numbers(key: str, value: Any, counts: tuple[int, ...], expected: str) -> tuple[float, ...]:
+    """Return finite numbers from a number, a sequence, or comma-separated text; their count is one of `counts`."""
+    problem = InputError(f"{key}: expected {expected}, got {value!r}")
+    if isinstance(value, str):
+        parts: list[Any] = value.split(",")
+    elif isinstance(value, Tensor) or hasattr(value, "tolist"):
+        listed = value.tolist()
+        parts = listed if isinstance(listed, list) else [listed]
+    else:
+        parts = list(value) if isinstance(value, Sequence) else [value]
+    try:
+        numbers = tuple(float(part) for part in parts)
+    except (TypeError, ValueError):
+        raise problem from None
+    if len(numbers) not in counts or not all(math.isfinite(number) for number in numbers):
+        raise problem
+    return numbers

@@ -15,9 +15,17 @@ from torch.overrides import TorchFunctionMode
 
 from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import LabelSet, find_label_set
-from advsearch.models.preprocessing import Triple
 
 CPU = torch.device("cpu")
+
+Triple = tuple[float, float, float]
+
+#: Named (mean, std) pairs, for values in [0, 1] and channels in RGB order.
+PRESETS: dict[str, tuple[Triple, Triple]] = {
+    "imagenet": ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
+    "half": ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
+    "clip": ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)),
+}
 
 Read = Callable[[Any, int], Any]
 """From what a network answered to so many images, to its output; ValueError says what was expected."""
@@ -238,11 +246,8 @@ def checked_images(images: Tensor) -> Tensor:
 
 
 def read_by(read: Read, answer: Any, count: int, name: str) -> Any:
-    """Return the output that a reader finds in a network's answer.
-
-    Raises:
-        ModelError: it finds none, or another number than `count`.
-    """
+    """Return the output that a reader finds in a network's answer. Raises ModelError where it finds none, or another
+    number than `count`."""
     try:
         output = read(answer, count)
     except ValueError as error:

@@ -1,14 +1,22 @@
-"""What a loader hands over: a network that is ready to be asked, and what its file or maker says about it."""
+"""What a loader hands over: a network that is ready to be asked, and what its file or maker says about it.
+
+The maker may be Python code: ``package.module:callable``, with weights after an ``@``.
+"""
 
 from __future__ import annotations
 
 import copy
+import difflib
+import importlib
+import os
 import pickle
+import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import torch
 from safetensors import SafetensorError
@@ -16,24 +24,21 @@ from safetensors.torch import load_file
 from torch import nn
 from torch.nn.parameter import is_lazy
 
-from advsearch.errors import FileFormatError, InputError, ModelError
+from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError, resembling
 from advsearch.files import open_regular
 from advsearch.models.archive import LARGEST
-from advsearch.models.model import CPU, GIVEN_BY, ModelWarning
-from advsearch.models.preprocessing import Triple
+from advsearch.models.model import CPU, GIVEN_BY, Model, ModelWarning, Triple
 from advsearch.models.probe import first_line
+from advsearch.registry import check_import, current_directory_importable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a network is to be asked.
-
-    Args:
-        task: by name.
-        names: of the classes, as the user gave them; None if they did not.
-        prompts: the texts that the user gave; None if they gave none.
-        tokens: the most that a free answer has.
-    """
+    """What a network is to be asked: the task's name, what its user gave as names of classes and as texts (None if they
+    did not), and the most tokens of a free answer."""
 
     task: str = "classification"
     names: tuple[str, ...] | None = None
@@ -41,28 +46,15 @@ class Purpose:
     tokens: int = 16
 
     def check(self, model: str, what: str, *tasks: str) -> None:
-        """Raise a ModelError where a network cannot do the task.
-
-        Args:
-            model: for messages.
-            what: it does, such as "compares a picture with texts".
-            tasks: that it does. Tasks of a user's own may read its answer in any way.
-        """
+        """Raise a ModelError where a network cannot do the task: `what` it does, such as "compares a picture with
+        texts", is good for `tasks`, and for a user's own, which may read its answer in any way."""
         if self.task in (*GIVEN_BY, "answer") and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
             raise ModelError(f"model {model} {what} and cannot do task {self.task}; use {instead}")
 
     def named(self, model: str, what: str, task: str) -> tuple[str, ...]:
-        """Return the names, for a network that has no classes of its own.
-
-        Args:
-            model, what: as in `check`.
-            task: that it does.
-
-        Raises:
-            ModelError: see `check`.
-            InputError: there are no names.
-        """
+        """Return the names, for a network that does a task and has no classes of its own. Raises ModelError as `check`,
+        and InputError where there are no names."""
         self.check(model, what, task)
         if self.names is None:
             raise InputError(
@@ -106,10 +98,7 @@ class Source:
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
     """Return a source with the module frozen, its type and device read off its parameters; `fields` go to `Source`.
-
-    Raises:
-        ModelError: it has lazy layers that have no weights yet.
-    """
+    Raises ModelError where it has lazy layers that have no weights yet."""
     lazy = [key for key, weights in (*module.named_parameters(), *module.named_buffers()) if is_lazy(weights)]
     if lazy:
         layer = lazy[0].rpartition(".")[0]
@@ -198,3 +187,89 @@ def _some(what: str, keys: list[str]) -> list[str]:
     if not keys:
         return []
     return [f"{len(keys)} {what} ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})"]
+
+
+def split_weights(spec: str) -> tuple[str, Path | None]:
+    """Return the part before the first ``@`` and the path after it, if there is one."""
+    name, _, weights = spec.partition("@")
+    return name.strip(), Path(weights.strip()) if weights.strip() else None
+
+
+def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
+    """Return the model behind ``package.module:callable[@weights.safetensors]``.
+
+    The module is looked for on `sys.path` and in the current directory. The attribute is an `nn.Module`, a `Model`, or
+    something that returns one when called without arguments (a function, or a class of modules).
+
+    Args:
+        spec: what is written above.
+        libraries: what else may stand before the colon; a module that there is not may be one of them, misspelt.
+
+    Raises:
+        ModelError: it cannot be imported, raises, returns something else, or the weights do not fit.
+        UnknownNameError: the module has no such attribute; near matches are named.
+        InputError: it must not be imported (`registry.only_named_code`).
+    """
+    target, weights = split_weights(spec)
+    check_import(target)
+    module_name, _, attribute = target.partition(":")
+    value: Any = _import_module(module_name, spec, libraries)
+    for part in attribute.split("."):
+        if not hasattr(value, part):
+            known = [key for key in vars(value) if not key.startswith("_") and callable(getattr(value, key))]
+            raise UnknownNameError(f"attribute of {module_name}", part, near_names(part, known))
+        value = getattr(value, part)
+    built = _build(value, spec)
+    if isinstance(built, Model):
+        if weights is not None:
+            raise ModelError(
+                f"model {spec}: {target} returns a ready Model, weights cannot be put into it; leave out '@...'"
+            )
+        return built
+    if weights is not None:
+        load_weights(built, weights, target)
+    return source_of(built, spec)
+
+
+def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType:
+    with current_directory_importable():
+        try:
+            return importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name is not None and (name == error.name or name.startswith(error.name + ".")):
+                near = resembling(name, libraries)
+                meant = f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?" if near else ""
+                message = f"no module named {error.name!r} on the Python path or in {os.getcwd()}{meant}"
+            else:
+                message = f"module {name!r} needs {error.name!r}, which is not installed"
+            raise ModelError(f"model {spec}: {message}") from error
+        except Exception as error:  # the user's code may raise anything
+            raise ModelError(f"model {spec}: importing {name!r} failed ({_where(error)})") from error
+
+
+def _build(value: Any, spec: str) -> nn.Module | Model:
+    made_here = not isinstance(value, (nn.Module, Model))
+    if made_here:
+        if not callable(value):
+            raise ModelError(f"model {spec}: expected a callable or an nn.Module, got {type(value).__name__}")
+        try:
+            value = value()
+        except Exception as error:  # the user's code may raise anything
+            raise ModelError(f"model {spec}: calling it without arguments failed ({_where(error)})") from error
+    if not isinstance(value, (nn.Module, Model)):
+        raise ModelError(
+            f"model {spec}: expected it to return an nn.Module or an advsearch Model, got {type(value).__name__}"
+        )
+    return value
+
+
+def _where(error: BaseException) -> str:
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+    return f"{first_line(error)}{place}"
+
+
+def near_names(name: str, known: Iterable[str]) -> list[str]:
+    """Return at most a dozen names to show, the nearest first."""
+    names = sorted(known)
+    return difflib.get_close_matches(name, names, n=12, cutoff=0.3) or names[:12]

@@ -66,14 +66,8 @@ def drawn(
     kinds: Sequence[str] = ("png", "svg"),
     style: dict[Any, Any] | None = None,
 ) -> Figures:
-    """Return a figure as files.
-
-    Args:
-        draw: draws on it.
-        size: width and height in inches.
-        kinds: suffixes of the files.
-        style: settings of matplotlib that differ from `STYLE`.
-    """
+    """Return a figure of a size in inches (width, height) as files of some kinds; the style is what differs from
+    `STYLE`."""
     # late: matplotlib takes long to import
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -138,7 +132,6 @@ def _only_axis(answer: SweepSummary) -> Sequence[AxisRow]:
 
 
 def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
-    """The map of a sweep."""
     first, second = cells.axes
     seen, correct, margin = cells.configurations, cells.correct, cells.margin
     extent = (-0.5, len(first.values) - 0.5, -0.5, len(second.values) - 0.5)
@@ -158,7 +151,6 @@ def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
 
 
 def _along(axes: Any, answer: SweepSummary, rows: Sequence[AxisRow]) -> None:
-    """The accuracy with its interval over one axis."""
     at, accuracy = range(len(rows)), [row.accuracy for row in rows]
     low, high = ([row.interval[end] for row in rows if row.interval] for end in (0, 1))
     axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
@@ -214,7 +206,6 @@ def _written(value: Any) -> str:
 
 
 def _who(answer: SweepSummary) -> str:
-    """Objects and models of a sweep, files without their folders."""
     return ", ".join(short_name(name) for name in (*split_names(answer.object), *split_names(answer.model)))
 
 
@@ -256,13 +247,8 @@ ROWS = 2
 
 @dataclass(frozen=True, eq=False)
 class MapView:
-    """What a camera sees of an object.
-
-    Attributes:
-        title: where the camera stands.
-        cells: (H, W) number of the cell in each pixel, row by row of the map; -1 beside the object.
-        normal: (H, W, 3) unit normals, world space.
-    """
+    """What a camera sees of an object: the number of the cell in each pixel (H, W), row by row of the map, -1 beside
+    the object, and unit normals (H, W, 3) in world space. The title says where it stands."""
 
     title: str
     cells: npt.NDArray[np.int64]
@@ -292,11 +278,8 @@ class SurfacePanel:
 
 
 def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
-    """Draw a row for each panel: the map, and the object in its colours from some sides.
-
-    Args:
-        panels: the first `MOST_PANELS` are drawn, at one scale.
-    """
+    """Draw a row for each of the first `MOST_PANELS` panels, at one scale: the map, and the object in its colours from
+    some sides."""
     panels = panels[:MOST_PANELS]
     largest = max((float(np.nanmax(np.abs(one.difference), initial=0.0)) for one in panels), default=0.0)
     end = max(ceil(10.0 * largest - 1e-9) / 10.0, 0.1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,28 +24,8 @@ TINT, LETTERS = 0.45, 28
 Box = tuple[float, float, float, float]
 
 
-class Shape(Protocol):
-    """What is drawn: a box, or the pixels of a mask; see `advsearch.tasks.Mark`."""
-
-    @property
-    def text(self) -> str:
-        """What stands beside it."""
-
-    @property
-    def true(self) -> bool:
-        """Whether it is true of the scene, and not what the model says."""
-
-    @property
-    def box(self) -> Box | None:
-        """x0, y0, x1, y1 in pixels of the picture."""
-
-    @property
-    def mask(self) -> Any:
-        """(h, w) bool over the whole picture, of any size; None for a box."""
-
-    @property
-    def map(self) -> Any:
-        """(h, w) numbers over the whole picture; None where there are none."""
+Shape = Any
+"""What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`."""
 
 
 def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
@@ -134,15 +114,13 @@ def _write(
     y = ends[3] if shape.true else ends[1] - high
     x, y = max(0, min(ends[0], size[0] - wide)), max(0, min(y, size[1] - high))
     rows = sorted(range(0, max(size[1] - high, 0) + 1), key=lambda one: (abs(one - y), one))
-    free = (one for one in rows if not any(_overlap((x, one, x + wide, one + high), other) for other in others))
+    free = (
+        one for one in rows if all(x > x1 or x0 > x + wide or one > y1 or y0 > one + high for x0, y0, x1, y1 in others)
+    )
     y = next(free, y)
     draw.rectangle((x, y, x + wide, y + high), fill=_colour(shape))
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
     return x, y, x + wide, y + high
-
-
-def _overlap(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> bool:
-    return one[0] <= other[2] and other[0] <= one[2] and one[1] <= other[3] and other[1] <= one[3]
 
 
 GAP, LINE = 8, 15
@@ -153,15 +131,8 @@ NARROWEST = 160
 
 
 def contact_sheet(pictures: Sequence[Floats], captions: Sequence[Sequence[str]]) -> Floats:
-    """Return pictures side by side on white.
-
-    Args:
-        pictures: (H, W, 3) display-referred sRGB in [0, 1], all of one size.
-        captions: the lines of text under each; what is too long for the tile is cut.
-
-    Returns:
-        (h, w, 3) float32, display-referred sRGB in [0, 1].
-    """
+    """Return pictures (H, W, 3), display-referred sRGB in [0, 1] and all of one size, side by side on white, each over
+    lines of text; what is too long for the tile is cut. As the pictures, float32."""
     columns = columns_for(len(pictures))
     rows = math.ceil(len(pictures) / columns)
     factor = math.ceil(NARROWEST / pictures[0].shape[1])

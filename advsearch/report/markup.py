@@ -1,22 +1,30 @@
 """HTML that is escaped by construction: text becomes markup only through `element`.
 
-And answers as a notebook shows them: what is said, pictures or a figure, and tables, without styles.
+And answers as a notebook shows them (what is said, pictures or a figure, and tables, without styles), and charts that
+stand inline in a page; their colours come from its style sheet, so that they follow its scheme.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from advsearch.report.figures import Figures, drawn, new_axes
+from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, new_axes
 from advsearch.report.shown import AnswerPart, ShownAnswer, shown
 from advsearch.runs.images import png_bytes
 from advsearch.runs.results.base import Result
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 
 _VOID = frozenset({"meta", "img", "br", "hr", "input", "link"})
 
@@ -28,13 +36,8 @@ class Html(str):
 
 
 def element(tag: str, *children: str | None, **attributes: str | float) -> Html:
-    """Return one element. Children that are not `Html` are escaped; None is left out.
-
-    Args:
-        tag: the element's name.
-        children: what stands in it.
-        attributes: by name; ``class_`` is ``class``, and other underscores become hyphens.
-    """
+    """Return one element. Children that are not `Html` are escaped; None is left out. Of attributes ``class_`` is
+    ``class``, and other underscores become hyphens."""
     names = {"class_": "class", "viewBox": "viewBox"}
     given = "".join(
         f' {names.get(name, name.replace("_", "-"))}="{escape(str(value), quote=True)}"'
@@ -90,12 +93,7 @@ def _shown(result: object) -> ShownAnswer:
 
 
 def answer_html(given: ShownAnswer, pictures: Mapping[str, ArrayLike] | None = None) -> str:
-    """Return an answer as a cell of a notebook.
-
-    Args:
-        given: what is shown of it.
-        pictures: name to (H, W, 3) sRGB in [0, 1].
-    """
+    """Return an answer as a cell of a notebook, with pictures (H, W, 3), sRGB in [0, 1]."""
     figures = [
         element(
             "figure", _picture(png_bytes(image), SHOWN, name), element("figcaption", name), style="display:inline-block"
@@ -130,7 +128,6 @@ def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
 
 
 def _part(one: AnswerPart) -> Html:
-    """A part of an answer; a folded one has its title as the handle."""
     head = element("thead", element("tr", *(element("th", cell) for cell in one.heads))) if one.heads else None
     body = (element("tr", *(element("td", cell) for cell in row)) for row in one.rows)
     inside = [
@@ -144,3 +141,129 @@ def _part(one: AnswerPart) -> Html:
 
 def _picture(png: bytes, width: int, alt: str) -> Html:
     return element("img", src=f"data:image/png;base64,{base64.b64encode(png).decode()}", width=width, alt=alt)
+
+
+HEIGHT = 300
+WIDE, NARROW = 720, 350
+"""Height and widths of a chart in CSS pixels: for a screen, and for a phone, which would shrink the letters of the wide
+one until nobody can read them. The style sheet shows one of them.
+"""
+
+MOST_POINTS = 400
+"""Points of a curve that are drawn; of more, evenly spread ones."""
+
+COLORS = {"search": "#010101", "baseline": "#020202", "soft": "#030303", "line": "#040404"}
+"""Variables of the style sheet, and what stands for them while matplotlib draws."""
+OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}
+"""The same of the colours that figures have."""
+STYLE: dict[Any, Any] = {
+    "font.size": 13.0,
+    "legend.fontsize": 13.0,
+    "legend.labelcolor": "linecolor",
+    "legend.borderpad": 0.0,
+    "legend.handlelength": 1.6,
+    "axes.edgecolor": COLORS["line"],
+    "axes.labelcolor": COLORS["soft"],
+    "axes.spines.left": False,
+    "axes.axisbelow": True,
+    "axes.grid.axis": "y",
+    "axes.grid": True,
+    "grid.color": COLORS["line"],
+    "text.color": COLORS["soft"],
+    "xtick.color": COLORS["line"],
+    "ytick.color": COLORS["line"],
+    "xtick.labelcolor": COLORS["soft"],
+    "ytick.labelcolor": COLORS["soft"],
+    "xtick.major.size": 0.0,
+    "ytick.major.size": 0.0,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "path.simplify": False,
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The objective of one policy, evaluation by evaluation; None where it was not a number. The name is for the
+    legend; `search` or `baseline` is also the variable of the style sheet that has its colour."""
+
+    name: str
+    kind: str
+    values: Sequence[float | None]
+
+
+def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "", width: int = WIDE) -> Html:
+    """Return the best objective so far (lines) and each single one (dots) over the number of evaluations; each curve
+    has a finite value. `zero_means` stands at the zero line, which is not there when it is empty; the width is in CSS
+    pixels."""
+    values = [np.array(curve.values, dtype=float) for curve in curves]
+    best = [np.fmax.accumulate(one) for one in values]
+    ends = [(one[np.isfinite(one)][0], one[-1]) for one in best]
+    told = "; ".join(f"{curve.name}: from {a:.3g} to {b:.3g}" for curve, (a, b) in zip(curves, ends, strict=True))
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for curve, each, so_far in zip(curves, values, best, strict=True):
+            shown = np.unique(np.linspace(0, len(each) - 1, min(len(each), MOST_POINTS)).round().astype(int))
+            color = COLORS[curve.kind]
+            # a dot is a line without a length: all of them are one path, and the page stays small
+            at, dots = (np.stack([one, one, one * np.nan], 1).ravel() for one in (shown + 1.0, each[shown]))
+            axes.plot(at, dots, solid_capstyle="round", linewidth=4, alpha=0.35, color=color)
+            dashes = {"search": "-", "baseline": (0.0, (4.0, 1.5))}[curve.kind]
+            axes.plot(shown + 1, so_far[shown], linestyle=dashes, linewidth=2, label=curve.name, color=color)
+        if zero_means:
+            axes.axhline(0.0, color=COLORS["soft"], linewidth=1, linestyle=(0.0, (5.0, 4.0)))
+            axes.annotate(zero_means, (1.0, 0.0), (-4, 4), axes.get_yaxis_transform(), "offset points", ha="right")
+        axes.set(xlabel="evaluations", ylabel=objective, xlim=(1, max(2, *map(len, values))))
+        axes.locator_params("x", integer=True)
+        figure.legend(loc="outside upper left", ncols=2)
+
+    return _chart(draw, width, HEIGHT, f"{objective} over evaluations. {told}")
+
+
+def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, height: int = HEIGHT) -> Html:
+    """Return what `draw` draws on axes, without its title and with the page's legend. The words say what it shows to
+    who does not see it; width and height are in CSS pixels."""
+
+    def on_figure(figure: Figure) -> None:
+        axes = figure.subplots()
+        draw(axes)
+        axes.set_title("")
+        for legend in (*figure.legends, *filter(None, [axes.get_legend()])):
+            legend.remove()
+        columns = 1 if width == NARROW else 2
+        figure.legend(loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"])
+
+    return _chart(on_figure, width, height, words)
+
+
+def _chart(draw: Callable[[Figure], object], width: int, height: int, words: str) -> Html:
+    (file,) = drawn(draw, (width / 72, height / 72), ("svg",), STYLE).values()
+    return element(
+        "svg",
+        element("title", words),
+        _inline(file.decode("utf-8"), f"{width}-"),
+        viewBox=f"0 0 {width} {height}",
+        class_="chart wide" if width == WIDE else "chart narrow",
+        role="img",
+        aria_label=words,
+    )
+
+
+def _inline(file: str, prefix: str) -> Html:
+    """Return what a file in SVG draws: without its head, hundredths of a pixel, names and frames to cut at.
+
+    All that is drawn lies in the frame. Names that are pointed at, those of markers, stay, behind the prefix: a page of
+    two charts would have them twice.
+    """
+    shapes = file[file.index("<g ") : file.rindex("</svg>")]
+    needless = r'<clipPath.*?</clipPath>|<!--.*?-->| clip-path="[^"]*"|(?<=\d\.\d)\d+(?=[^<>]*>)'
+    shapes = re.sub(needless, "", shapes, flags=re.DOTALL)
+    pointed = set(re.findall(r'href="#([^"]+)"', shapes))
+    shapes = re.sub(r' id="([^"]*)"', lambda one: f' id="{prefix}{one[1]}"' if one[1] in pointed else "", shapes)
+    shapes = re.sub(r'href="#', f'href="#{prefix}', shapes)
+    shapes = re.sub(r"<defs>\s*</defs>", "", shapes)
+    for name, color in (*COLORS.items(), *OF_FIGURES.items()):
+        shapes = shapes.replace(color, f"var(--{name})")
+    return Html(shapes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 from advsearch.described import NOT_A_NUMBER
 
@@ -50,24 +50,17 @@ MOST_DECIMALS = 4
 PROBABILITY_DECIMALS = 1
 """Of a probability that a model gives."""
 
-_TAKES = (SEGMENTATION, SIMILARITY)
-"""Tasks of which an answer takes the object for something."""
 WHOLE = ("background", "itself", "something else")
 """Answers without an article."""
 
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
+_DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
+_DOING |= {"answers": "answering"}
 
-class Said(Protocol):
-    """An answer of a model: `advsearch.tasks.Answer`, or what a result holds of one."""
 
-    @property
-    def label(self) -> str:
-        """In words."""
-
-    @property
-    def probability(self) -> float | None:
-        """In [0, 1], of what the task says; None where there is none."""
+Said = Any
+"""An answer of a model: `advsearch.tasks.Answer`, or what a result holds of one."""
 
 
 def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
@@ -196,32 +189,23 @@ def calls(task: str, thing: str, label: str) -> str:
     """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
     if label == NOT_A_NUMBER:
         return f"answers nothing for {thing}, for its answer is not a number"
-    if task == SEGMENTATION and label.startswith(_NONE):
+    if task in (SEGMENTATION, DETECTION) and label.startswith(_NONE):
         return f"finds {label}"
+    if task == DETECTION and label.endswith(_ELSEWHERE):
+        return f"sees {with_article(label.removesuffix(_ELSEWHERE))} where there is none"
     if task == CLASSIFICATION:
         return f"calls {thing} {with_article(label)}"
-    if task == DETECTION:
-        return _detects("finds", "sees", "takes", thing, label)
     if task == DEPTH:
         return f"judges {thing} {label}"
-    return f"takes {thing} for {_stuff(label)}" if task in _TAKES else f'answers "{label}" for {thing}'
+    if task in (DETECTION, SEGMENTATION, SIMILARITY):
+        return f"takes {thing} for {label if label in WHOLE and task != DETECTION else with_article(label)}"
+    return f'answers "{label}" for {thing}'
 
 
 def calling(task: str, label: str) -> str:
     """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
-    if task == SEGMENTATION and label.startswith(_NONE):
-        return f"finding {label}"
-    if task == CLASSIFICATION:
-        return f"calling it {with_article(label)}"
-    if task == DETECTION:
-        return _detects("finding", "seeing", "taking", "it", label)
-    if task == DEPTH:
-        return f"judging it {label}"
-    return f"taking it for {_stuff(label)}" if task in _TAKES else f'answering "{label}"'
-
-
-def _stuff(label: str) -> str:
-    return label if label in WHOLE else with_article(label)
+    verb, _, rest = calls(task, "it", label).partition(" ")
+    return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
 
 
 def _similar(share: str, kept: Any) -> str:
@@ -231,11 +215,3 @@ def _similar(share: str, kept: Any) -> str:
     if "rank" not in kept:
         return f"cosine {kept['cosine']:.2f}"
     return f"{share}, right one at rank {kept['rank']} of {kept['references']}" if kept["rank"] > 1 else share
-
-
-def _detects(finds: str, sees: str, takes: str, thing: str, label: str) -> str:
-    if label.startswith(_NONE):
-        return f"{finds} {label}"
-    if label.endswith(_ELSEWHERE):
-        return f"{sees} {with_article(label.removesuffix(_ELSEWHERE))} where there is none"
-    return f"{takes} {thing} for {with_article(label)}"

@@ -45,15 +45,9 @@ LARGEST_PROFILE = 16 << 20
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A picture with its size.
-
-    Attributes:
-        name: what it is, as is printed beside it.
-        picture: (h, w, 3) uint8 sRGB, bleed included.
-        pixel: width and height of one pixel, millimetres.
-        bleed: pixels on each side that belong to the bleed, in columns and in rows.
-        inside: (h, w) what is cut out, where it is less than the rectangle within the bleed.
-    """
+    """A picture with a name that is printed beside it: (h, w, 3) uint8 sRGB, with `bleed` pixels on each side, in
+    columns and in rows. Width and height of one pixel are in millimetres; `inside` (h, w) is what is cut out, where it
+    is less than the rectangle within the bleed."""
 
     name: str
     picture: Bytes
@@ -70,13 +64,10 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A part of a piece on a page.
+    """A part of a piece on a page, with the name that is printed beside it.
 
-    Attributes:
-        piece: whose.
-        name: what is printed beside it.
-        trim: first and last column and row of the part within the piece's picture, half-open: x0, x1, y0, y1.
-        x, y: left and upper edge of the trim on the page, millimetres from its upper left corner.
+    Trim: first and last column and row of the part within the piece's picture, half-open: x0, x1, y0, y1. Its left and
+    upper edge are at x and y on the page, millimetres from the upper left corner.
     """
 
     piece: Piece
@@ -128,11 +119,8 @@ def write_sheets(
 
 
 def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[list[Placed]]:
-    """Yield what is on each page: rows of parts, the highest first, from the upper left.
-
-    Raises:
-        InputError: a pixel is larger than a page, or there would be more than `SHEETS_EVER` pages.
-    """
+    """Yield what is on each page: rows of parts, the highest first, from the upper left. Raises InputError where a
+    pixel is larger than a page, or there would be more than `SHEETS_EVER` pages."""
     width, height = paper[0] - 2 * MARGIN, paper[1] - 2 * MARGIN - FOOT
     parts = [part for piece in pieces for part in _parts(piece, width, height)]
     parts.sort(key=lambda part: -_extent(part)[1])

@@ -1,11 +1,8 @@
 """What a sweep found beside its shares, in rows and sentences: over drives, on the surface, and from how far away.
 
-How far away a detector sees an object is the distance at which half of a sweep's pictures show it to the model. The
-share of pictures in which it is seen is taken to fall with the distance. The estimate is where the falling line through
-the counts crosses one half (isotonic regression by pooling adjacent violators, Ayer et al. 1955, linear in the
-logarithm of the distance). The interval is exact: with m distances each share is judged by the binomial test of one
-half at 0.025 / m on each side, so that all hold together with 95 %; it begins at the farthest distance at which the
-share is above one half for sure, and ends at the nearest one beyond it at which the share is below one half for sure.
+How far away a detector sees an object is the distance at which half of a sweep's pictures show it: where the falling
+line through the shares (isotonic regression, Ayer et al. 1955, linear in the logarithm of the distance) crosses one
+half. Its interval is exact: each of m shares is judged by the binomial test of one half at 0.025 / m on each side.
 """
 
 from __future__ import annotations
@@ -131,14 +128,8 @@ def distance_of(summary: SweepSummary) -> SeenFrom | None:
 
 
 def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
-    """Return the distance at which an object is first seen.
-
-    Args:
-        rows: of one axis, each with pictures: a distance, or both ends of a range of it, and the counts there.
-
-    Raises:
-        InputError: there are fewer than two distances.
-    """
+    """Return the distance at which an object is first seen, from the rows of one axis: a distance, or both ends of a
+    range of it, and the counts there. Raises InputError where there are fewer than two distances."""
     rows = sorted(rows, key=_middle)
     counted = [(_middle(row), row.correct, row.configurations) for row in rows]
     if len(counted) < 2:

@@ -6,17 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from advsearch.report.phrases import (
-    CLASSIFICATION,
-    SUCCESS_ABOVE_ZERO,
-    calling,
-    calls,
-    margin_text,
-    percent,
-    percent_number,
-    wanted,
-    with_article,
-)
+from advsearch.report import phrases
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
@@ -41,14 +31,14 @@ def attack_verdict(summary: AttackSummary) -> str:
     ending, verified = summary.ending, summary.verified
     thing = f"this {noun(summary)}"
     if ending == "already wrong":
-        wrong = calls(summary.task, thing, summary.clean.label)
+        wrong = phrases.calls(summary.task, thing, summary.clean.label)
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
     if verified is None and ending == "interrupted" and summary.adversarial:
-        says = calls(summary.task, thing, summary.adversarial.label)
+        says = phrases.calls(summary.task, thing, summary.adversarial.label)
         return f"Interrupted after {count(summary.steps, 'step')}. The answer so far is not verified: the model {says}."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
-    rate = rate_text(verified) + _each(summary)
+    rate = rate_text(verified) + (f", each with another {' and '.join(summary.over)}" if summary.over else "")
     claim = _claim(summary, thing)
     if ending == "found":
         return f"{_how_it_errs(summary, verified, thing)} in {rate}."
@@ -73,7 +63,7 @@ def remarks(summary: AttackSummary) -> list[str]:
         said.append(
             "The random search beside it found a worse configuration than the policy did "
             f"({own.successes} of {own.trials} with a margin of {own.margin:.2f}); that of the random search is the "
-            f"answer. The margin is {margin_text(summary.task)}."
+            f"answer. The margin is {phrases.margin_text(summary.task)}."
         )
     else:
         said += _against_random(summary)
@@ -105,7 +95,7 @@ def goal_text(summary: AttackSummary) -> str:
 def objective_text(summary: AttackSummary) -> str:
     """Return what came of an objective that is no margin, over the trials; empty where there is nothing to say."""
     tried = summary.tried_objective
-    if tried is None or summary.objective in SUCCESS_ABOVE_ZERO:
+    if tried is None or summary.objective in phrases.SUCCESS_ABOVE_ZERO:
         return ""
     parts = [
         f"{name} {one.mean:.3g} (from {one.low:.3g} to {one.high:.3g})"
@@ -161,7 +151,7 @@ def short_names(text: str) -> str:
 
 def interval_text(interval: Interval | None) -> str:
     """Return ``83-100 %`` for the interval of a rate."""
-    return f"{percent_number(interval[0])}-{percent_number(interval[1])} %" if interval else NO_INTERVAL
+    return f"{phrases.percent_number(interval[0])}-{phrases.percent_number(interval[1])} %" if interval else NO_INTERVAL
 
 
 def rate_text(rated: VerifiedRate) -> str:
@@ -207,7 +197,7 @@ def workers_text(shared: SharedWork | None) -> str:
         return ""
     told = [f"{shared.most} at most"]
     if shared.utilisation is not None:
-        told.append(f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}")
+        told.append(f"busy {phrases.percent(shared.utilisation)} of {seconds_text(shared.alive)}")
     told.append(f"loading took {seconds_text(shared.loading)}")
     counts = {"lost": shared.lost, "refused": shared.refused, "given out again": shared.retried}
     return ", ".join([*told, *(f"{number} {what}" for what, number in counts.items() if number)])
@@ -265,12 +255,8 @@ def print_cost_text(summary: AttackSummary) -> str:
 
 
 def formation_text(formation: Formation, gains: Mapping[str, float] | None = None) -> str:
-    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops, gain 1.35``.
-
-    Args:
-        formation: of the pictures.
-        gains: of several scenes, by their names.
-    """
+    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops, gain 1.35``; gains
+    of several scenes by their names."""
     height, width = formation.resolution
     denoised = "not denoised" if formation.denoiser == "none" else f"denoised ({formation.denoiser})"
     exposure = f"exposure {number_text(formation.exposure)} stops"
@@ -278,14 +264,12 @@ def formation_text(formation: Formation, gains: Mapping[str, float] | None = Non
     if formation.gain is not None:
         gain = f"gain {number_text(formation.gain)}"
     else:
-        each = "; ".join(f"{gain_name(name)} {number_text(value)}" for name, value in (gains or {}).items())
+        each = "; ".join(
+            f"{', '.join(map(short_name, name.split(', ')))} {number_text(value)}"
+            for name, value in (gains or {}).items()
+        )
         gain = "a gain for each scene" + (f": {each}" if each else "")
     return f"{made}, sampler {formation.sampler}, {gain}"
-
-
-def gain_name(name: str) -> str:
-    """Return an object and an environment without their folders."""
-    return ", ".join(short_name(one) for one in name.split(", "))
 
 
 def number_text(value: Any) -> str:
@@ -299,14 +283,14 @@ def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> 
         return f"The model recognises {thing}, more surely than in the clean scene,"
     answers = verified.labels
     if len(answers) == 1:
-        return f"The model {calls(summary.task, thing, next(iter(answers)))}"
+        return f"The model {phrases.calls(summary.task, thing, next(iter(answers)))}"
     if answers:
         most = max(answers, key=lambda label: answers[label])
         what = "takes {} for one of the targets" if summary.target else "is wrong about {}"
-        return f"The model {what.format(thing)}, most often {calling(summary.task, most)},"
-    if summary.task != CLASSIFICATION:
+        return f"The model {what.format(thing)}, most often {phrases.calling(summary.task, most)},"
+    if summary.task != phrases.CLASSIFICATION:
         return f"The model is wrong about {thing}"
-    called = with_article(summary.adversarial.label) if summary.adversarial else "something else"
+    called = phrases.with_article(summary.adversarial.label) if summary.adversarial else "something else"
     return f"The model takes {thing} for something else ({called})"
 
 
@@ -314,7 +298,7 @@ def _claim(summary: AttackSummary, thing: str) -> str:
     """Return what a trial counts as, as a clause: "the model is wrong about this mug"."""
     if summary.minimises:
         return f"the model recognises {thing}, more surely than in the clean scene,"
-    if summary.target and summary.task == CLASSIFICATION:
+    if summary.target and summary.task == phrases.CLASSIFICATION:
         return f"the model calls {thing} {_a_target(summary)}"
     if summary.target:
         return f"the model answers {' or '.join(summary.target)}"
@@ -325,16 +309,15 @@ def _wanted(summary: AttackSummary, thing: str) -> str:
     """Return what was looked for, as a clause: "makes the model miss this mug"."""
     if summary.minimises:
         return f"makes {thing} easier to recognise"
-    return f"makes the model call {thing} {_a_target(summary)}" if summary.target else wanted(summary.objective, thing)
+    return (
+        f"makes the model call {thing} {_a_target(summary)}"
+        if summary.target
+        else phrases.wanted(summary.objective, thing)
+    )
 
 
 def _a_target(summary: AttackSummary) -> str:
-    return " or ".join(with_article(name) for name in summary.target or ())
-
-
-def _each(summary: AttackSummary) -> str:
-    """Return what is said of the renders of an answer that holds for many conditions."""
-    return f", each with another {' and '.join(summary.over)}" if summary.over else ""
+    return " or ".join(phrases.with_article(name) for name in summary.target or ())
 
 
 def _against_random(summary: AttackSummary) -> list[str]:

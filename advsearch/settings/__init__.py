@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from advsearch.settings.configuration import FILES, Config
-from advsearch.settings.declaration import Clash, Setting, setting, setting_as_in, settings
+from advsearch.settings.configuration import FILES, Clash, Config, Setting, setting, setting_as_in, settings
 from advsearch.settings.values import (
     HEADER,
     all_finite,
@@ -24,24 +23,7 @@ from advsearch.settings.values import (
 )
 
 __all__ = [
-    "FILES",
-    "HEADER",
-    "Clash",
-    "Config",
-    "Setting",
-    "all_finite",
-    "as_python",
-    "as_text",
-    "check_once",
-    "each_once",
-    "is_shallow",
-    "number_or_text",
-    "parse_assignment",
-    "read_yaml",
-    "setting",
-    "setting_as_in",
-    "settings",
-    "shown",
-    "split_names",
-    "texts",
-]
+    "FILES", "HEADER", "Clash", "Config", "Setting", "all_finite", "as_python", "as_text", "check_once", "each_once",
+    "is_shallow", "number_or_text", "parse_assignment", "read_yaml", "setting", "setting_as_in", "settings", "shown",
+    "split_names", "texts",
+]  # fmt: skip

@@ -1,34 +1,174 @@
-"""A typed configuration: what a command needs to know, checked as a whole, and as words of a command line."""
+"""What is declared of a setting, for the help, the docs, errors and checks alike, and configurations made of settings.
+
+A configuration is what a command needs to know, checked as a whole, and as words of a command line.
+"""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ConfigDict, PrivateAttr, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.files import JsonObject
-from advsearch.settings.declaration import Clash, Setting, settings
-from advsearch.settings.values import (
-    HEADER,
-    NAMED,
-    SCHEMA,
-    all_finite,
-    as_python,
-    is_file,
-    is_shallow,
-    put,
-    read_yaml,
-    shown,
-    split_names,
-)
+from advsearch.settings import values as written
 
 if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
     from typing_extensions import Self
+
+
+Form = Literal["text", "switch", "names", "assignments", "axes", "choices", "controls"]
+"""How a setting is written on a command line: as text; as a flag alone; or as what may come again: names, NAME=VALUE,
+NAME=VALUES, NAME=CHOICE or a choice for all, NAME or NAME={OPTION: VALUE}."""
+
+
+def setting(
+    default: Any,
+    group: str,
+    description: str,
+    expects: str = "",
+    *,
+    unit: str = "",
+    otherwise: str = "",
+    flag: str = "",
+    metavar: str = "",
+    form: Form = "text",
+    switched: str = "",
+    **constraints: Any,
+) -> Any:
+    """Return a pydantic field.
+
+    Args:
+        default: the default, a function that makes it, or ... for none.
+        group: heading in the help.
+        description: what it is.
+        expects: completes "expected ..." in errors, and names the range in the help; empty where type and constraints
+            say it.
+        unit: of the value.
+        otherwise: what a default of None comes to.
+        flag: its flag, where that is not its name: "--control".
+        metavar: what stands for the value in the help, where that is not the last word of its name.
+        form: how it is written on a command line; what is true or false is a switch.
+        switched: what the flag does, where that is the opposite of the description.
+        constraints: as of `pydantic.Field`.
+    """
+    notes: JsonObject = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise, "flag": flag}
+    notes |= {"metavar": metavar, "form": form, "switched": switched}
+    declared: Any = {"default": default, "description": description, **notes, **constraints}
+    alias = constraints.pop("alias", None)
+    make = {"default_factory": default} if callable(default) else {"default": default}
+    extra = {**notes, "declared": declared}
+    return Field(**make, description=description, json_schema_extra=extra, alias=alias, **constraints)
+
+
+def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
+    """Return a setting as another command declares it, but for some of the arguments of `setting`."""
+    extra: Any = config.model_fields[field].json_schema_extra
+    return setting(**{**extra["declared"], **changes})
+
+
+class Clash(NamedTuple):
+    """A setting, by its field, that says nothing, or the opposite of another one, `with_others` that are such. It
+    counts as given where it differs from its default; `why` completes "setting: ..." and says what to do."""
+
+    setting: str
+    with_others: Callable[[Any], object]
+    why: str
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the help and the docs say about one setting.
+
+    Attributes:
+        field: attribute of the configuration.
+        name: its name in YAML.
+        flag: its flag on the command line.
+        group: the heading it stands under: scene, model, search, verification or run.
+        description: what it is.
+        expects: the values it takes, with their range.
+        unit: the unit of the value; may be empty.
+        default: the default; None when there is none.
+        otherwise: what a default of None comes to; may be empty.
+        required: whether it must be given.
+        metavar: what stands for its value in the help.
+        form: how it is written on a command line.
+        switched: what its flag does, where that is the opposite of the description; may be empty.
+    """
+
+    field: str
+    name: str
+    flag: str
+    group: str
+    description: str
+    expects: str
+    unit: str
+    default: Any
+    otherwise: str
+    required: bool
+    metavar: str
+    form: Form
+    switched: str
+
+    @property
+    def text(self) -> str:
+        """What it is, its values with range and unit, and its default."""
+        unit = f", in {self.unit}" if self.unit else ""
+        default = self.otherwise if self.default is None else str(self.default)
+        if isinstance(self.default, dict):
+            default = ",".join(self.default)
+        elif isinstance(self.default, float):
+            default = f"{self.default:g}"
+        return f"{self.description}: {self.expects}{unit}" + (f" (default: {default})" if default else "")
+
+
+def settings(config: type[Config]) -> tuple[Setting, ...]:
+    """Return every setting of a configuration, in the order in which they are shown."""
+    declared = []
+    for field, info in config.model_fields.items():
+        if field in config.without:
+            continue
+        notes: Any = info.json_schema_extra
+        declared.append(
+            Setting(
+                field=field,
+                name=info.alias or field,
+                flag=notes["flag"] or "--" + field.replace("_", "-"),
+                group=notes["group"],
+                description=info.description or "",
+                expects=notes["expects"] or _expected(info),
+                unit=notes["unit"],
+                default=None if info.is_required() else info.get_default(call_default_factory=True),
+                otherwise=notes["otherwise"],
+                required=info.is_required(),
+                metavar=notes["metavar"] or field.rpartition("_")[2].upper(),
+                form="switch" if info.annotation is bool else notes["form"],
+                switched=notes["switched"],
+            )
+        )
+    return tuple(declared)
+
+
+def _expected(info: FieldInfo) -> str:
+    """What type and constraints of a field say of its values."""
+    kinds = [one for one in get_args(info.annotation) or (info.annotation,) if one is not type(None)]
+    if kinds == [bool]:
+        return "true or false"
+    if get_origin(info.annotation) is Literal or get_origin(kinds[0]) is Literal:
+        *first, last = kinds if get_origin(info.annotation) is Literal else get_args(kinds[0])
+        return f"{', '.join(first)} or {last}"
+    limits = {name: getattr(one, name) for one in info.metadata for name in ("ge", "gt", "le") if hasattr(one, name)}
+    number = "a whole number" if kinds == [int] else "a number"
+    most = limits["le"] if kinds == [int] else f"{limits['le']:g}".replace("e+0", "e")
+    if "gt" in limits:
+        return f"{number} greater than {limits['gt']:g} and at most {most}"
+    return f"{number} from {limits['ge']:g} to {most}"
 
 
 def as_flags(setting: Setting, value: Any) -> list[str]:
@@ -44,7 +184,7 @@ def as_flags(setting: Setting, value: Any) -> list[str]:
     if setting.field == "epsilon" and isinstance(value, (dict, tuple)):
         pairs = [f"{name}={_number(given)}" for name, given in value.items()] if isinstance(value, dict) else value
         return [setting.flag, ",".join(str(one) for one in pairs)]
-    if setting.field in NAMED and isinstance(value, dict):
+    if setting.field in written.NAMED and isinstance(value, dict):
         options = {name: given for name, given in value.items() if name != "name"}
         return [setting.flag, f"{value['name']}={_flow(options)}"]
     if setting.field == "resolution":
@@ -75,11 +215,8 @@ FILES = (
 
 
 class SettingsError(InputError):
-    """One or more settings have values that are not allowed.
-
-    Attributes:
-        problems: pairs of a setting's name and what is wrong with it.
-    """
+    """One or more settings have values that are not allowed: `problems` are pairs of a setting's name and what is wrong
+    with it."""
 
     def __init__(self, problems: tuple[tuple[str, str], ...], file: str | Path = "") -> None:
         where = f"{file}: " if file else ""
@@ -109,11 +246,11 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     def __init__(self, **data: Any) -> None:
-        deep = {name: value for name, value in data.items() if not is_shallow(value)}
+        deep = {name: value for name, value in data.items() if not written.is_shallow(value)}
         if deep:
             raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
         try:
-            super().__init__(**as_python(data))
+            super().__init__(**written.as_python(data))
         except ValidationError as error:
             raise _settings_error(type(self), error.errors(include_url=False)) from None
 
@@ -129,7 +266,7 @@ class Config(BaseModel):
     @classmethod
     def _finite(cls, value: Any) -> Any:
         """Refuse NaN and infinity however deep they are, and whole numbers that no machine has."""
-        if not all_finite(value):
+        if not written.all_finite(value):
             raise ValueError("not finite")
         return value
 
@@ -159,10 +296,10 @@ class Config(BaseModel):
             FileFormatError: the file is missing, empty or not such a mapping.
             InputError: as for the class; the message names the file.
         """
-        data = {name: value for name, value in read_yaml(path).items() if name not in ("schema", "command")}
+        data = {name: value for name, value in written.read_yaml(path).items() if name not in ("schema", "command")}
         data = cls.of_this_version(data)
         for name, value in (overrides or {}).items():
-            put(data, name, value)
+            written.put(data, name, value)
         try:
             return cls(**data)
         except SettingsError as error:
@@ -190,12 +327,8 @@ class Config(BaseModel):
 
     @classmethod
     def of(cls, other: Config, **changes: object) -> Self:
-        """Return what another command's configuration describes as one of this, in a place of its own.
-
-        Args:
-            other: gives the settings that are `shared`.
-            **changes: settings that are different.
-        """
+        """Return what another command's configuration describes as one of this, in a place of its own: the settings
+        that are `shared`, but for the changes."""
         return cls(**{**cls.shared(other), **changes}).with_only_here(other.only_here)
 
     @property
@@ -211,9 +344,9 @@ class Config(BaseModel):
 
     def to_yaml(self) -> str:
         """Return the YAML form; `from_yaml` of it gives an equal configuration."""
-        data = {"schema": SCHEMA, "command": self.command, **self.plain()}
+        data = {"schema": written.SCHEMA, "command": self.command, **self.plain()}
         note = f"# But it can't be: {self._in_words()}\n" if self._only_here else ""
-        return HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
+        return written.HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
 
     def plain(self) -> JsonObject:
         """Return every setting by the name it has in YAML, as JSON values."""
@@ -238,8 +371,10 @@ class Config(BaseModel):
         """Return the settings that decide a run's numbers, as JSON values: all that are not `free`. Files have their
         names only, since they may have been moved."""
         given = {name: value for name, value in self.plain().items() if name not in self.free}
-        files = {name: _bare(value) for name in FILES if isinstance(value := given.get(name), str)}
-        return {**given, **files}
+        for name in FILES:
+            if isinstance(value := given.get(name), str):
+                given[name] = ",".join(Path(part).name for part in written.split_names(value))
+        return given
 
     def command_line(self) -> str:
         """Return the shell command that repeats this in a place of its own: all settings that are not the default.
@@ -257,7 +392,7 @@ class Config(BaseModel):
 
     def _in_words(self) -> str:
         """What only this Python session has, in a sentence."""
-        *first, last = map(shown, self._only_here)
+        *first, last = map(written.shown, self._only_here)
         listed = f"{', '.join(first)} and {last}" if first else last
         return f"{listed} {'exist' if first else 'exists'} only in the Python session that asked."
 
@@ -271,24 +406,19 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
         name = str(error["loc"][0])
         if name not in known:
             return UnknownNameError("setting", name, {one.name for one in declared})
-        got = "nothing" if error["type"] == "missing" else shown(error["input"])
+        got = "nothing" if error["type"] == "missing" else written.shown(error["input"])
         if known[name].form in ("assignments", "controls") and len(error["loc"]) > 1:
             got = f"{error['loc'][1]}={got}"
         problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
     return SettingsError(tuple(problems.items()))
 
 
-def _bare(value: str) -> str:
-    """Return names with no folders before them."""
-    return ",".join(Path(part).name for part in split_names(value))
-
-
 def _absolute(value: str | None) -> str | None:
     """Return the absolute path of `value` where it is a file, and the name it is otherwise; of a list, each part."""
-    return None if value is None else ",".join(map(_absolute_file, split_names(value)))
+    return None if value is None else ",".join(map(_absolute_file, written.split_names(value)))
 
 
 def _absolute_file(name: str) -> str:
-    path, mark, part = (name, "", "") if is_file(name) else name.partition("#")
-    is_path = ("/" in path or Path(path).suffix != "") and is_file(path)
+    path, mark, part = (name, "", "") if written.is_file(name) else name.partition("#")
+    is_path = ("/" in path or Path(path).suffix != "") and written.is_file(path)
     return f"{Path(path).resolve()}{mark}{part}" if is_path else name

@@ -40,11 +40,8 @@ def as_python(value: Any) -> Any:
 
 
 def as_text(value: Any, *, several: bool = False) -> Any:
-    """Return what names something as a text: a path, a number, or a list of such where there may be several.
-
-    Raises:
-        ValueError: it can't be a name, or there are several where one is expected.
-    """
+    """Return what names something as a text: a path, a number, or a list of such where there may be several. Raises
+    ValueError where it can't be a name, or there are several where one is expected."""
     parts = value if isinstance(value, (list, tuple)) else [value]
     if not parts or not all(isinstance(one, (str, Path, int)) and not isinstance(one, bool) for one in parts):
         return value
@@ -98,12 +95,7 @@ def number_or_text(value: Any) -> Any:
 def parse_assignment(text: str, where: str) -> tuple[str, Any]:
     """Return the name and the value of ``NAME=VALUE``; the value is read as YAML, and as plain text where it is none.
 
-    Args:
-        text: the assignment.
-        where: what the error names: ``"--set"``, say.
-
-    Raises:
-        InputError: there is no ``=``, or the name is empty.
+    Raises InputError, which names `where` ("--set", say): there is no ``=``, or the name is empty.
     """
     name, separator, value = text.partition("=")
     if not (separator and name.strip()):
@@ -129,11 +121,7 @@ def is_file(name: str) -> bool:
 
 
 def check_once(names: Iterable[str], setting: str) -> None:
-    """Check that nothing is given twice.
-
-    Raises:
-        InputError: a name comes twice; the message names the setting.
-    """
+    """Check that nothing is given twice. Raises InputError where a name comes twice; the message names the setting."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise InputError(f"{setting}: {twice[0]} is given twice; leave one of them out")

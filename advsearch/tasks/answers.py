@@ -26,13 +26,8 @@ MOST = 256
 
 
 class Utterance(TypedDict):
-    """What a model says of one picture.
-
-    Attributes:
-        text: in words.
-        logits: (T, tokens) float32, of all that it could have said at each step; it took the largest.
-        begins: from a word to the numbers of the tokens that may begin it; empty where none does.
-    """
+    """What a model says of one picture: the text, logits (T, tokens) float32 of all that it could have said at each
+    step, of which it took the largest, and from a word to the tokens that may begin it, where any does."""
 
     text: str
     logits: Tensor
@@ -73,22 +68,17 @@ class FreeAnswer(Task):
         return replace(self, target=None if target is None else _words("target", target), minimise=minimise)
 
     def read(self, answer: Any, count: int) -> list[Utterance]:
-        """See `Task.read`: what `Utterance` describes, for each picture."""
         keys = Utterance.__required_keys__
         if isinstance(answer, (list, tuple)) and all(isinstance(one, Mapping) and keys <= one.keys() for one in answer):
             return list(answer)
         raise ValueError("expected a mapping with text, logits and begins for each picture, as answers in words have")
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`: something has to be right."""
         self.truth(facts)
 
     def truth(self, facts: Facts) -> Words:
-        """Return the right words: what was said, or else the object's own label.
-
-        Raises:
-            InputError: there are none, or one is the target too.
-        """
+        """Return the right words: what was said, or else the object's own label. Raises InputError where there are
+        none, or one is the target too."""
         text = facts.own_label if facts.label is None else facts.label
         if text is None:
             raise InputError(f"label: expected the right words for {facts.object}, got none")
@@ -98,11 +88,9 @@ class FreeAnswer(Task):
         return right
 
     def truth_names(self, truth: Words) -> Words:
-        """Return the right words."""
         return truth
 
     def margin(self, output: Sequence[Utterance], truth: Words) -> Tensor:
-        """See `FreeAnswer`, (N,): over 0 exactly where the text has none of the words."""
         return torch.stack([_margin(one, truth) for one in output])
 
     def answers(self, output: Sequence[Utterance], count: int = 1) -> list[tuple[Answer, ...]]:

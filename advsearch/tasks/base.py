@@ -33,13 +33,8 @@ Own = TypeVar("Own", bound="Task")
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer of a model to a picture.
-
-    Attributes:
-        label: in words.
-        index: its number among the model's classes; None where there are no classes.
-        probability: in [0, 1]; None where the model gives none.
-    """
+    """One answer of a model to a picture: a label in words, its number among the model's classes, where there are any,
+    and a probability, where the model gives one."""
 
     label: str
     index: int | None = None
@@ -87,6 +82,10 @@ class Judgement:
         return self.answer.label == NOT_A_NUMBER
 
 
+Said = tuple[Answer, JsonValue]
+"""What a model says of a picture, and what else is kept of it."""
+
+
 @dataclass(frozen=True)
 class Mark:
     """What a picture shows of an answer, or of what is true: a box, or the pixels of a mask.
@@ -108,13 +107,8 @@ class Mark:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the camera sees first through the middle of each pixel of a picture, without noise.
-
-    Attributes:
-        mask: (H, W) bool, where it is the object.
-        depth: (H, W) float, how far it is, see `Facts.depth`.
-        z_depth: (H, W) float, see `Facts.z_depth`.
-    """
+    """What the camera sees first through the middle of each pixel of a picture, without noise: where it is the object,
+    (H, W) bool, and how far it is, (H, W) float, as in `Facts.depth` and in `Facts.z_depth`."""
 
     mask: Tensor
     depth: Tensor
@@ -141,11 +135,8 @@ class Facts:
 
     @cached_property
     def sight(self) -> Sight:
-        """What is seen of the configuration; the camera looks when this is asked for, and once.
-
-        Raises:
-            InputError: no configuration is meant.
-        """
+        """What is seen of the configuration; the camera looks when this is asked for, and once. Raises InputError for
+        no configuration is meant."""
         if self.look is None:
             raise InputError(
                 f"the task needs to see {self.object}, which depends on the configuration; set `varies = True` on it"
@@ -177,11 +168,8 @@ class Facts:
 
     @property
     def z_depth(self) -> Tensor:
-        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives.
-
-        Raises:
-            InputError: as for `sight`.
-        """
+        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives. Raises
+        InputError as for `sight`."""
         return self.sight.z_depth
 
     @cached_property
@@ -202,11 +190,8 @@ class Facts:
         return self.describe()
 
     def number(self, name: str) -> float:
-        """Return the number that a parameter has in this configuration.
-
-        Raises:
-            InputError: nothing in the scene is called that.
-        """
+        """Return the number that a parameter has in this configuration. Raises InputError where nothing in the scene is
+        called that."""
         if name not in self.numbers:
             known = ", ".join(sorted(self.numbers)) or "none"
             raise InputError(
@@ -244,15 +229,20 @@ class Task(ABC):
     minimise: bool = field(default=False, metadata=FROM_RUN)
     target: Truth = field(default=None, metadata=FROM_RUN)
 
+    def check_numbers(self, fits: Callable[[float], bool], expected: str, *names: str) -> None:
+        """Check options that are numbers. Raises InputError where one is none, or does not fit; it says what was
+        `expected`."""
+        for name in names:
+            value: object = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not fits(value):
+                raise InputError(f"task {self.name}: {name}: expected {expected}, got {value!r}")
+
     # ---- what a task has to say -------------------------------------------------------------------------------------
 
     @abstractmethod
     def truth(self, facts: Facts) -> Truth:
-        """Return what is true of the scene.
-
-        Raises:
-            InputError: the facts do not say it, or the model cannot answer it.
-        """
+        """Return what is true of the scene. Raises InputError where the facts do not say it, or the model cannot answer
+        it."""
 
     @abstractmethod
     def margin(self, output: Output, truth: Truth) -> Tensor:
@@ -285,12 +275,8 @@ class Task(ABC):
         return False
 
     def seeing(self: Own, output: Output, truth: Truth | None) -> Own:
-        """Return the task with what its model's answer to a clean picture of the scene shows of how answers are read.
-
-        Args:
-            output: of one picture.
-            truth: of the scene; None where nobody knows it.
-        """
+        """Return the task with what its model's answer to one clean picture of the scene shows of how answers are read;
+        the truth is None where nobody knows it."""
         return self
 
     @property
@@ -328,11 +314,8 @@ class Task(ABC):
         return self
 
     def check(self, facts: Facts) -> None:
-        """Refuse a scene of which nothing could be judged, before anything is rendered.
-
-        Raises:
-            InputError: as for `truth`.
-        """
+        """Refuse a scene of which nothing could be judged, before anything is rendered. Raises InputError as for
+        `truth`."""
         if not self.varies:
             self.truth(facts)
 
@@ -382,12 +365,14 @@ class Task(ABC):
 
     def judge(self, output: Output, truth: Truth) -> list[Judgement]:
         """Return what is to be said of each of N outputs."""
-        scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
-        answers, payloads = self.answers(output), self.payloads(output)
-        return [
-            Judgement.of(score, margin, first, payload)
-            for score, margin, (first, *_), payload in zip(scores, margins, answers, payloads, strict=True)
-        ]
+        with torch.no_grad():
+            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+            each = zip(scores, margins, self.said(output, truth, margins), strict=True)
+            return [Judgement.of(score, margin, *said) for score, margin, said in each]
+
+    def said(self, output: Output, truth: Truth, margins: Sequence[float]) -> list[Said]:
+        """Return the answer to each of N pictures, and what is kept beside it; `margins` are theirs."""
+        return [(first, kept) for (first, *_), kept in zip(self.answers(output), self.payloads(output), strict=True)]
 
 
 def typical(judgements: Sequence[Judgement]) -> Judgement:

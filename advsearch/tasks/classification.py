@@ -50,25 +50,19 @@ class ClassTask(Task):
             raise InputError("minimise: makes the right answer easier to give; leave `target` out")
 
     def on(self: Own, model: Model, *, target: str | None = None, minimise: bool = False) -> Own:
-        """See `Task.on`: the target is one of the model's classes, or several.
-
-        Raises:
-            InputError: there is no such class, or the model's answers are not what the task reads.
-        """
+        """See `Task.on`: the target is one of the model's classes, or several. Raises InputError where there is no such
+        class, or the model's answers are not what the task reads."""
         if self.reads_logits != (model.read is None):
-            raise InputError(f"model {model.name}: {self._other_reader}")
+            other = f'it was loaded for its logits; load it with task="{self.name}"'
+            if self.reads_logits:
+                other = "expected logits, and it was loaded for another task; leave `read` out"
+            raise InputError(f"model {model.name}: {other}")
         labels, named = (model.labels, model.named) if self.reads_logits else self._names(model)
         try:
             wanted = None if target is None else find_label_set(target, labels, named=named).indices
         except InputError as error:
             raise InputError(f"target: {error}") from None
         return replace(self, labels=labels, named=named, target=wanted, minimise=minimise)
-
-    @property
-    def _other_reader(self) -> str:
-        if self.reads_logits:
-            return "expected logits, and it was loaded for another task; leave `read` out"
-        return f'it was loaded for its logits; load it with task="{self.name}"'
 
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
         """The names of the classes that a model answers with, and whether they are names."""
@@ -86,11 +80,8 @@ class ClassTask(Task):
         return None
 
     def right_classes(self, facts: Facts) -> Labels:
-        """Return the indices of the right classes: what was said, or else the object's own label.
-
-        Raises:
-            InputError: the model has no such class, the object has no label, or a target is right.
-        """
+        """Return the indices of the right classes: what was said, or else the object's own label. Raises InputError
+        where the model has no such class, the object has no label, or a target is right."""
         text = facts.own_label if facts.label is None else facts.label
         if text is None:
             raise InputError(f"label: expected the right answers for {facts.object}, got none")
@@ -149,7 +140,6 @@ class Classification(ClassTask):
         return output.index_fill(1, torch.tensor(sorted(nothing), device=output.device), -math.inf)
 
     def margin(self, output: Tensor, truth: Labels) -> Tensor:
-        """See `wrong_lead`."""
         return wrong_lead(self.answerable(output, truth), truth)
 
     def score(self, output: Tensor, truth: Labels) -> Tensor:
@@ -185,7 +175,6 @@ class Classification(ClassTask):
         return [Judgement.of(score, margin, first) for score, margin, (first,) in rows]
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
-        """Return the names of classes."""
         return self.names(truth)
 
 
@@ -194,35 +183,22 @@ class Classification(ClassTask):
 
 def wrong_lead(logits: Tensor, right: Labels) -> Tensor:
     """Return the largest wrong logit minus the largest right one, (N,): over 0 exactly where the answer is wrong.
-
-    Raises:
-        InputError: as for `members`.
-    """
+    Raises InputError as for `members`."""
     inside = members(logits, right)
     return logits.masked_fill(inside, -math.inf).amax(dim=1) - logits.masked_fill(~inside, -math.inf).amax(dim=1)
 
 
 def target_lead(logits: Tensor, targets: Labels) -> Tensor:
     """Return the largest logit of the targets minus the largest other one, (N,): over 0 exactly where one is answered.
-
-    Raises:
-        InputError: as for `members`.
-    """
+    Raises InputError as for `members`."""
     inside = members(logits, targets, "target")
     return logits.masked_fill(~inside, -math.inf).amax(dim=1) - logits.masked_fill(inside, -math.inf).amax(dim=1)
 
 
 def members(logits: Tensor, labels: Labels | Tensor, setting: str = "label") -> Tensor:
-    """Return (C,) bool, true for the classes of a label set; checks the logits and the labels.
-
-    Args:
-        logits: (N, C).
-        labels: class indices, which are right for all N.
-        setting: what an error names.
-
-    Raises:
-        InputError: logits of another shape, no index, one out of range, or all classes.
-    """
+    """Return (C,) bool, true for the classes of a label set; checks the logits (N, C) and the labels, which are right
+    for all N. Raises InputError, which names the setting: logits of another shape, no index, one out of range, or all
+    classes."""
     if logits.ndim != 2:
         raise InputError(f"model output: expected logits of shape (N, classes), got {tuple(logits.shape)}")
     classes = logits.shape[1]

@@ -20,9 +20,10 @@ from torch import Tensor
 
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
+from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task
+from advsearch.tasks.base import Answer, Facts, Mark, Said, Task
 
 ASIDE = 0.1
 """Cosine of the angle to the camera's axis from which on z-depth is no distance any more."""
@@ -64,12 +65,8 @@ Map = Mapping[str, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """What is true of a picture: where the object is seen, and how far everything is.
-
-    Attributes:
-        mask: (H, W) bool, the pixels in which the object is seen.
-        z: (H, W) z-depth in object sizes; infinite where there is nothing.
-    """
+    """What is true of a picture: in which pixels the object is seen, (H, W) bool, and the z-depth of everything in
+    object sizes, (H, W); infinite where there is nothing."""
 
     mask: Tensor
     z: Tensor
@@ -143,10 +140,8 @@ class Depth(Task):
     missing: str = field(default="", metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
-        for name, low, high in (("tolerance", 0.0, LARGEST), ("size", -1e-9, 1e6)):
-            value: object = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low < value < high:
-                raise InputError(f"task depth: {name}: expected a number over 0, under {high:g}, got {value!r}")
+        self.check_numbers(lambda value: 0.0 < value < LARGEST, "a number over 0, under 100", "tolerance")
+        self.check_numbers(lambda value: -1e-9 < value < 1e6, "a number over 0, under 1e+06", "size")
         for name, known in (("kind", KINDS), ("seek", GOALS)):
             if getattr(self, name) not in ("", *known):
                 raise InputError(f"task depth: {name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
@@ -154,11 +149,8 @@ class Depth(Task):
     # ---- what is read -----------------------------------------------------------------------------------------------
 
     def read(self, answer: Any, count: int) -> list[Map]:
-        """Return the map (h, w) of each picture in what a network answered, by what its numbers are.
-
-        Raises:
-            ValueError: there is none.
-        """
+        """Return the map (h, w) of each picture in what a network answered, by what its numbers are. Raises ValueError
+        where there is none."""
         kind = ""
         if isinstance(answer, Mapping):
             kind = next((one for one in KINDS if one in answer), "")
@@ -178,11 +170,8 @@ class Depth(Task):
         return [{kind: one} for one in answer.float()]
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Depth:
-        """See `Task.on`.
-
-        Raises:
-            InputError: the model was loaded for another task or with names of classes, or there is a target.
-        """
+        """See `Task.on`. Raises InputError where the model was loaded for another task or with names of classes, or
+        there is a target."""
         if model.read is None:
             raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="depth"')
         if model.labels:
@@ -192,12 +181,10 @@ class Depth(Task):
         return super().on(model, target=target, minimise=minimise)
 
     def seeking(self, objective: str) -> Depth:
-        """See `Task.seeking`: the objectives of depth say what counts as success."""
         return replace(self, seek=objective) if objective in GOALS else self
 
     @property
     def looks(self) -> bool:
-        """See `Task.looks`: at what the network says of its numbers, and at what is beside the object."""
         return True
 
     def seeing(self, output: Sequence[Map], truth: Distances | None) -> Depth:
@@ -229,7 +216,6 @@ class Depth(Task):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """See `Task.remarks`: how answers are read."""
         if not self.seen_kind:
             return ()
         text = f"The model's numbers are read as {self.seen_kind}: {KINDS[self.seen_kind]}"
@@ -238,20 +224,13 @@ class Depth(Task):
         return (f"{text}, which are found by least squares on what is seen beside the object.",)
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`.
-
-        Raises:
-            InputError: there is a label.
-        """
+        """See `Task.check`. Raises InputError where there is a label."""
         if facts.label is not None:
             raise InputError("label: task depth has no classes; leave it out")
 
     def truth(self, facts: Facts) -> Distances:
-        """Return where the object is seen, and how far everything is.
-
-        Raises:
-            InputError: the lens sees so far aside that the distance along its axis says nothing.
-        """
+        """Return where the object is seen, and how far everything is. Raises InputError where the lens sees so far
+        aside that the distance along its axis says nothing."""
         if bool((facts.z_depth < ASIDE * facts.depth).any()):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, and this lens sees things more "
@@ -260,7 +239,6 @@ class Depth(Task):
         return Distances(facts.mask, facts.z_depth)
 
     def truth_names(self, truth: Distances) -> tuple[str, ...]:
-        """Return what is right, in words."""
         return (AS_FAR,)
 
     # ---- scores -----------------------------------------------------------------------------------------------------
@@ -339,26 +317,21 @@ class Depth(Task):
 
     def answers(self, output: Sequence[Map], count: int = 1) -> list[tuple[Answer, ...]]:
         """Return between which numbers each map is."""
-        return [(self._range(one),) for one in output]
+        found: list[tuple[Answer, ...]] = []
+        for one in output:
+            ((said, values),) = one.items()
+            low, high = (float(end) for end in values.detach().aminmax())
+            text = f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}"
+            found.append((Answer(text if math.isfinite(low + high) else NOT_A_NUMBER),))
+        return found
 
-    def _range(self, one: Map) -> Answer:
-        ((said, values),) = one.items()
-        low, high = (float(end) for end in values.detach().aminmax())
-        if not math.isfinite(low + high):
-            return Answer(NOT_A_NUMBER)
-        return Answer(f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}")
-
-    def judge(self, output: Sequence[Map], truth: Distances) -> list[Judgement]:
-        """See `Task.judge`; the payload has the factor by which the distance is off, what is left of the relief, and
+    def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[Said]:
+        """See `Task.said`; the payload has the factor by which the distance is off, what is left of the relief, and
         where scale and shift were found."""
-        with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
-            return [
-                Judgement.of(score, margin, *self._said(one, truth, right=margin <= 0.0))
-                for score, margin, one in zip(scores, margins, output, strict=True)
-            ]
+        each = zip(output, margins, strict=True)
+        return [self._said(one, truth, right=margin <= 0.0) for one, margin in each]
 
-    def _said(self, one: Map, truth: Distances, *, right: bool) -> tuple[Answer, Any]:
+    def _said(self, one: Map, truth: Distances, *, right: bool) -> Said:
         if not truth.seen:
             return Answer("out of view"), None
         factors = self._factors(one, truth)
@@ -366,7 +339,7 @@ class Depth(Task):
         if not math.isfinite(mean):
             return Answer(NOT_A_NUMBER), None
         distance = float(truth.z[truth.mask].double().log().mean().exp())
-        payload: dict[str, float | str] = {
+        payload: dict[str, JsonValue] = {
             "distance": round(distance, 4),
             "judged": round(distance * math.exp(mean), 4),
             "factor": round(math.exp(float(factors.abs().mean())), 4),
@@ -395,13 +368,10 @@ class Depth(Task):
 
 
 def _fitted(values: Tensor, wanted: Tensor, at: Tensor) -> Tensor:
-    """Return a scale times the values plus a shift, the nearest to what is wanted where `at` says, by least squares.
+    """Return a scale times the values (H, W) plus a shift, the nearest to what is wanted where `at` (H, W) says, by
+    least squares; there is a pixel there, and what is wanted is finite.
 
     A scale is not negative: what the model holds for near stays near.
-
-    Args:
-        values, wanted: (H, W).
-        at: (H, W) bool, at least one pixel; `wanted` is finite there.
     """
     x, y = values[at], wanted[at]
     x, y, middle, level = x - x.mean(), y - y.mean(), x.mean(), y.mean()

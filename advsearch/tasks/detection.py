@@ -1,10 +1,8 @@
 """Object detection: whether a model finds the object, by a box where it is and the right name.
 
-A model that gives a score of every class for each box has not suppressed those that overlap, which is done class by
-class (greedily) before anybody sees a box. What counts here holds before and after that: the object is found by a right
-box that is left, and has vanished where there was none before either; a box that is a success is one that is left. So a
-right box beside a better one of its class that is not where the object is makes an answer neither right nor a success.
-Boxes that come with their labels count as they are. Scores p are compared as log-odds, log(p / (1 - p)).
+Boxes with a score of every class are suppressed class by class (greedily) before anybody sees one. The object is found
+by a right box that is left, and has vanished where there was none before either; a box that is a success is one that is
+left. Boxes that come with their labels count as they are. Scores p are compared as log-odds, log(p / (1 - p)).
 """
 
 from __future__ import annotations
@@ -19,37 +17,43 @@ from torch import Tensor
 
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
-from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.models.labels import names_nothing
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark
+from advsearch.tasks.base import Answer, Facts, Mark, Said
 from advsearch.tasks.boxes import (
     FORMS,
+    HEADS,
     KNOWN,
+    LAYOUTS,
+    SMALLEST,
     UNITS,
+    Box,
+    Detections,
+    Place,
     Reading,
-    left_over,
-    overlap,
+    as_option,
+    best_of,
+    listed,
+    log_odds,
+    numbers_of,
+    overlap_with,
     share_inside,
-    strongest,
     strongest_boxes,
+    suppressed,
     unit_in,
 )
 from advsearch.tasks.classification import NO, ClassTask, Labels
 from advsearch.tasks.detector_answers import (
     ORDERS,
     QUERIES,
-    Detections,
-    as_option,
     ask_order,
     checked_order,
     detections_in,
-    numbers_of,
     order_in,
     settled,
+    told_by_classes,
 )
-from advsearch.tasks.yolo_heads import HEADS, LAYOUTS, names_head
 
 GOALS = {
     "vanish": "no right box is found where the object is",
@@ -59,36 +63,11 @@ GOALS = {
 }
 """What an attack may be after, by the name of the objective."""
 
-SMALLEST = 1e-6
-"""Scores and overlaps below this, or as near to 1, count as this: log-odds of 13.8."""
-MOST, LEAST, LOOKED_AT = 8, 0.1, 500
-"""Most boxes that are kept of a picture; the least score of one, and of one that is suppressed; and among how many of
-the best scores they are looked for."""
+MOST, LEAST = 8, 0.1
+"""Most boxes that are kept of a picture; the least score of one, and of one that is suppressed."""
 
-Box = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class Place:
-    """What is to be found in a picture: the truth of detection.
-
-    Attributes:
-        labels: indices of the right classes.
-        box: smallest box round what is seen of the object, x0, y0, x1, y1 in pixels; None where nothing is.
-        size: (height, width) of the picture in pixels.
-    """
-
-    labels: Labels
-    box: tuple[int, int, int, int] | None
-    size: tuple[int, int]
-
-    @property
-    def shares(self) -> Tensor | None:
-        """The box as shares of width and height, (4,)."""
-        if self.box is None:
-            return None
-        height, width = self.size
-        return torch.tensor(self.box) / torch.tensor([width, height, width, height])
+ELSEWHERE = "elsewhere"
+"""How an answer says that a box is not where the object is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,9 +91,8 @@ class Detection(ClassTask):
         seek: what an attack is after, one of `GOALS`.
         input_size: (height, width) of the model's input in pixels.
         seen_unit, seen_order: what the model's own answers show; "" where they have not yet.
-        undecided: whether only numbers tell scores from classes in its answers.
+        undecided, masks: whether only numbers tell scores from classes; whether mask coefficients are left out.
         shape: (A, B) of an answer that is read as a YOLO's head; None of others.
-        masks: whether mask coefficients stand in its answers, which are left out.
         told: whether its network says that its boxes are corners in pixels, as those of libraries do (`KNOWN`).
         fills_with_nan: whether rows of NaN stand where nothing is found, and not for an answer that is not a number.
         doubts: what is odd about these.
@@ -145,14 +123,8 @@ class Detection(ClassTask):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("iou", "confidence"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
-                raise InputError(f"task detection: {name}: expected a number between 0 and 1, got {value!r}")
-        if isinstance(self.suppression, bool) or not 0.0 < self.suppression <= 1.0:
-            raise InputError(
-                f"task detection: suppression: expected a number over 0, up to 1, got {self.suppression!r}"
-            )
+        self.check_numbers(lambda value: 0.0 < value < 1.0, "a number between 0 and 1", "iou", "confidence")
+        self.check_numbers(lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "suppression")
         try:
             checked_order(self.order or ORDERS[0])
         except ValueError as error:
@@ -177,32 +149,29 @@ class Detection(ClassTask):
 
     @property
     def looks(self) -> bool:
-        """See `Task.looks`: unless all is said already, boxes are compared with the true one."""
         return not (self.told or (self.boxes and self.unit)) or (self.undecided and not self.order)
 
     def seeing(self, output: Sequence[Detections], truth: Place | None) -> Detection:
         found = self._having_seen(output)
         output = found._boxed(output)
-        reading, right = found._reading, strongest_boxes(output)[:0]
+        reading = found._reading
         if truth is not None and truth.shares is not None:
             each = [(one["boxes"], found._of(one, truth.labels)) for one in found._settled(output)]
             right = torch.cat([raw[score >= LEAST] for raw, score in each])
-        if len(right) and truth is not None and truth.shares is not None:
-            better = reading.better(right, truth.shares, self.iou)
-            doubts = f"one of them is nearer to the object with {better}" if better else reading.fault(right)
-        else:
-            boxes = strongest_boxes(output)
-            doubts = reading.fault(boxes) and f"{reading.fault(boxes)}{reading.instead(boxes)}"
-        return replace(found, doubts=doubts)
+            if len(right):
+                better = reading.better(right, truth.shares, self.iou)
+                said = f"one of them is nearer to the object with {better}" if better else reading.fault(right)
+                return replace(found, doubts=said)
+        boxes = strongest_boxes(output)
+        return replace(found, doubts=reading.fault(boxes) and f"{reading.fault(boxes)}{reading.instead(boxes)}")
 
     def _having_seen(self, output: Sequence[Detections]) -> Detection:
         """The task with what an answer of its model shows of orders and units."""
         grids = [one["raw"] for one in output if "raw" in one]
         last = any("logits" in one for one in output) and self.named and names_nothing(self.labels[-1])
+        head = self._head or (QUERIES[1] if last else "")
         try:
-            order = order_in(
-                output, len(self.labels) if self.named else None, self._head or (QUERIES[1] if last else "")
-            )
+            order = order_in(output, len(self.labels) if self.named else None, head)
         except ValueError as error:
             what = f"the model's answer is {tuple(grids[0].shape)}: " if grids else ""
             asked = f"; {ask_order()}" if any("either" in one for one in output) else ""
@@ -247,65 +216,49 @@ class Detection(ClassTask):
     @property
     def remarks(self) -> tuple[str, ...]:
         said = []
+        order = as_option(f"order: {self.seen_order}")
         if self.shape and not self.order:
-            said.append(
-                f"The detector's answer of {self.shape} is read as a YOLO's: {as_option(f'order: {self.seen_order}')}."
-            )
+            said.append(f"The detector's answer of {self.shape} is read as a YOLO's: {order}.")
         if self.seen_order in QUERIES and not self.order:
-            said.append(f"The detector's answer is read as a DETR's: {as_option(f'order: {self.seen_order}')}.")
+            said.append(f"The detector's answer is read as a DETR's: {order}.")
         if self.masks:
             said.append("The detector's masks are left out: its boxes and scores are read.")
         if self.undecided and self.seen_order and not self.order:
-            said.append(
-                "Scores and classes of the detector's boxes are told apart by their values: they are read as "
-                f"{as_option(f'order: {self.seen_order}')}."
-            )
+            told = "Scores and classes of the detector's boxes are told apart by their values"
+            said.append(f"{told}: they are read as {order}.")
         if self.doubts:
             said.append(f"The detector's boxes may be read wrongly: {self.doubts}.")
         return tuple(said)
 
     @property
     def _reading(self) -> Reading:
-        middle = self._told_by_classes(self._head or self.seen_order)
-        return Reading(
-            self.boxes or ("cxcywh" if middle else FORMS[0]), self.unit or self.seen_unit or UNITS[1], self.input_size
-        )
+        form = self.boxes or ("cxcywh" if told_by_classes(self._head or self.seen_order) else FORMS[0])
+        return Reading(form, self.unit or self.seen_unit or UNITS[1], self.input_size)
 
     @property
     def _head(self) -> str:
-        """The head of `yolo_heads.HEADS`, or the one of `QUERIES`, that `order` says; "" where it says none."""
+        """The head of `boxes.HEADS`, or the one of `QUERIES`, that `order` says; "" where it says none."""
         order = " ".join(checked_order(self.order)) if self.order else ""
-        return order if self._told_by_classes(order) else ""
-
-    @staticmethod
-    def _told_by_classes(order: str) -> bool:
-        """Whether an order is of answers that the number of classes explains; their boxes have a middle and sides."""
-        return names_head(order) or order in QUERIES
+        return order if told_by_classes(order) else ""
 
     def seeking(self, objective: str) -> Detection:
-        """See `Task.seeking`: the objectives of detection say what counts as success."""
         return replace(self, seek=objective) if objective in GOALS else self
 
     def read(self, answer: Any, count: int) -> list[Detections]:
-        """See `Task.read`: what `advsearch.tasks.detector_answers.detections_in` takes."""
         return detections_in(answer, count, self.order)
 
     def classes_in(self, output: Sequence[Detections]) -> int | None:
-        """Return how many classes each box has a score of."""
         scores = output[0].get("scores")
         return scores.shape[1] if scores is not None and scores.ndim == 2 else None
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`: the model must have such a class."""
         self.right_classes(facts)
 
     def truth(self, facts: Facts) -> Place:
-        """Return what is to be found, and where it is seen."""
         height, width = facts.mask.shape
         return Place(self.right_classes(facts), facts.box, (height, width))
 
     def truth_names(self, truth: Place) -> tuple[str, ...]:
-        """Return the right names."""
         return self.names(truth.labels)
 
     # ---- scores -----------------------------------------------------------------------------------------------------
@@ -315,53 +268,49 @@ class Detection(ClassTask):
 
         Of `create`: how far the best box where nothing is stands above it.
         """
-        wrong = self._created if self.seek == "create" else self._missed
-        return self._each(output, lambda one: wrong(self._left(one), truth))
+        wrong = self._create if self.seek == "create" else self._vanish
+        return self._each(output, truth, lambda one: wrong(self._left(one), truth))
 
     def score(self, output: Sequence[Detections], truth: Place) -> Tensor:
         """Return how near each of N outputs is to what is sought, (N,), in log-odds: over 0 where it is a success."""
         if self.minimise:
             return -self.margin(output, truth)
-        reach = {
-            "vanish": self._missed,
-            "mislabel": self._mislabelled,
-            "displace": self._displaced,
-            "create": self._created,
-        }[self.seek]
-        return self._each(output, lambda one: reach(one, truth))
+        reach: Callable[[Detections, Place], Tensor] = getattr(self, f"_{self.seek}")
+        return self._each(output, truth, lambda one: reach(one, truth))
 
-    def _each(self, output: Sequence[Detections], value: Callable[[Detections], Tensor]) -> Tensor:
-        """A value of each picture, (N,); NaN where a number that counts is none."""
-        read = self._read(output)
-        return torch.stack([one["scores"].sum() * math.nan if self._broken(one) else value(one) for one in read])
+    def _each(self, output: Sequence[Detections], truth: Place, value: Callable[[Detections], Tensor]) -> Tensor:
+        """A value of each picture, (N,); NaN where a number that counts is none, -1 where there is nothing to find."""
+        hidden = truth.box is None and self.seek != "create"
+        return torch.stack([
+            one["scores"].sum() * math.nan if self._broken(one)
+            else one["scores"].sum() * 0.0 - 1.0 if hidden
+            else value(one)
+            for one in self._read(output)
+        ])  # fmt: skip
 
-    def _missed(self, one: Detections, truth: Place) -> Tensor:
-        at = self._overlap(one, truth)
-        if at is None:
-            return one["scores"].sum() * 0.0 - 1.0
-        return self._bar - log_odds(_best(self._of(one, truth.labels), at >= self.iou))
+    def _vanish(self, one: Detections, truth: Place) -> Tensor:
+        return self._bar - log_odds(best_of(self._of(one, truth.labels), self._at(one, truth)))
 
-    def _mislabelled(self, one: Detections, truth: Place) -> Tensor:
-        missed, at = self._missed(one, truth), self._overlap(one, truth)
-        if at is None:
-            return missed
-        called = log_odds(_best(self._rivals(self._left(one), truth.labels), at >= self.iou)) - self._bar
-        return torch.minimum(missed, called)
+    def _mislabel(self, one: Detections, truth: Place) -> Tensor:
+        called = log_odds(best_of(self._rivals(self._left(one), truth.labels), self._at(one, truth))) - self._bar
+        return torch.minimum(self._vanish(one, truth), called)
 
-    def _displaced(self, one: Detections, truth: Place) -> Tensor:
+    def _displace(self, one: Detections, truth: Place) -> Tensor:
         """The lesser of two: how far the best overlap of a box that counts is under `iou`, and that some box counts.
 
         The first is in units in which a small step from `iou` is as long as one in log-odds.
         """
-        at, scores = self._overlap(one, truth), self._of(one, truth.labels)
-        if at is None:
-            return one["scores"].sum() * 0.0 - 1.0
-        sure = log_odds(_best(scores)) - self._bar
-        away = (self.iou - _best(at, scores >= self.confidence)) / (self.iou * (1.0 - self.iou))
+        scores = self._of(one, truth.labels)
+        sure = log_odds(best_of(scores)) - self._bar
+        away = (self.iou - best_of(overlap_with(one, truth), scores >= self.confidence)) / (self.iou * (1.0 - self.iou))
         return torch.minimum(away, sure)
 
-    def _created(self, one: Detections, truth: Place) -> Tensor:
-        return log_odds(_best(self._sought(self._left(one)), self._elsewhere(one, truth))) - self._bar
+    def _create(self, one: Detections, truth: Place) -> Tensor:
+        return log_odds(best_of(self._rivals(self._left(one), ()), self._elsewhere(one, truth))) - self._bar
+
+    def _at(self, one: Detections, truth: Place) -> Tensor:
+        """Which boxes are where the object is, (D,) bool."""
+        return overlap_with(one, truth) >= self.iou
 
     @property
     def _bar(self) -> float:
@@ -395,7 +344,6 @@ class Detection(ClassTask):
 
     @property
     def _least(self) -> float:
-        """The least score of a box that anybody looks at."""
         return min(LEAST, self.confidence)
 
     def _broken(self, one: Detections) -> bool:
@@ -404,96 +352,62 @@ class Detection(ClassTask):
         return blank or not all(bool(one[name].detach().isfinite().all()) for name in ("boxes", "scores"))
 
     def _left(self, one: Detections) -> Detections:
-        """What suppression leaves of boxes with a score of every class: the score of one that it removes is 0.
-
-        What has a score under `LEAST`, or under `confidence` if that is less, counts for nobody and is left alone. The
-        choice has no derivative; what is left has.
-        """
-        if "labels" in one or self.suppression == 1.0 or not len(one["boxes"]):
-            return one
-        scores, boxes = one["scores"].detach(), one["boxes"].detach()
-        rows, classes = (scores >= self._least).nonzero(as_tuple=True)
-        removed = torch.zeros_like(scores, dtype=torch.bool)
-        for label in classes.unique().tolist():
-            mine = rows[classes == label]
-            if len(mine) > 1:
-                removed[mine, label] = ~left_over(boxes[mine], scores[mine, label], self.suppression)
-        return {**one, "scores": torch.where(removed, 0.0, one["scores"])}
-
-    def _overlap(self, one: Detections, truth: Place) -> Tensor | None:
-        """Intersection over union with the true box, (D,); None where the object is not seen."""
-        shares = truth.shares
-        return None if shares is None else overlap(one["boxes"], shares.to(one["boxes"]))
+        return suppressed(one, self._least, self.suppression)
 
     def _elsewhere(self, one: Detections, truth: Place) -> Tensor:
         """Boxes of which most is not on the object, and that do not frame it, (D,) bool."""
-        shares = truth.shares
-        if shares is None:
+        if truth.shares is None:
             return torch.ones(len(one["boxes"]), dtype=torch.bool, device=one["boxes"].device)
-        boxes, place = one["boxes"], shares.to(one["boxes"])
-        return (share_inside(boxes, place) < 0.5) & (overlap(boxes, place) < self.iou)
+        return (share_inside(one["boxes"], truth.shares.to(one["boxes"])) < 0.5) & ~self._at(one, truth)
 
     @staticmethod
     def _of(one: Detections, labels: Labels) -> Tensor:
         """The score of a class among these for each box, (D,)."""
         scores = one["scores"]
         if "labels" not in one:
-            return scores[:, list(labels)].amax(dim=1) if len(scores) else scores.sum(dim=1)
+            return scores[:, list(labels)].amax(dim=1) if len(scores) and labels else scores.sum(dim=1) * 0.0
         return scores * torch.isin(one["labels"], torch.tensor(labels, device=scores.device))
 
     def _rivals(self, one: Detections, labels: Labels) -> Tensor:
-        """The score of another class, or of those that are sought, for each box, (D,)."""
+        """The score of a class that is none of these, or of those that are sought, for each box, (D,)."""
         if self.target is not None:
             return self._of(one, self.target)
         if "labels" in one:
             return one["scores"] - self._of(one, labels)
         return self._of(one, tuple(sorted(set(range(one["scores"].shape[1])) - set(labels))))
 
-    def _sought(self, one: Detections) -> Tensor:
-        """The score of any class, or of those that are sought, for each box, (D,)."""
-        return self._rivals(one, ())
-
     # ---- in words ---------------------------------------------------------------------------------------------------
 
     def answers(self, output: Sequence[Detections], count: int = 1) -> list[tuple[Answer, ...]]:
-        """Return the names of the best boxes of each picture with their scores; of boxes that overlap, the best one."""
         found = []
         for one in self._read(output):
-            rows = [] if self._broken(one) else self._listed(one, count, SMALLEST)
-            listed = [Answer(self.name_of(label), label, score) for _, label, score in rows]
-            found.append(tuple(listed) or (Answer(NOT_A_NUMBER if self._broken(one) else "nothing"),))
+            said = [Answer(self.name_of(label), label, score) for _, label, score in self._listed(one, count, SMALLEST)]
+            found.append(tuple(said) or (Answer(NOT_A_NUMBER if self._broken(one) else "nothing"),))
         return found
 
-    def judge(self, output: Sequence[Detections], truth: Place) -> list[Judgement]:
-        """See `Task.judge`; the answer is what the model says of the object, the payload its boxes in pixels."""
-        with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
-            return [
-                Judgement.of(score, margin, *self._said(one, truth))
-                for score, margin, one in zip(scores, margins, self._read(output), strict=True)
-            ]
-
-    def _said(self, one: Detections, truth: Place) -> tuple[Answer, JsonValue]:
-        if self._broken(one):
-            return Answer(NOT_A_NUMBER), None
-        return self._answer(self._left(one), truth), self._payload(one, truth)
+    def said(self, output: Sequence[Detections], truth: Place, margins: Sequence[float]) -> list[Said]:
+        """See `Task.said`; the answer is what the model says of the object, the payload its boxes in pixels."""
+        return [
+            (Answer(NOT_A_NUMBER), None) if self._broken(one)
+            else (self._answer(self._left(one), truth), self._payload(one, truth))
+            for one in self._read(output)
+        ]  # fmt: skip
 
     def _answer(self, one: Detections, truth: Place) -> Answer:
         """What a model says of the object, with the score of the box that says so."""
-        names, at = self.names(truth.labels), self._overlap(one, truth)
-        if self.seek == "create" and float(self._created(one, truth)) > 0.0:
-            return self._named(one, self._sought(one), self._elsewhere(one, truth), f"{{}} {ELSEWHERE}")
-        if at is None:
+        if self.seek == "create" and float(self._create(one, truth)) > 0.0:
+            return self._named(one, self._rivals(one, ()), self._elsewhere(one, truth), f"{{}} {ELSEWHERE}")
+        if truth.box is None:
             return Answer("out of view")
-        near, right = at >= self.iou, self._of(one, truth.labels)
-        best = float(_best(right, near))
+        near, right, wrong = self._at(one, truth), self._of(one, truth.labels), self._rivals(one, truth.labels)
+        best = float(best_of(right, near))
         if best >= self.confidence:
             return self._named(one, right, near)
-        if float(_best(self._rivals(one, truth.labels), near)) >= self.confidence:
-            return self._named(one, self._rivals(one, truth.labels), near)
-        if float(_best(right)) >= self.confidence:
+        if float(best_of(wrong, near)) >= self.confidence:
+            return self._named(one, wrong, near)
+        if float(best_of(right)) >= self.confidence:
             return self._named(one, right, ~near, f"{{}} {ELSEWHERE}")
-        return Answer(f"{NO}{names[0]}", None, best if math.isfinite(best) else None)
+        return Answer(f"{NO}{self.name_of(truth.labels[0])}", None, best if math.isfinite(best) else None)
 
     def _named(self, one: Detections, scores: Tensor, among: Tensor, form: str = "{}") -> Answer:
         """The class of the best box among some."""
@@ -503,19 +417,8 @@ class Detection(ClassTask):
         return Answer(form.format(self.name_of(label)), label if form == "{}" else None, score)
 
     def _listed(self, one: Detections, count: int, least: float) -> list[tuple[Box, int, float]]:
-        """The best boxes, of a class and a place one: shares of width and height, class, score."""
-        boxes, scores = one["boxes"].detach(), one["scores"].detach()
-        best, places = scores.flatten().topk(min(LOOKED_AT, scores.numel()))
-        each = 1 if "labels" in one else scores.shape[1]
-        rows = places // each
-        classes = one["labels"][rows] if "labels" in one else places % each
-        found: list[tuple[Box, int, float]] = []
-        for label in classes[best >= least].unique().tolist():
-            mine = ((classes == label) & (best >= least)).nonzero().flatten()
-            for place in mine[strongest(boxes[rows[mine]], best[mine], count, self.suppression)].tolist():
-                x0, y0, x1, y1 = boxes[rows[place]].tolist()
-                found.append(((x0, y0, x1, y1), label, float(best[place])))
-        return sorted(found, key=lambda row: -row[2])[:count]
+        """See `listed`; none of an answer that is not a number."""
+        return [] if self._broken(one) else listed(one, count, least, self.suppression)
 
     def _payload(self, one: Detections, truth: Place) -> Any:
         """The true box, and what the model found, in pixels of the picture."""
@@ -534,27 +437,10 @@ class Detection(ClassTask):
         """See `Task.marks`: the true box, and every box with a score of `confidence`."""
         height, width = truth.size
         true = [] if truth.box is None else [Mark(" or ".join(self.names(truth.labels)), True, box=truth.box)]
-        found = []
-        for one in self._read(output):
-            listed = [] if self._broken(one) else self._listed(one, MOST, self.confidence)
-            found.append(true + [
+        return [
+            true + [
                 Mark(f"{self.name_of(label)} {score:.2f}", False, box=(a * width, b * height, c * width, d * height))
-                for (a, b, c, d), label, score in listed
-            ])  # fmt: skip
-        return found
-
-
-ELSEWHERE = "elsewhere"
-"""How an answer says that a box is not where the object is."""
-
-
-def log_odds(shares: Tensor) -> Tensor:
-    """Return log(p / (1 - p)), with what lies outside [0, 1] taken for its end."""
-    inside = shares.clamp(SMALLEST, 1.0 - SMALLEST)
-    return inside.log() - torch.log1p(-inside)
-
-
-def _best(values: Tensor, among: Tensor | None = None) -> Tensor:
-    """The largest of values (D,), or of those where `among` is true; 0 where there are none."""
-    chosen = values if among is None else torch.where(among, values, 0.0)
-    return torch.cat([chosen, chosen.new_zeros(1)]).amax()
+                for (a, b, c, d), label, score in self._listed(one, MOST, self.confidence)
+            ]
+            for one in self._read(output)
+        ]  # fmt: skip

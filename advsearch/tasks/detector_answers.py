@@ -4,7 +4,7 @@ Detections of one picture are a mapping with `boxes` (D, 4) as they came and `sc
 with `labels` (D,), the class of each box. Where types, names and shapes leave open which of two numbers of a box is its
 score and which its class, these stand as `either` (D, 2) in place of both. One tensor that only the number of classes
 explains stands as `raw` (A, B) in place of all, with the channels of maps that came with it as `beside` (K,), see
-`yolo_heads`. Logits that only that number explains stand as `logits` (D, K) in place of scores, see `QUERIES`. Rows
+`boxes`. Logits that only that number explains stand as `logits` (D, K) in place of scores, see `QUERIES`. Rows
 that only fill up are gone; how many of them were NaN throughout is said as `blank` (1,), if any.
 """
 
@@ -20,9 +20,18 @@ from torch import Tensor
 
 from advsearch.models.labels import sets_of
 from advsearch.models.model import each_tensor
-from advsearch.tasks.yolo_heads import HEADS, LAYOUTS, TOLERANCE, head_in, names_head, split
-
-Detections = Mapping[str, Tensor]
+from advsearch.tasks.boxes import (
+    HEADS,
+    LAYOUTS,
+    TOLERANCE,
+    Detections,
+    as_option,
+    counted,
+    head_in,
+    names_head,
+    nowhere,
+    split,
+)
 
 EXPECTED = (
     "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, D) and scores (N, D); rows "
@@ -53,16 +62,21 @@ WORDS = {"boxes": ("box",), "scores": ("score", "conf", "prob", "logit"), "label
 NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 
 
+def told_by_classes(order: str) -> bool:
+    """Whether an order is of answers that the number of classes explains; their boxes have a middle and sides."""
+    return names_head(order) or order in QUERIES
+
+
 def checked_order(text: str) -> tuple[str, ...]:
     """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture.
 
-    Of one of YOLO's heads these are the words of `yolo_heads.HEADS`, and of a layout; of DETR's one of `QUERIES`.
+    Of one of YOLO's heads these are the words of `boxes.HEADS`, and of a layout; of DETR's one of `QUERIES`.
 
     Raises:
         ValueError: it names others.
     """
     parts = tuple(text.replace(",", " ").split())
-    if names_head(" ".join(parts)) or " ".join(parts) in QUERIES:
+    if told_by_classes(" ".join(parts)):
         return parts
     if sorted(parts) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
         raise ValueError(
@@ -74,16 +88,9 @@ def checked_order(text: str) -> tuple[str, ...]:
 
 
 def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
-    """Return what a detector answered to each of `count` pictures.
-
-    Args:
-        answer: as `EXPECTED` says. The parts of a mapping or an object may have other names.
-        count: pictures.
-        order: of parts that have no names, see `checked_order`; "" for what types and shapes say.
-
-    Raises:
-        ValueError: it is something else, or scores are not in [0, 1].
-    """
+    """Return what a detector answered, as `EXPECTED` says, to each of `count` pictures. The order is of parts that have
+    no names, see `checked_order`; "" for what types and shapes say. Raises ValueError: it is something else, or scores
+    are not in [0, 1]."""
     parts = checked_order(order) if order else ()
     if isinstance(answer, (list, tuple)) and answer and all(isinstance(one, Tensor) and one.ndim > 3 for one in answer):
         raise ValueError("expected boxes, and not the maps of a head from which they are made: export it in .eval()")
@@ -289,36 +296,13 @@ def _kept(one: dict[str, Tensor], filling: Tensor, numbers: Tensor) -> Detection
     return {**kept, "blank": blank.sum()[None]} if bool(blank.any()) else kept
 
 
-def nowhere(boxes: Tensor) -> Tensor:
-    """Whether boxes (D, 4) of any form are none: four times the same number, or one that is not finite, (D,) bool."""
-    return (boxes == boxes[:, :1]).all(dim=1) | ~boxes.isfinite().all(dim=1)
-
-
 # ---- scores and classes by what they are ----------------------------------------------------------------------------
 
 
-def counted(one: Detections) -> Tensor:
-    """Rows that say something: a box, and a number over 0 beside it, (D,) bool."""
-    return ~nowhere(one["boxes"]) & (numbers_of(one) > 0.0).any(dim=1)
-
-
-def numbers_of(one: Detections) -> Tensor:
-    """The numbers of each box that are scores, or may be, without derivatives, (D, K)."""
-    beside = (one["either"] if "either" in one else one["scores"]).detach()
-    return beside if beside.ndim == 2 else beside[:, None]
-
-
 def settled(one: Detections, order: str = "", classes: int | None = None) -> Detections:
-    """Return the detections of a picture with boxes, scores and labels told apart.
-
-    Args:
-        one: of `detections_in`.
-        order: one of `ORDERS` or `QUERIES`, or of `yolo_heads.HEADS` with a layout; "" for what its rows show.
-        classes: that there are; None where nobody says.
-
-    Raises:
-        ValueError: they do not show it, or something else than the order says.
-    """
+    """Return the detections of a picture with boxes, scores and labels told apart, by an order (`ORDERS`, `QUERIES`, or
+    `boxes.HEADS` with a layout; "" for what its rows show) and the number of classes, None where nobody says. Raises
+    ValueError: they do not show it, or something else than the order says."""
     if "raw" in one:
         if classes is None:
             raise ValueError(EXPECTED)
@@ -363,15 +347,10 @@ def ask_order() -> str:
     return f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
 
 
-def as_option(options: str) -> str:
-    """Return what says options of detection, as messages name settings."""
-    return f"`task='detection={{{options}}}'`"
-
-
 def order_in(found: Sequence[Detections], classes: int | None = None, head: str = "") -> str:
     """Return which order detections show; "" where they leave it open.
 
-    It is one of `ORDERS`, of `QUERIES`, or of `yolo_heads.HEADS` with its layout.
+    It is one of `ORDERS`, of `QUERIES`, or of `boxes.HEADS` with its layout.
 
     A class is a whole number, a score lies in [0, 1]; and what suppression leaves comes by falling scores. Two numbers
     of which none is a class are the scores of two classes, or objectness and the score of the only one.
@@ -379,7 +358,7 @@ def order_in(found: Sequence[Detections], classes: int | None = None, head: str 
     Args:
         found: of any pictures.
         classes: that there are; None where nobody says.
-        head: of `yolo_heads.HEADS`, what is said of answers in one tensor, or of `QUERIES`; "" for nothing.
+        head: of `boxes.HEADS`, what is said of answers in one tensor, or of `QUERIES`; "" for nothing.
 
     Raises:
         ValueError: no number can be a score, or none a class; or a grid of boxes has none or several of its orders; or

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.described import NOT_A_NUMBER
-from advsearch.errors import InputError
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark
+from advsearch.tasks.base import Answer, Facts, Mark, Said
 from advsearch.tasks.classification import NO, ClassTask, Labels, members, target_lead, wrong_lead
 
 EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
@@ -23,12 +22,8 @@ Lead = Callable[[Tensor, Labels], Tensor]
 
 @dataclass(frozen=True)
 class Region:
-    """What is to be segmented in a picture: the truth of segmentation.
-
-    Attributes:
-        labels: indices of the right classes.
-        mask: (H, W) bool, the pixels of the picture in which the object is seen.
-    """
+    """What is to be segmented in a picture, the truth of segmentation: indices of the right classes, and (H, W) bool,
+    the pixels in which the object is seen."""
 
     labels: Labels
     mask: Tensor
@@ -66,16 +61,10 @@ class Segmentation(ClassTask):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        value: object = self.accuracy
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= 1.0:
-            raise InputError(f"task segmentation: accuracy: expected a number over 0, up to 1, got {value!r}")
+        self.check_numbers(lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "accuracy")
 
     def read(self, answer: Any, count: int) -> Tensor:
-        """Return the logits (N, classes, h, w) in what a network answered.
-
-        Raises:
-            ValueError: there are none.
-        """
+        """Return the logits (N, classes, h, w) in what a network answered. Raises ValueError where there are none."""
         if isinstance(answer, Mapping):
             answer = answer.get("out", answer.get("logits"))
         elif hasattr(answer, "logits"):
@@ -87,19 +76,15 @@ class Segmentation(ClassTask):
         return answer.float()
 
     def classes_in(self, output: Tensor) -> int:
-        """Return the number of classes."""
         return output.shape[1]
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`: the model must have such a class."""
         self.right_classes(facts)
 
     def truth(self, facts: Facts) -> Region:
-        """Return what is to be segmented."""
         return Region(self.right_classes(facts), facts.mask)
 
     def truth_names(self, truth: Region) -> tuple[str, ...]:
-        """Return the right names."""
         return self.names(truth.labels)
 
     def margin(self, output: Tensor, truth: Region) -> Tensor:
@@ -161,20 +146,16 @@ class Segmentation(ClassTask):
             found.append(listed or (Answer("nothing" if len(said) else NOT_A_NUMBER),))
         return found
 
-    def judge(self, output: Tensor, truth: Region) -> list[Judgement]:
-        """See `Task.judge`.
+    def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[Said]:
+        """See `Task.said`.
 
         The answer is the class of most of the object's pixels; a wrong one where too few are right, and "no bottle"
         where most of these are background. Its probability is the share of the object's pixels that are right.
         """
-        with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
-            return [
-                Judgement.of(score, margin, *self._said(one, truth, right=margin <= 0.0))
-                for score, margin, one in zip(scores, margins, output, strict=True)
-            ]
+        each = zip(output, margins, strict=True)
+        return [self._said(one, truth, right=margin <= 0.0) for one, margin in each]
 
-    def _said(self, logits: Tensor, truth: Region, *, right: bool) -> tuple[Answer, Any]:
+    def _said(self, logits: Tensor, truth: Region, *, right: bool) -> Said:
         """The answer of one picture, and what else is kept: shares of the object's pixels by class, and the overlap."""
         pixels = self._pixels(logits[None], truth)
         if pixels is None:

@@ -1,9 +1,6 @@
-"""A gallery: pictures in folders, one folder for each name, as a network sees them.
+"""Similarity: which reference pictures a network finds nearest, by the cosine of its features.
 
-Similarity: which reference pictures a network finds nearest, by the cosine of its features.
-
-Networks without classes are used like that: re-identification, search by picture, recognition of faces and products.
-With one folder of reference pictures for each name it is a classification among these names. Without, an answer is
+With a gallery, one folder of pictures for each name, it is a classification among these names. Without, an answer is
 right where the picture is still the same thing as the clean one to the network.
 """
 
@@ -11,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +21,7 @@ from advsearch import files
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.models.zoo.features import PARTS, pooled
+from advsearch.models.zoo.outputs import PARTS, pooled
 from advsearch.options import FROM_RUN
 from advsearch.pictures import upright
 from advsearch.tasks.base import Facts, Judgement
@@ -84,11 +81,8 @@ class Gallery:
 
 
 def folders_of(folder: str) -> list[tuple[str, Path]]:
-    """Return the names in a folder, and the folder of each, in alphabetical order; hidden ones are left out.
-
-    Raises:
-        InputError: it is not there, or does not have two names.
-    """
+    """Return the names in a folder, and the folder of each, in alphabetical order; hidden ones are left out. Raises
+    InputError where it is not there, or does not have two names."""
     root = Path(folder).expanduser()
     found = [(one.name, one) for one in _listed(root) if one.is_dir()]
     if len(found) < 2:
@@ -117,12 +111,22 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
     """
     names = folders_of(folder)
     root = Path(folder).expanduser()
-    paths = [(number, one) for number, (_, where) in enumerate(names) for one in _pictures(where)]
+    paths: list[tuple[int, Path]] = []
+    for number, (_, where) in enumerate(names):
+        found = _listed(where)
+        if not found:
+            raise InputError(f"references: expected pictures of {where.name} in {where}, got none; put some there")
+        paths += [(number, one) for one in found]
     if len(paths) > files.scaled(MOST):
         raise files.too_large(root, f"at most {files.scaled(MOST):,} reference pictures", f"{len(paths):,}")
     with torch.no_grad():
         shown = (_cut(torch.from_numpy(upright(one, SIDE)), model.input_size) for _, one in paths)
-        parts = [_features(model, batch, root) for batch in _batches(shown)]
+        parts = []
+        for batch in _batches(shown):
+            parts.append(model(batch))
+            if parts[-1].dim() != 2:
+                got = tuple(parts[-1].shape)
+                raise InputError(f"model {model.name}: expected features (N, D), got {got}; use another task")
     features = torch.cat(parts)
     broken = ~features.isfinite().all(dim=1)
     if bool(broken.any()):
@@ -187,13 +191,6 @@ def _listed(folder: Path) -> list[Path]:
         ) from None
 
 
-def _pictures(folder: Path) -> Sequence[Path]:
-    found = _listed(folder)
-    if not found:
-        raise InputError(f"references: expected pictures of {folder.name} in {folder}, got none; put some there")
-    return found
-
-
 def _cut(picture: Tensor, size: tuple[int, int]) -> Tensor:
     """Return the largest middle part of a picture (H, W, 3) that has the shape of the input."""
     height, width = picture.shape[:2]
@@ -208,13 +205,6 @@ def _batches(pictures: Iterator[Tensor]) -> Iterator[Tensor]:
     for _, alike in itertools.groupby(pictures, key=lambda one: one.shape):
         while batch := list(itertools.islice(alike, AT_ONCE)):
             yield torch.stack(batch)
-
-
-def _features(model: Model, pictures: Tensor, root: Path) -> Tensor:
-    features: Tensor = model(pictures)
-    if features.dim() != 2:
-        raise InputError(f"model {model.name}: expected features (N, D), got {tuple(features.shape)}; use another task")
-    return features
 
 
 METHODS = ("nearest", "linear")
@@ -239,7 +229,7 @@ class Similarity(Classification):
       pictures of its own, so that one with many has no more votes than one with few, and every name has a gradient.
       The mean, so that one odd picture decides nothing where `k` is over 1. With 1, the default, an answer is right
       exactly where the nearest picture of all is.
-    - `linear`: those of a logistic regression on the reference features, of length 1 (`gallery.fitted`).
+    - `linear`: those of a logistic regression on the reference features, of length 1 (`fitted`).
 
     With `threshold` they are the cosine to the clean picture's features and the threshold, over `TEMPERATURE`.
 
@@ -274,11 +264,10 @@ class Similarity(Classification):
             raise InputError(f"task similarity: k: expected a whole number of at least 1, got {self.k!r}")
         if self.method == "linear" and self.k != 1:
             raise InputError("task similarity: k: belongs to `method: nearest`; leave one of the two out")
-        bar = self.threshold
-        if bar is not None and (isinstance(bar, bool) or not isinstance(bar, (int, float)) or not -1.0 < bar < 1.0):
-            raise InputError(f"task similarity: threshold: expected a cosine between -1 and 1, got {bar!r}")
-        if bar is not None and self.references:
-            raise InputError("task similarity: threshold: compares with the clean picture; leave `references` out")
+        if self.threshold is not None:
+            self.check_numbers(lambda bar: -1.0 < bar < 1.0, "a cosine between -1 and 1", "threshold")
+            if self.references:
+                raise InputError("task similarity: threshold: compares with the clean picture; leave `references` out")
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Similarity:
         """See `Task.on`; references are read and shown to the model, once.
@@ -300,7 +289,6 @@ class Similarity(Classification):
         return replace(found, gallery=embedded(self.references, model, linear=self.method == "linear"))
 
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
-        """Those of the folders."""
         return tuple(name for name, _ in folders_of(self.references)) if self.references else (ITSELF, ELSE), True
 
     def right_classes(self, facts: Facts) -> Labels:
@@ -316,7 +304,6 @@ class Similarity(Classification):
         return not self.references and self.clean is None
 
     def seeing(self, output: Tensor, truth: Labels | None) -> Similarity:
-        """See `Task.seeing`: the first picture is the clean one."""
         return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.looks else self
 
     def read(self, answer: Any, count: int) -> Tensor:
@@ -344,7 +331,6 @@ class Similarity(Classification):
         return scores / TEMPERATURE
 
     def answerable(self, output: Tensor, truth: Labels) -> Tensor:
-        """See `Task.answerable`: the logits."""
         return super().answerable(self.logits(output), truth)
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:

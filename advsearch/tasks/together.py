@@ -5,16 +5,56 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, final
 
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.models import Model
-from advsearch.models.ensemble import Ensemble, Outputs, by_picture, of_each
+from advsearch.models import Model, Preprocessing
+from advsearch.models.model import joined
 from advsearch.options import FROM_RUN, JOINED
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task, Truth
+
+Outputs = tuple[Any, ...]
+"""What each of several models answers to one picture."""
+
+
+@final
+class Ensemble:
+    """Asks several models, each of which resizes and normalises for itself; what `Model.module` is of `together`."""
+
+    def __init__(self, models: Sequence[Model]) -> None:
+        self.models = tuple(models)
+
+    def __call__(self, images: Tensor) -> list[Any]:
+        """Return the output of each model for pictures (N, H, W, 3) sRGB in [0, 1]."""
+        return [model(images) for model in self.models]
+
+
+def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Model:
+    """Return several models as one, whose output is a list with a tuple of the models' outputs for each picture. The
+    size of the pictures is (height, width) in pixels; None for the largest that a model takes."""
+    high, wide = (max(model.input_size[side] for model in models) for side in (0, 1))
+    return Model(
+        module=Ensemble(models),
+        name=" and ".join(model.name for model in models),
+        labels=(),
+        preprocessing=Preprocessing(size or (high, wide), layout="NHWC"),
+        differentiable=all(model.differentiable for model in models),
+        read=by_picture,
+    )
+
+
+def by_picture(answer: list[Any], count: int) -> list[Outputs]:
+    """Return the outputs by picture of `count` pictures, from those by model."""
+    return [tuple(output[k : k + 1] for output in answer) for k in range(count)]
+
+
+def of_each(outputs: Sequence[Outputs]) -> list[Any]:
+    """Return the output of each model for N pictures, from what each of them got."""
+    return [joined(parts) for parts in zip(*outputs, strict=True)]
+
 
 Truths = tuple[Truth, ...]
 
@@ -27,7 +67,7 @@ class Together(Task):
     largest of the models' margins, and the score the least of their scores.
 
     Args:
-        parts: the task of each model, in the order of the outputs of `advsearch.models.ensemble.together`.
+        parts: the task of each model, in the order of the outputs of `advsearch.tasks.together.together`.
         models: that are asked.
         tasks: the parts on these, by `on`.
     """
@@ -42,20 +82,15 @@ class Together(Task):
 
     @property
     def title(self) -> str:
-        """See `Task.title`: of different tasks, their names."""
         names = [one.title for one in self.parts]
         return JOINED.join(names) if len(set(names)) > 1 else self.name
 
     def read(self, answer: Any, count: int) -> list[Outputs]:
-        """See `advsearch.models.ensemble.by_picture`."""
         return by_picture(answer, count)
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Together:
-        """See `Task.on`; a target is for the tasks that take a label, where some do and some do not.
-
-        Raises:
-            InputError: it is no model of `together`, or one of fewer or more than there are tasks.
-        """
+        """See `Task.on`; a target is for the tasks that take a label, where some do and some do not. Raises InputError
+        where it is no model of `together`, or one of fewer or more than there are tasks."""
         models = model.module.models if isinstance(model.module, Ensemble) else ()
         if len(models) != len(self.parts):
             raise InputError(f"model: expected {len(self.parts)}, one for each task, got {len(models) or 1}")
@@ -69,7 +104,6 @@ class Together(Task):
         return replace(self, models=models, tasks=tasks, target=wanted, minimise=minimise)
 
     def seeking(self, objective: str) -> Together:
-        """See `Task.seeking`: of every task."""
         return replace(self, parts=tuple(one.seeking(objective) for one in self.parts))
 
     def told(self, one: Task, facts: Facts) -> Facts:
@@ -80,7 +114,6 @@ class Together(Task):
         return one.labelled or not any(part.labelled for part in self.parts)
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`: of every model."""
         for one in self.tasks:
             one.check(self.told(one, facts))
 
@@ -102,11 +135,9 @@ class Together(Task):
         return tuple(dict.fromkeys(remark for one in self.tasks for remark in one.remarks))
 
     def truth(self, facts: Facts) -> Truths:
-        """Return what is true for each model."""
         return tuple(one.truth(facts) for one in self.tasks)
 
     def truth_names(self, truth: Truths) -> tuple[str, ...]:
-        """Return the names of all models, each once."""
         pairs = zip(self.tasks, truth, strict=True)
         return tuple(dict.fromkeys(name for one, own in pairs for name in one.truth_names(own)))
 
@@ -115,28 +146,24 @@ class Together(Task):
         return tuple(dict.fromkeys(name for one in self.tasks for name in one.target_names))
 
     def margin(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        """Return the largest margin of the models, (N,)."""
         return torch.stack([one.margin(*own) for one, *own in self._each(output, truth)]).amax(dim=0)
 
     def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        """Return the least score of the models, (N,)."""
         return torch.stack([one.score(*own) for one, *own in self._each(output, truth)]).amin(dim=0)
 
     def answers(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Answer, ...]]:
-        """Return one answer for each picture: what each model says, in their order."""
         said = [one.answers(own) for one, own in zip(self.tasks, of_each(output), strict=True)]
         return [(_joined([first for first, *_ in each]),) for each in zip(*said, strict=True)]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
-        """See `Task.judge`; the payload is that of each model."""
-        judged = [one.judge(*own) for one, *own in self._each(output, truth)]
-        return [self._together(each) for each in zip(*judged, strict=True)]
-
-    def _together(self, each: Sequence[Judgement]) -> Judgement:
-        payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
-        said = _joined([one.answer for one in each]), payloads if any(map(_there, payloads.values())) else None
-        margin = math.nan if any(one.not_a_number for one in each) else max(one.margin for one in each)
-        return Judgement.of(min(one.score for one in each), margin, *said)
+        found = []
+        for each in zip(*(one.judge(*own) for one, *own in self._each(output, truth)), strict=True):
+            payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
+            payload = payloads if any(one is not None for one in payloads.values()) else None
+            margin = math.nan if any(one.not_a_number for one in each) else max(one.margin for one in each)
+            answer = _joined([one.answer for one in each])
+            found.append(Judgement.of(min(one.score for one in each), margin, answer, payload))
+        return found
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
         """See `Task.marks`: what is true of the first, maps of all, and what each model says under its name."""
@@ -149,12 +176,7 @@ class Together(Task):
         return found
 
     def _each(self, output: Sequence[Outputs], truth: Truths) -> list[tuple[Any, Any, Any]]:
-        """The task, the output and the truth of each model."""
         return list(zip(self.tasks, of_each(output), truth, strict=True))
-
-
-def _there(payload: object) -> bool:
-    return payload is not None
 
 
 def _joined(answers: Sequence[Answer]) -> Answer:

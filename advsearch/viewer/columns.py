@@ -146,10 +146,7 @@ class Columns:
 
 def read_columns(run: Path, after: int = 0, most: int | None = None) -> Columns:
     """Return the rows of the sweep in `run` that were written after the row with this id, `most` of them at most.
-
-    Raises:
-        FileFormatError: the results cannot be read.
-    """
+    Raises FileFormatError where the results cannot be read."""
     with Store(run / NAME, read_only=True) as store:
         found, edges = columns_of(islice(store.rows(KIND, after=after), most)), store.noted(EDGES)
     known = edges if isinstance(edges, dict) else {}
@@ -180,6 +177,7 @@ def columns_of(rows: Iterable[Row]) -> Columns:
         if isinstance(row.payload, dict) and "box" in row.payload:
             boxes.extend([NO_BOX] * (8 * number - len(boxes)))
             boxes.extend(_boxes(row.payload, row.label or ""))
+    boxes.extend([NO_BOX] * (8 * len(steps) - len(boxes) if boxes else 0))
     return Columns(
         step=np.array(steps, np.uint32),
         margin=np.array(margins, np.float32),
@@ -189,13 +187,8 @@ def columns_of(rows: Iterable[Row]) -> Columns:
         answers=tuple(answers.names),
         parameters=parameters.columns(len(steps)),
         last=last,
-        boxes=_filled(boxes, len(steps)) if boxes else None,
+        boxes=np.array(boxes, np.uint16).reshape(-1, 8) if boxes else None,
     )
-
-
-def _filled(boxes: array[int], count: int) -> AnyArray:
-    boxes.extend([NO_BOX] * (8 * count - len(boxes)))
-    return np.array(boxes, np.uint16).reshape(count, 8)
 
 
 def _boxes(payload: Mapping[str, Any], label: str) -> list[int]:
@@ -206,8 +199,6 @@ def _boxes(payload: Mapping[str, Any], label: str) -> list[int]:
 
 
 class _Levels:
-    """Names, and where each row's stands among them."""
-
     def __init__(self) -> None:
         self.names: dict[str, int] = {}
         self.places = array("H")

@@ -12,9 +12,6 @@ from itertools import islice
 from pathlib import Path
 from urllib.parse import quote
 
-import numpy as np
-from numpy.typing import NDArray
-
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
 from advsearch.runs import files, listing, store
@@ -94,15 +91,8 @@ def following_page(name: str, run: Path) -> str:
 
 
 def progress_json(run: Path, after: int) -> bytes:
-    """Return what is new in a run as JSON.
-
-    Args:
-        run: its folder.
-        after: what `next` was in the answer before, or `START`.
-
-    Raises:
-        FileFormatError: what it keeps is damaged.
-    """
+    """Return what is new in a run as JSON, after what `next` was in the answer before, or `START`. Raises
+    FileFormatError where what it keeps is damaged."""
     last = after
     running, ended = (
         files.is_held(run),
@@ -114,7 +104,9 @@ def progress_json(run: Path, after: int) -> bytes:
         with store.Store(run / store.NAME, read_only=True) as results:
             rows = list(islice(results.rows(after=after), MOST_ROWS))
             last = (rows[-1].id or after) if rows else after
-            pictures = [_shown(*one) for one in results.pictures("search", after, last)]
+            for number, picture in results.pictures("search", after, last):
+                small = data_url(thumbnail(picture.astype("float32") / 255.0), "image/jpeg")
+                pictures.append({"step": number, "picture": small})
     answer: dict[str, object] = {
         "rows": [_told(one) for one in rows],
         "pictures": pictures,
@@ -129,11 +121,6 @@ def _told(row: Row) -> dict[str, object]:
     values = {name: [value["value"], value["unit"]] for name, value in row.values.items()}
     found = {"kind": row.kind, "step": row.step, "objective": row.objective, "success": row.success, "label": row.label}
     return {**found, "values": values}
-
-
-def _shown(number: int, picture: NDArray[np.uint8]) -> dict[str, object]:
-    shown = thumbnail(picture.astype("float32") / 255.0)
-    return {"step": number, "picture": data_url(shown, "image/jpeg")}
 
 
 def _parts(run: Path) -> Html | None:

@@ -16,27 +16,15 @@ from typing import TypeVar
 from advsearch import rooms
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_bytes
-from advsearch.report.charts import NARROW, WIDE, study_chart
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
 from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, PARTS, REPORT, RunDirectory
 from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
+from advsearch.viewer import document
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.document import (
-    again,
-    data_script,
-    data_url,
-    document,
-    facts_table,
-    heading,
-    part_links,
-    scrolled,
-    study_table,
-    subject_html,
-)
 from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, write_sweep_page
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
@@ -69,7 +57,7 @@ def object_section(data: bytes) -> Html | None:
 
 def object_data(data: bytes) -> list[Html]:
     """Return the script that holds the object, if there is one."""
-    return [data_script(base64.b64encode(data).decode("ascii"), "object-file")] if data else []
+    return [document.data_script(base64.b64encode(data).decode("ascii"), "object-file")] if data else []
 
 
 def _header(data: bytes) -> dict[str, dict[str, object]]:
@@ -90,16 +78,8 @@ KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 
 
 def write_page(run: Path, result: Result) -> Path:
-    """Write `report.html` into the folder of a run and return its path.
-
-    Args:
-        run: the folder.
-        result: that the run has.
-
-    Raises:
-        FileFormatError: other results of the run are damaged.
-        StorageError: the page cannot be written.
-    """
+    """Write `report.html` into the folder of a run and return its path. Raises FileFormatError where other results of
+    the run are damaged, StorageError where the page cannot be written."""
     if isinstance(result, SweepSummary):
         return write_sweep_page(run, result)
     own = rooms.in_room(result.command, "page", "page")
@@ -125,13 +105,13 @@ def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
         *([] if drawn else _figures(run, given.said)),
         *(_section(run, one, given.said) for one in given.sections if one.only in ("", "page") and not one.empty),
         _links(run, parts) if parts and all(isinstance(one, str) for one in parts) else None,
-        join_html(element("h2", "Cost and conditions"), facts_table(facts)),
-        again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
+        join_html(element("h2", "Cost and conditions"), document.facts_table(facts)),
+        document.again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
     )
     subject = subject_of(result, given)
-    what = join_html(result.command, "; " if subject else None, subject_html(*(("", one) for one in subject)))
-    header = heading(what, given.said, remarks_of(result, given))
-    return document(
+    what = join_html(result.command, "; " if subject else None, document.subject_html(*(("", one) for one in subject)))
+    header = document.heading(what, given.said, remarks_of(result, given))
+    return document.document(
         f"{run.name}, {result.command}", header, main, footer=f"run {run.name}. This page needs no other file."
     )
 
@@ -149,11 +129,15 @@ def _section(run: Path, one: AnswerPart, said: str) -> Html:
     if one.draw is not None:
         words = " ".join([f"{one.title}.", *(one.text or [said])])
         chart = element("div", *(study_chart(one.draw, words, width, one.height) for width in (WIDE, NARROW)))
-    table = study_table(one.heads, one.rows, part_links(run, one.parts), one.shares) if one.heads else None
+    table = (
+        document.study_table(one.heads, one.rows, document.part_links(run, one.parts), one.shares)
+        if one.heads
+        else None
+    )
     inside = join_html(
         *(element("p", text) for text in one.text if text and one.draw is None),
         chart or _figure(run, one.figure, " ".join(one.text) or one.title),
-        (table or facts_table({row[0]: row[1] for row in one.rows})) if one.rows else None,
+        (table or document.facts_table({row[0]: row[1] for row in one.rows})) if one.rows else None,
         *(_pictures(run, group) for group in one.pictures),
         element("p", one.note, class_="soft") if one.note else None,
     )
@@ -167,7 +151,7 @@ def _pictures(run: Path, group: Iterable[Picture]) -> Html | None:
     figures = [
         element(
             "figure",
-            element("img", src=data_url(file.read_bytes(), KINDS[file.suffix.lower()]), alt=one.caption),
+            element("img", src=document.data_url(file.read_bytes(), KINDS[file.suffix.lower()]), alt=one.caption),
             element("figcaption", one.caption),
         )
         for one in group
@@ -187,13 +171,12 @@ def _figure(run: Path, name: str, alt: str) -> Html | None:
     file = kept(run, name) if name else None
     if file is None:
         return None
-    picture = element("img", src=data_url(file.read_bytes(), "image/png"), alt=alt)
-    return element("figure", scrolled(picture, "wide"), class_="wide")
+    picture = element("img", src=document.data_url(file.read_bytes(), "image/png"), alt=alt)
+    return element("figure", document.scrolled(picture, "wide"), class_="wide")
 
 
 def _links(run: Path, parts: list[str]) -> Html:
-    """The runs that a run consists of, folded."""
-    linked = zip(parts, part_links(run, parts), strict=True)
+    linked = zip(parts, document.part_links(run, parts), strict=True)
     lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
     return element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines))
 
@@ -225,20 +208,16 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
     with placed_by("bundle"):
         if len(results) == 1 and not sweeps:
-            return _alone(runs[0], folder)
+            run = runs[0]
+            for part in sorted((run / PARTS).glob(f"*/{REPORT}")):
+                if part.is_symlink() or part.parent.is_symlink() or not part.is_file():
+                    continue
+                write_bytes(folder / part.relative_to(run), part.read_bytes())
+            return write_bytes(folder / INDEX, renewed(run).read_bytes())
         if len(sweeps) < len(results):
             raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
         sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
         return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
-
-
-def _alone(run: Path, folder: Path) -> Path:
-    """Write the page of a run, and those of the attacks that it consists of, which it links to."""
-    for part in sorted((run / PARTS).glob(f"*/{REPORT}")):
-        if part.is_symlink() or part.parent.is_symlink() or not part.is_file():
-            continue
-        write_bytes(folder / part.relative_to(run), part.read_bytes())
-    return write_bytes(folder / INDEX, renewed(run).read_bytes())
 
 
 def _copied(run: Path, folder: Path, number: int) -> SweepSource:

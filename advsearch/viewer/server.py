@@ -1,21 +1,22 @@
-"""Requests that the dashboard's server does not answer as asked.
+"""`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
 
-`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
-
-What it answers: GET and HEAD of the list, of a run's page, of its rows and pictures, POST of a photograph, and nothing
-else. No part of an address becomes a path: runs are looked up by name among those that it was given, pictures by
-number. A request whose `Host` is not this server's is refused, so that a page elsewhere whose name is made to lead here
-(DNS rebinding) reads nothing; so is one that another origin's page sends. Beyond this machine every request needs the
-token, and goes over HTTPS. A photograph has to come from this server's own page, which alone knows the key for it.
+It answers GET and HEAD of the list, of a run's page, rows and pictures, POST of a photograph, and nothing else. No part
+of an address becomes a path. A request whose `Host` is not this server's is refused (DNS rebinding); so is one that
+another origin's page sends. Beyond this machine every request needs the token, and goes over HTTPS, with a certificate
+that `openssl` makes and that is good for as long as the server runs. A photograph needs the key of this server's page.
 """
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import ipaddress
 import re
 import secrets
+import socket
 import ssl
+import subprocess
+import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -24,7 +25,6 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from queue import Queue
-from socket import socket
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
@@ -34,11 +34,63 @@ from advsearch.files import open_regular
 from advsearch.report.markup import element
 from advsearch.runs import files, listing
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
-from advsearch.viewer.certificate import https_context, is_address, reachable
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.dashboard import START, following_page, is_under_way, list_page, progress_json
 from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
 from advsearch.viewer.thumbnails import cover, kept_pictures, path_of
+
+DAYS = 7
+"""For which a certificate is good."""
+
+
+def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
+    """Return what speaks HTTPS under some names and addresses, and the SHA-256 fingerprint of its new certificate.
+    Raises InputError where there is no `openssl`, or it makes none."""
+    names = ",".join(f"IP:{host}" if is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
+    with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
+        key, certificate = Path(folder) / "key.pem", Path(folder) / "certificate.pem"
+        key.touch(mode=0o600)
+        command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
+        command += ["-keyout", str(key), "-out", str(certificate), "-days", str(DAYS), "-subj", "/CN=advsearch"]
+        command += ["-addext", f"subjectAltName={names}", "-addext", "extendedKeyUsage=serverAuth"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, timeout=30.0, stdin=subprocess.DEVNULL)
+        except FileNotFoundError:
+            raise InputError(
+                "https: needs the program openssl, which makes the certificate; apt-get install openssl, or leave "
+                "`host` and `https` out"
+            ) from None
+        except (OSError, subprocess.SubprocessError) as error:
+            text = (getattr(error, "stderr", None) or b"").decode(errors="replace")[-300:]
+            raise InputError(f"https: openssl made no certificate: {text or error}") from None
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.load_cert_chain(certificate, key)
+        data = ssl.PEM_cert_to_DER_cert(certificate.read_text(encoding="ascii"))
+    digest = hashlib.sha256(data).hexdigest().upper()
+    return context, ":".join(digest[place : place + 2] for place in range(0, len(digest), 2))
+
+
+def reachable(host: str) -> str:
+    """Return the address under which others reach what listens at `host`: of any address, the one that leads out."""
+    if host not in ("0.0.0.0", "::", ""):
+        return host
+    family, far = (socket.AF_INET6, "2001:db8::1") if host == "::" else (socket.AF_INET, "192.0.2.1")
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((far, 9))  # chooses an address; nothing is sent
+            return str(probe.getsockname()[0])
+    except OSError:
+        return "::1" if host == "::" else "127.0.0.1"
+
+
+def is_address(host: str) -> bool:
+    """Whether a host is a number and no name."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
 
 
 class Refused(Exception):
@@ -116,7 +168,7 @@ class Dashboard(HTTPServer):
         if https or self.token:
             names = (reachable(host), "localhost", LOOPBACK)
             self._context, self.fingerprint = https_context(names)
-        self._waiting: Queue[tuple[socket, Any] | None] = Queue(WAITING)
+        self._waiting: Queue[tuple[socket.socket, Any] | None] = Queue(WAITING)
         try:
             super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:
@@ -280,13 +332,6 @@ class _Handler(BaseHTTPRequestHandler):
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such run")
         return found
 
-    def _list(self, _query: Mapping[str, list[str]]) -> tuple[str, bytes]:
-        return "text/html; charset=utf-8", list_page(self.server.runs()).encode()
-
-    def _cover(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        """A small picture of a run for the list; an empty one where it has none."""
-        return "image/jpeg", cover(self._run(name))
-
     def _page(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         run = self._run(name)
         if listing.listed_run(run, counts=False).command == "sweep":
@@ -297,9 +342,6 @@ class _Handler(BaseHTTPRequestHandler):
         if is_under_way(run):
             return _html(following_page(name, run).encode(), "../../")
         return _html(report.read_bytes(), "../../")
-
-    def _progress(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        return "application/json", progress_json(self._run(name), _after(query, START))
 
     def _part(self, _query: Mapping[str, list[str]], name: str, part: str) -> tuple[str, bytes]:
         """The page of one of the attacks that a study consists of, where the study's page links to it."""
@@ -342,12 +384,6 @@ class _Handler(BaseHTTPRequestHandler):
         )
         return _html(made, "../../../", ("../", name))
 
-    def _rendering(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
-        return _photographs("rendering_picture")(self._run(name), rendering)
-
-    def _photo(self, _query: Mapping[str, list[str]], name: str, photo: str) -> tuple[str, bytes]:
-        return _photographs("photo")(self._run(name), photo)
-
     def _take(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
         _photographs("check_sender")(self.headers, self.server.key)
         data = partial(_photographs("request_body"), self.headers, self.rfile)
@@ -364,17 +400,23 @@ Handler = Callable[..., tuple[str, bytes]]
 Routes = tuple[tuple[str, Handler], ...]
 
 _ROUTES: Routes = (
-    ("/", _Handler._list),
+    ("/", lambda self, _: ("text/html; charset=utf-8", list_page(self.server.runs()).encode())),
     ("/compare/", _Handler._compare),
     ("/runs/([^/]+)/", _Handler._page),
-    ("/runs/([^/]+)/cover", _Handler._cover),
+    ("/runs/([^/]+)/cover", lambda self, _, name: ("image/jpeg", cover(self._run(name)))),
     ("/runs/([^/]+)/rows", _Handler._rows),
-    ("/runs/([^/]+)/progress", _Handler._progress),
+    (
+        "/runs/([^/]+)/progress",
+        lambda self, query, name: ("application/json", progress_json(self._run(name), _after(query, START))),
+    ),
     (f"/runs/([^/]+)/{PARTS}/([^/]+)/{re.escape(REPORT)}", _Handler._part),
     (r"/runs/([^/]+)/pictures/[0-9]+/([0-9]{1,12})\.jpg", _Handler._picture),
     ("/runs/([^/]+)/align/", _Handler._align),
-    ("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._rendering),
-    ("/runs/([^/]+)/align/photos/([^/]+)", _Handler._photo),
+    (
+        "/runs/([^/]+)/align/renderings/([^/]+)",
+        lambda self, _, name, one: _photographs("rendering_picture")(self._run(name), one),
+    ),
+    ("/runs/([^/]+)/align/photos/([^/]+)", lambda self, _, name, one: _photographs("photo")(self._run(name), one)),
 )
 
 _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
@@ -382,7 +424,6 @@ _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
 
 
 def _after(query: Mapping[str, list[str]], otherwise: int) -> int:
-    """Return the id of the row after which rows are asked for."""
     after = query.get("after", [str(otherwise)])[0]
     if not re.fullmatch(r"[0-9]{1,15}", after):
         raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")

@@ -17,21 +17,9 @@ from pathlib import Path
 
 from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.report import wording
-from advsearch.report.charts import NARROW, WIDE, study_chart
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report import sweeps, wording
+from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
 from advsearch.report.phrases import answer_text, beside_text, is_command, percent
-from advsearch.report.sweeps import (
-    DRIVE_HEADS,
-    difference_text,
-    distance_axes,
-    distance_of,
-    distance_sentence,
-    drive_rows,
-    drive_title,
-    surface_sentences,
-    wrong_text,
-)
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
@@ -95,12 +83,8 @@ def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
 
 
 def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:
-    """Return the page as HTML.
-
-    Args:
-        runs: folder and result of each sweep; None where it has none yet.
-        sources: what the explorer of each reads.
-    """
+    """Return the page of sweeps as HTML, of each its folder, its result (None where it has none yet) and what its
+    explorer reads."""
     connects = any(isinstance(one.rows, str) for one in sources)
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)
@@ -217,7 +201,8 @@ def sweep_verdict(summary: SweepSummary) -> str:
 def _still(path: Path, summary: SweepSummary) -> Html:
     """What a page without a script shows in the explorer's place."""
     single = summary.cells is not None and max(map(max, summary.cells.configurations)) <= 1
-    figure = _figure(path / "images" / "sweep.png", f"{'Margin' if single else 'Accuracy'} over {_axes_text(summary)}.")
+    axes = " and ".join(list(dict.fromkeys(row.axis for row in summary.axes))[:2]) or "all configurations"
+    figure = _figure(path / "images" / "sweep.png", f"{'Margin' if single else 'Accuracy'} over {axes}.")
     worst = _figure(path / "images" / "worst.png", _worst_text(summary))
     return join_html(
         element("div", figure, class_="pictures", data_still="true") if figure else None,
@@ -230,13 +215,13 @@ def _drives(path: Path, summary: SweepSummary) -> Html:
     """What is said of whole drives, where frames of a path were swept, with frames of the worst one."""
     if not summary.drives:
         return Html("")
-    said = f"Frames of the worst drive, {drive_title(summary.drives[0])}, from the first to the last"
+    said = f"Frames of the worst drive, {sweeps.drive_title(summary.drives[0])}, from the first to the last"
     figure = _figure(path / "images" / "drive.png", said, wide=True)
     return join_html(
         element("h2", "Whole drives"),
         element("div", figure, class_="pictures") if figure else None,
         *(
-            join_html(element("p", drive_title(one)), study_table(DRIVE_HEADS, drive_rows(one)))
+            join_html(element("p", sweeps.drive_title(one)), study_table(sweeps.DRIVE_HEADS, sweeps.drive_rows(one)))
             for one in summary.drives
         ),
     )
@@ -244,11 +229,11 @@ def _drives(path: Path, summary: SweepSummary) -> Html:
 
 def _distance(summary: SweepSummary) -> Html:
     """How far away the object is seen, where the sweep of a detector tells."""
-    found = distance_of(summary)
+    found = sweeps.distance_of(summary)
     if found is None:
         return Html("")
-    said = distance_sentence(found)
-    charts = [study_chart(partial(distance_axes, found), said, width) for width in (WIDE, NARROW)]
+    said = sweeps.distance_sentence(found)
+    charts = [study_chart(partial(sweeps.distance_axes, found), said, width) for width in (WIDE, NARROW)]
     return join_html(element("h2", "How far away it is seen"), element("p", said), *charts)
 
 
@@ -256,7 +241,7 @@ def _surface(path: Path, summary: SweepSummary) -> Html:
     """Which parts of the surface go with wrong answers, where that was asked for."""
     if summary.surface is None:
         return Html("")
-    said = surface_sentences(summary.surface)
+    said = sweeps.surface_sentences(summary.surface)
     figure = _figure(path / "images" / "surface.png", " ".join(said), wide=True)
     tables = [_parts(one) for one in summary.surface.tables if one.strongest]
     return join_html(
@@ -274,9 +259,9 @@ def _parts(told: SurfaceTable) -> Html:
             f"{one.u:.3f}, {one.v:.3f}",
             ", ".join(f"{x:.3g}" for x in one.place),
             str(one.face),
-            wrong_text(one.seen),
-            wrong_text(one.hidden),
-            difference_text(one),
+            sweeps.wrong_text(one.seen),
+            sweeps.wrong_text(one.hidden),
+            sweeps.difference_text(one),
             f"{one.p:.2g}",
         )
         for one in told.strongest
@@ -284,11 +269,6 @@ def _parts(told: SurfaceTable) -> Html:
     who = f"{wording.short_name(told.object)}, {wording.short_name(told.model)}"
     what = f"{who}: the {told.part}s that are told most clearly"
     return element("details", element("summary", what), study_table(heads, cells))
-
-
-def _axes_text(summary: SweepSummary) -> str:
-    names = list(dict.fromkeys(row.axis for row in summary.axes))
-    return " and ".join(names[:2]) or "all configurations"
 
 
 def _worst_text(summary: SweepSummary) -> str:
@@ -316,13 +296,10 @@ def _axes(summary: SweepSummary) -> Html:
     for name in dict.fromkeys(row.axis for row in summary.axes):
         mine = [row for row in summary.axes if row.axis == name]
         if len(mine) <= MOST_LISTED:
-            tables.append(element("details", element("summary", f"Accuracy by {name}"), _table(mine)))
+            heads = ("value", "configurations", "right", "accuracy", "95 % interval")
+            table = study_table(heads, [_cells(row) for row in mine])
+            tables.append(element("details", element("summary", f"Accuracy by {name}"), table))
     return join_html(element("h2", "In numbers"), *tables) if tables else Html("")
-
-
-def _table(rows: Sequence[AxisRow]) -> Html:
-    heads = ("value", "configurations", "right", "accuracy", "95 % interval")
-    return study_table(heads, [_cells(row) for row in rows])
 
 
 def _cells(row: AxisRow) -> list[str]:
@@ -351,11 +328,8 @@ def _cost(path: Path, summary: SweepSummary) -> Html:
 
 
 def result_of(run: Path) -> SweepSummary | None:
-    """Return the result of the sweep in a folder; None where it has none yet.
-
-    Raises:
-        FileFormatError: it is damaged, or that of another command.
-    """
+    """Return the result of the sweep in a folder; None where it has none yet. Raises FileFormatError where it is
+    damaged, or that of another command."""
     if not (run / "summary.json").is_file():
         return None
     found = read_result(run)

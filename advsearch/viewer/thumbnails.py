@@ -87,24 +87,14 @@ def path_of(run: Path, number: int) -> Path:
 
 
 def keep(run: Path, number: int, data: bytes) -> None:
-    """Keep the thumbnail of a picture.
-
-    Raises:
-        StorageError: it cannot be written.
-    """
+    """Keep the thumbnail of a picture. Raises StorageError where it cannot be written."""
     write_bytes(path_of(run, number), data, durable=False)
 
 
 @dataclass(frozen=True)
 class Kept:
-    """The thumbnails that a run has.
-
-    Attributes:
-        run: its folder.
-        models: how many configurations in a row are of one picture.
-        some: whether only some of the pictures were kept.
-        suffix: of the files.
-    """
+    """The thumbnails that a run has, as files with a suffix, each of `models` configurations in a row; only of some of
+    the pictures, if it says so."""
 
     run: Path
     models: int

@@ -28,11 +28,10 @@ from advsearch.engine.loading import as_controls, instances_in, settings_of
 from advsearch.engine.naming import given_to
 from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
-from advsearch.progress import NullProgress
+from advsearch.progress import BarProgress, LineProgress, NotebookProgress, NullProgress, watched
 from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region.answer import RegionResult
 from advsearch.runs.results.base import Result
-from advsearch.watching import BarProgress, LineProgress, NotebookProgress, watched
 
 SIDE = 16
 PICTURE: dict[str, Any] = {"resolution": SIDE, "spp": 1, "denoise": "none", "threads": 1}
@@ -342,7 +341,7 @@ def test_progress_is_a_bar_where_somebody_looks(monkeypatch: pytest.MonkeyPatch)
     shell = types.SimpleNamespace(kernel=object())
     notebook = types.SimpleNamespace(get_ipython=lambda: shell, display=types.SimpleNamespace(display=display))
     monkeypatch.setitem(sys.modules, "IPython", notebook)
-    monkeypatch.setattr("advsearch.watching.UPDATE", 0.0)
+    monkeypatch.setattr("advsearch.progress.UPDATE", 0.0)
     assert watcher(True) is NotebookProgress
     assert any(re.search(r'searching, 2 of 4.*best 0\.5 <progress value="2" max="4">', one) for one in shown)
     assert shown[-1] == "<div>a sentence</div>"

@@ -21,7 +21,6 @@ from advsearch.config import AttackConfig
 from advsearch.engine.objective import of_ensemble
 from advsearch.engine.verifier import Retrials
 from advsearch.errors import InputError
-from advsearch.models.ensemble import of_each, together
 from advsearch.questions.attack.answer import MatrixResult
 from advsearch.questions.attack.carry_out import attack_from_config
 from advsearch.questions.attack.several import models_answering
@@ -29,7 +28,7 @@ from advsearch.questions.gap.settings import GapConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Classification
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Together, of_each, together
 
 BOTH = "small_models:easy,small_models:hard"
 SHORT: dict[str, Any] = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import importlib
 import io
 import json
 import os
@@ -27,23 +26,22 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 
 import advsearch
 from advsearch import __version__
-from advsearch.cli import list as listing
+from advsearch.cli import names
 from advsearch.cli.flags import with_flags
-from advsearch.cli.main import COMMANDS, main
+from advsearch.cli.main import COMMANDS, help_of, main
 from advsearch.cli.output import aligned, finish, watch_progress
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress
 from advsearch.questions.gap.settings import GapConfig
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.settings import Parameter
 from advsearch.settings import Config, settings
-from advsearch.watching import BarProgress, LineProgress
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL")
 
@@ -120,7 +118,7 @@ def test_help_has_four_groups_and_each_command_once_with_its_whole_help(
     shown = re.findall(r"^  ([a-z0-9-]+) +(.+(?:\n {4,}.*)*)", listing, re.M)
     assert [name for name, _ in shown] == list(COMMANDS)
     for name, text in shown:
-        assert " ".join(text.split()) == importlib.import_module(COMMANDS[name]).HELP
+        assert " ".join(text.split()) == help_of(name)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -812,7 +810,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_the_listed_models_can_be_loaded_by_that_name() -> None:
-    assert list(listing.MODELS) == [AttackConfig(object="mug").model]
+    assert list(names.MODELS) == [AttackConfig(object="mug").model]
 
 
 @pytest.mark.usefixtures("registries")
@@ -991,7 +989,7 @@ def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
 def test_lines_come_where_nothing_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr("sys.stderr", stream)
-    monkeypatch.setattr("advsearch.watching.PATIENCE", 0.0)
+    monkeypatch.setattr("advsearch.progress.PATIENCE", 0.0)
     with watch_progress() as progress:
         progress.stage("compiling")
         for _ in range(100):

@@ -14,8 +14,8 @@ from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.controls import Space, make_control, make_space
-from advsearch.controls.clean import sentences
 from advsearch.controls.pose import PoseControl
+from advsearch.controls.values import sentences
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import sweep_from_config

@@ -13,8 +13,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control
-from advsearch.controls.geometry import BoundGeometry, GeometryControl
-from advsearch.controls.geometry_modes import WALL_STRAIN, Limits, body, shape_modes
+from advsearch.controls.geometry import WALL_STRAIN, BoundGeometry, GeometryControl, Limits, body, shape_modes
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, describe
@@ -108,7 +107,7 @@ def test_no_rigid_motion_is_left(scene: SceneDescription, form: str) -> None:
     control, solid = bound(scene, form=form), body(scene.object.mesh)
     centred = solid.places - solid.places.mean(axis=0)
     for u in wild(len(control.start))[:3]:
-        field = control._shaper.field(u).numpy()
+        field = control._field(2.0 * u.double() - 1.0).numpy()
         size = float(np.linalg.norm(field))
         for axis in np.eye(3):
             for rigid in (np.broadcast_to(axis, field.shape), np.cross(axis, centred)):

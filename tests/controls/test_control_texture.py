@@ -95,9 +95,9 @@ def test_a_palette_repaints_what_resembles_its_colour() -> None:
     assert colors.shape == (2, 3)
     red = int(colors[:, 0].argmax())
     from advsearch.controls.base import Budget
-    from advsearch.controls.texture import Recoloured
+    from advsearch.controls.texture import recoloured
 
-    painter = Recoloured(image, colors, Budget("linf", 0.5))
+    painter = recoloured(image, colors, Budget("linf", 0.5))
     u = colors.clone()
     u[red] = torch.tensor([0.3, 0.7, 0.2])
     painted = painter.texels(u.reshape(-1))

@@ -21,8 +21,7 @@ from advsearch.engine.loading import Scene
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.models.reference import load
-from advsearch.models.trainable import Trainable
+from advsearch.models.reference import Trainable, load
 from advsearch.progress import NullProgress
 from advsearch.questions.harden import carry_out as hardening
 from advsearch.questions.harden import scenes as harden_scenes

@@ -25,7 +25,7 @@ from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
-from advsearch.models.trainable import Trainable, trainable
+from advsearch.models.reference import Trainable, trainable
 from advsearch.progress import NullProgress
 from advsearch.questions.harden.answer import TrainingRound
 from advsearch.questions.harden.lessons import (

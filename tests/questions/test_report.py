@@ -24,7 +24,7 @@ from advsearch.questions.report.evidence import (
     photo_claims,
     warnings_over,
 )
-from advsearch.report.claims import ENDED, NO_PROOF, NOTHING, Claim
+from advsearch.report.shown import ENDED, NO_PROOF, NOTHING, Claim
 from advsearch.runs.results.base import Result
 from advsearch.runs.summary import to_json
 

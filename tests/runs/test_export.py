@@ -120,15 +120,14 @@ def test_a_table_that_cannot_be_written_names_out(run: Path, capsys: pytest.Capt
 @pytest.mark.parametrize("format", WRITERS)
 def test_what_is_no_table_says_what_it_writes_and_is_in_the_help(format: str, run: Path, capsys: Any) -> None:
     writer = WRITERS[format]
-    said = writer.__doc__ or ""
-    where = f"{writer.__file__} (see advsearch/cli/exports/__init__.py): expected"
-    assert said.endswith(".") and "\n" not in said, f"{where} a sentence as its docstring"
-    assert f"--format {format}" in writer.EXAMPLE and "--out" in writer.EXAMPLE, f"{where} an EXAMPLE with --format"
+    said = writer.text
+    assert said.endswith(".") and "\n" not in said, f"{format}: expected a sentence"
+    assert f"--format {format}" in writer.example and "--out" in writer.example, f"{format}: an example with --format"
     assert main(["export", "--help"]) == 0
     assert f"{format}: {said.rstrip('.')}".lower() in " ".join(capsys.readouterr().out.split()).lower()
     assert main(["export", run.name, "--format", format]) == 2
-    assert f"--out: {format} writes {writer.WRITES}; give its name" in " ".join(capsys.readouterr().err.split())
-    out = writer.EXAMPLE.split("--out ")[1]
+    assert f"--out: {format} writes {writer.writes}; give its name" in " ".join(capsys.readouterr().err.split())
+    out = writer.example.split("--out ")[1]
     assert main(["export", "nowhere", "--format", format, "--out", out]) == 2
     assert "nowhere" in capsys.readouterr().err and not Path(out).exists()
 

@@ -15,8 +15,8 @@ from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
 from advsearch.tasks import Answer, Detection, Facts, Judgement, Sight
-from advsearch.tasks.boxes import corners, overlap, share_inside, strongest
-from advsearch.tasks.detection import GOALS, Place, log_odds
+from advsearch.tasks.boxes import Place, corners, log_odds, overlap, share_inside, strongest
+from advsearch.tasks.detection import GOALS
 from advsearch.tasks.detector_answers import detections_in
 
 NAMES = ("cup", "bowl", "dog")

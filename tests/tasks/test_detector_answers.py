@@ -16,8 +16,8 @@ from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.tasks import Answer, Detection
-from advsearch.tasks.detection import Place
-from advsearch.tasks.detector_answers import Detections, detections_in, settled
+from advsearch.tasks.boxes import Detections, Place
+from advsearch.tasks.detector_answers import detections_in, settled
 
 CUP, BOWL = [20.0, 40.0, 60.0, 90.0], [65.0, 10.0, 90.0, 35.0]
 NAMES = ("cup", "bowl")

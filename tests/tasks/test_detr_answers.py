@@ -14,7 +14,7 @@ from advsearch import load_model
 from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import read_labels
 from advsearch.tasks import Detection
-from advsearch.tasks.detection import Place
+from advsearch.tasks.boxes import Place
 from advsearch.tasks.detector_answers import QUERIES
 
 NAMES = ("bowl", "coffee mug", "dog")

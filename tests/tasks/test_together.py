@@ -17,12 +17,11 @@ from advsearch.config import AttackConfig
 from advsearch.engine.objective import objective_for
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
-from advsearch.models.ensemble import together
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Depth, Detection, Facts, Segmentation, Sight, Task, make_task
 from advsearch.tasks.depth import AS_FAR, DISPARITY, GONE
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Together, together
 
 BOTH = {"name": "detection+depth", "depth": {"kind": DISPARITY}}
 

@@ -16,8 +16,7 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.labels import names_in, read_labels
 from advsearch.tasks import Detection
-from advsearch.tasks.boxes import left_over, strongest
-from advsearch.tasks.detection import Place
+from advsearch.tasks.boxes import Place, left_over, strongest
 from advsearch.tasks.detector_answers import order_in
 
 CUP = (20.0, 40.0, 60.0, 90.0)

@@ -33,13 +33,12 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.questions.attack.page import LARGE_PICTURE, SMALLER_SIDE
 from advsearch.report import wording
-from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
-from advsearch.report.markup import Html, element, figure_of_answer, join_html
+from advsearch.report.markup import NARROW, WIDE, Curve, Html, element, figure_of_answer, join_html, objective_chart
 from advsearch.report.phrases import objective_label, percent
 from advsearch.report.shown import shown
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.images import read_png
-from advsearch.viewer.document import CSS, asset
+from advsearch.viewer.document import asset
 from advsearch.viewer.pages import LARGEST, object_section, read_object
 
 VOID = {"meta", "img", "br", "hr", "link"}
@@ -180,9 +179,10 @@ def test_a_phone_gets_a_chart_that_fits_with_letters_that_can_be_read(tmp_path: 
     assert (
         width <= 390 - 2 * 20
     )  # what the page leaves of a phone: letters of 13 are drawn as such, and nothing scrolls
-    assert "min-width" not in re.findall(r"svg\.chart \{[^}]*\}", CSS)[0]
-    phone = CSS.index("@media (max-width: 34rem)")
-    assert CSS.index("svg.narrow { display: none; }") < phone < CSS.index("svg.narrow { display: block; }")
+    assert "min-width" not in re.findall(r"svg\.chart \{[^}]*\}", asset("document.css"))[0]
+    css = asset("document.css")
+    phone = css.index("@media (max-width: 34rem)")
+    assert css.index("svg.narrow { display: none; }") < phone < css.index("svg.narrow { display: block; }")
 
 
 def test_numbers_have_the_digits_that_mean_something(tmp_path: Path) -> None:

@@ -36,8 +36,7 @@ from advsearch.questions.photographs.answer import (
 from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
-from advsearch.viewer import certificate
-from advsearch.viewer.server import Dashboard
+from advsearch.viewer.server import Dashboard, https_context, reachable
 
 
 def picture(size: tuple[int, int] = (64, 48), format: str = "JPEG", level: int = 128) -> bytes:
@@ -329,7 +328,7 @@ def test_the_key_is_for_this_user_alone_and_does_not_stay(tmp_path: Path, monkey
 
     monkeypatch.setattr(ssl.SSLContext, "load_cert_chain", looked_at)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    certificate.https_context(["127.0.0.1", "localhost"])
+    https_context(["127.0.0.1", "localhost"])
     assert seen == [(0o600, 0o700)]
     assert list(tmp_path.iterdir()) == []
 
@@ -341,8 +340,8 @@ def test_without_openssl_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch
 
 
 def test_any_address_is_told_as_one_that_others_reach() -> None:
-    assert certificate.reachable("192.0.2.7") == "192.0.2.7"
-    assert certificate.reachable("0.0.0.0") not in ("0.0.0.0", "")
+    assert reachable("192.0.2.7") == "192.0.2.7"
+    assert reachable("0.0.0.0") not in ("0.0.0.0", "")
 
 
 def test_the_page_shows_a_code_for_a_phone(run: Path, tmp_path: Path) -> None:

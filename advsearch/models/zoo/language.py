@@ -23,7 +23,7 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models.model import ModelWarning
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
-from advsearch.models.zoo.loaded import Loaded, Measured, measured
+from advsearch.models.zoo.library import Loaded, Measured, measured
 from advsearch.models.zoo.zero_shot import spoken
 
 QUESTION = "What is this? Answer with its name only."
@@ -54,11 +54,8 @@ def speaks(architecture: str, network: Any) -> bool:
 
 
 def source(loaded: Loaded) -> Source:
-    """Return the source of a network that is finished when names are there, or a free answer is asked for.
-
-    Raises:
-        ModelError: it has an encoder for texts of its own, or its processor can't be had.
-    """
+    """Return the source of a network that is finished when names are there, or a free answer is asked for. Raises
+    ModelError where it has an encoder for texts of its own, or its processor can't be had."""
     if getattr(loaded.network.config, "is_encoder_decoder", False):
         raise _another(loaded, "answers from an encoder of its own")
     try:
@@ -74,7 +71,6 @@ def source(loaded: Loaded) -> Source:
 
 
 def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
-    """Return the classifier of these names, or what answers freely."""
     purpose.check(loaded.name, "goes on in words", "classification", "answer")
     free, names = purpose.task == "answer", purpose.names
     if free and names is not None:
@@ -98,7 +94,9 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
         module = _Free(reader, processor.tokenizer, _ends(loaded.network), purpose.tokens) if free else named
         with torch.no_grad():
             _check(loaded, named, side)
-            seconds = _seconds(module, side)
+            begun = time.perf_counter()
+            module(torch.zeros((1, 3, *side)))
+            seconds = time.perf_counter() - begun
     except (InputError, ModelError):
         raise
     except Exception as error:  # any network may raise anything
@@ -144,17 +142,19 @@ Pixels = Callable[[Tensor], Tensor]
 
 
 def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measured]:
-    """Return what makes ``pixel_values`` of a picture (3, H, W), and what `advsearch.models.preprocessing` does before.
+    """Return what makes ``pixel_values`` of a picture (3, H, W), and what `Preprocessing` does before.
 
     An affine map is measured and left to that. What cuts a picture into patches or tiles is called itself, which is
     differentiable where the processor works with torchvision.
     """
-    described, side = Measured(), _side(loaded.network.config)
+    side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or SIDE
+    side = (int(side[0]), int(side[1])) if isinstance(side, (list, tuple)) else (int(side), int(side))
+    described = Measured()
     with suppress(ModelError):  # it is called then
         described = measured(lambda **given: processor(text=[text], **given), loaded.spec)
     if "mean" in described:
         described["input_size"] = described.get("input_size", side)
-        pixels: Pixels = _alone
+        pixels: Pixels = lambda image: image[None]  # noqa: E731
     elif importlib.util.find_spec("torchvision") is None:
         raise ModelError(
             f"model {loaded.spec}: its processor cuts pictures into patches or tiles, and lets gradients through with "
@@ -164,16 +164,6 @@ def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measur
         described, pixels = Measured(input_size=side), partial(_called, processor, text)
     _check_pixels(loaded, processor, text, pixels, described)
     return pixels, described
-
-
-def _side(config: Any) -> tuple[int, int]:
-    side = getattr(getattr(config, "vision_config", None), "image_size", None) or SIDE
-    height, width = side if isinstance(side, (list, tuple)) else (side, side)
-    return int(height), int(width)
-
-
-def _alone(image: Tensor) -> Tensor:
-    return image[None]
 
 
 def _called(processor: Any, text: str, image: Tensor) -> Tensor:
@@ -271,11 +261,8 @@ class _Reader(nn.Module):
         return self._prompts[side]
 
     def given(self, image: Tensor) -> dict[str, Tensor]:
-        """Return what the network is given for a picture (3, H, W).
-
-        Raises:
-            ValueError: it is for pictures of another size.
-        """
+        """Return what the network is given for a picture (3, H, W). Raises ValueError where it is for pictures of
+        another size."""
         height, width = image.shape[1:]
         prompt, pixels = self.prompt((height, width)), self._pixels(image)
         if pixels.shape != prompt["pixel_values"].shape:
@@ -287,10 +274,7 @@ class _Reader(nn.Module):
 
     def begin(self, image: Tensor) -> tuple[Tensor, Any]:
         """Return the logits (tokens,) float32 of what follows picture and prompt, and the keys and values so far.
-
-        Raises:
-            ValueError: the network keeps none.
-        """
+        Raises ValueError where the network keeps none."""
         answer = self.network(**self.given(image), use_cache=True)
         past = answer.get(self.cache)
         if past is None:
@@ -329,16 +313,16 @@ class _Named(nn.Module):
             self.register_buffer(key, value)
 
     def forward(self, images: Tensor) -> Tensor:
-        return torch.stack([self._scores(image) for image in images])
-
-    def _scores(self, image: Tensor) -> Tensor:
-        first, past = self.reader.begin(image)
-        kept = (self.get_buffer(key).to(first.device) for key in ("stems", "rows", "columns", "counts"))
+        kept = (self.get_buffer(key).to(images.device) for key in ("stems", "rows", "columns", "counts"))
         stems, rows, columns, counts = kept
-        likely = first.log_softmax(dim=-1)[None]
-        if len(stems):
-            likely = torch.cat([likely, self.reader.go_on(stems, past).log_softmax(dim=-1).flatten(0, 1)])
-        return (likely[rows, columns] * counts).sum(dim=1)
+        scores = []
+        for image in images:
+            first, past = self.reader.begin(image)
+            likely = first.log_softmax(dim=-1)[None]
+            if len(stems):
+                likely = torch.cat([likely, self.reader.go_on(stems, past).log_softmax(dim=-1).flatten(0, 1)])
+            scores.append((likely[rows, columns] * counts).sum(dim=1))
+        return torch.stack(scores)
 
 
 class _Free(nn.Module):
@@ -349,16 +333,16 @@ class _Free(nn.Module):
         self.reader, self.tokenizer, self.ends, self.most = reader, tokenizer, ends, most
 
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
-        return [self._said(image) for image in images]
-
-    def _said(self, image: Tensor) -> dict[str, Any]:
-        logits, past = self.reader.begin(image)
-        steps, tokens = [logits], [int(logits.argmax())]
-        while tokens[-1] not in self.ends and len(tokens) < self.most:
-            steps.append(self.reader.go_on(logits.new_tensor([tokens[-1:]], dtype=torch.long), past)[0, -1])
-            tokens.append(int(steps[-1].argmax()))
-        text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
-        return {"text": text, "logits": torch.stack(steps), "begins": self.begins}
+        said = []
+        for image in images:
+            logits, past = self.reader.begin(image)
+            steps, tokens = [logits], [int(logits.argmax())]
+            while tokens[-1] not in self.ends and len(tokens) < self.most:
+                steps.append(self.reader.go_on(logits.new_tensor([tokens[-1:]], dtype=torch.long), past)[0, -1])
+                tokens.append(int(steps[-1].argmax()))
+            text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
+            said.append({"text": text, "logits": torch.stack(steps), "begins": self.begins})
+        return said
 
     def begins(self, word: str) -> list[int]:
         """Return the tokens that begin a word, in small letters or with a capital, after a blank or without one."""
@@ -370,7 +354,6 @@ class _Free(nn.Module):
 
 
 def _ends(network: Any) -> frozenset[int]:
-    """Return the tokens that end an answer."""
     said = network.generation_config.eos_token_id
     return frozenset(said if isinstance(said, (list, tuple)) else [said]) - {None}
 
@@ -394,12 +377,6 @@ def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
     size = max(TOLERANCE, 8.0 * torch.finfo(loaded.network.dtype).eps) * max(1.0, abs(own))
     if not abs(own - ours) <= size:
         raise _another(loaded, f"goes on otherwise after what it has kept ({ours:.6g} for {own:.6g})")
-
-
-def _seconds(module: nn.Module, side: tuple[int, int]) -> float:
-    begun = time.perf_counter()
-    module(torch.zeros((1, 3, *side)))
-    return time.perf_counter() - begun
 
 
 def _another(loaded: Loaded, what: str) -> ModelError:

@@ -19,21 +19,15 @@ from torch.nn import functional
 from advsearch.errors import ModelError, resembling
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
-from advsearch.models.zoo import features, language, pixels, timm, zero_shot
-from advsearch.models.zoo.library import library, reading
-from advsearch.models.zoo.loaded import Loaded, in_pixels, processor_of
+from advsearch.models.zoo import language, named, outputs, zero_shot
+from advsearch.models.zoo.library import Loaded, in_pixels, library, processor_of, reading
 
 
 @dataclass(frozen=True)
 class Family:
-    """Networks of transformers that are loaded and asked alike.
-
-    Args:
-        ours: whether a network is of it, by the name of its architecture (``DeiTForImageClassificationWithTeacher``)
-            and the network or its class.
-        loader: the class of transformers that builds it; "" for the architecture itself.
-        source: makes the model's source of it.
-    """
+    """Networks of transformers that are loaded and asked alike: `ours` tells them by the name of an architecture
+    (``DeiTForImageClassificationWithTeacher``) and the network or its class, a class of transformers builds them (""
+    for the architecture itself), and `source` makes the model's source."""
 
     ours: Callable[[str, Any], bool]
     loader: str
@@ -56,12 +50,12 @@ def load(spec: str) -> Source:
     One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`, `language`).
 
     Its labels are those that it was published with; size, order of channels and normalisation are measured on its
-    image processor (`processors.measured`). Code in a repository is never run, and weights are read from safetensors
+    image processor (`library.measured`). Code in a repository is never run, and weights are read from safetensors
     alone. A repository that timm has saved goes to timm.
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
-            kind or larger than the memory, or its processor does what `advsearch.models.preprocessing` can't.
+            kind or larger than the memory, or its processor does what `Preprocessing` can't.
 
     Warns:
         ModelWarning: it has no image processor.
@@ -82,7 +76,7 @@ def load(spec: str) -> Source:
             where["local_files_only"] = True
         told = _config(transformers, name, spec, where)
         if told.get("model_type") == "timm_wrapper" and "architectures" not in told:  # which timm itself has saved
-            return timm.load_repository(spec, name, revision)
+            return named.timm_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
@@ -123,13 +117,8 @@ def _part(transformers: Any, spec: str, name: str, where: Mapping[str, Any], loa
 
 
 def _kind(architecture: str, network: Any, spec: str) -> Family:
-    """Return which of `NETWORKS` an architecture is of; a ModelError says what it is otherwise.
-
-    Args:
-        architecture: by name.
-        network: of it, or its class.
-        spec: the model, for messages.
-    """
+    """Return which of `NETWORKS` an architecture is of, by its name and a network or its class; a ModelError says what
+    it is otherwise."""
     for kind in NETWORKS:
         if kind.ours(architecture, network):
             return kind
@@ -174,7 +163,6 @@ def _out_of_reach(name: str) -> bool:
 
 
 def _cached() -> list[str]:
-    """Return the names of the repositories in the hub's cache."""
     cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
     return [one.name.partition("--")[2].replace("--", "/") for one in cache.glob("models--*")]
 
@@ -264,16 +252,16 @@ NETWORKS = (
     Family(
         _called("TimmWrapperForImageClassification"),
         "AutoModelForImageClassification",
-        lambda loaded: timm.of_wrapped(loaded, names_of(loaded.network.config)),
+        lambda loaded: named.wrapped_timm(loaded, names_of(loaded.network.config)),
     ),
     Family(
-        _called("ForImageClassification"), "AutoModelForImageClassification", features.also(_with_names(_Classifier))
+        _called("ForImageClassification"), "AutoModelForImageClassification", outputs.also(_with_names(_Classifier))
     ),
     Family(_called("ForSemanticSegmentation"), "AutoModelForSemanticSegmentation", _with_names(_Segmenter)),
     Family(
-        pixels.is_ours,
+        outputs.is_ours,
         "AutoModelForUniversalSegmentation",
-        lambda loaded: pixels.mask_source(loaded, names_of(loaded.network.config) or None),
+        lambda loaded: outputs.mask_source(loaded, names_of(loaded.network.config) or None),
     ),
     Family(
         lambda architecture, network: zero_shot.finds(architecture),
@@ -282,13 +270,13 @@ NETWORKS = (
     ),
     Family(_called("ForObjectDetection"), "AutoModelForObjectDetection", _with_names(_Detector)),
     Family(language.speaks, "AutoModelForImageTextToText", language.source),
-    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", pixels.depth_source),
+    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", outputs.depth_source),
     Family(
         lambda architecture, network: zero_shot.compares(network),
         "AutoModel",
-        features.also(zero_shot.source, reads_text=True),
+        outputs.also(zero_shot.source, reads_text=True),
     ),
-    Family(features.answers_with_features, "", features.source),
+    Family(outputs.answers_with_features, "", outputs.source),
 )
 """Every kind that is read, the particular ones first."""
 

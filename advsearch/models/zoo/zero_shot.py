@@ -19,7 +19,7 @@ from advsearch.models.labels import patterns
 from advsearch.models.model import ModelWarning
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, sharing_copy, source_of
-from advsearch.models.zoo.loaded import Loaded, Measured, in_pixels
+from advsearch.models.zoo.library import Loaded, Measured, in_pixels
 
 TEXTS = 64
 """Texts that are embedded at once."""
@@ -34,11 +34,8 @@ def compares(network: Any) -> bool:
 
 
 def source(loaded: Loaded) -> Source:
-    """Return the source of a network that becomes a classifier when names are there.
-
-    Raises:
-        ModelError: it takes patches in place of pictures.
-    """
+    """Return the source of a network that becomes a classifier when names are there. Raises ModelError where it takes
+    patches in place of pictures."""
     check_takes_pictures(loaded.network, loaded.spec)
     return loaded.when_named(_named)
 
@@ -53,7 +50,6 @@ def check_takes_pictures(network: Any, spec: str) -> None:
 
 
 def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
-    """Return the classifier of these names."""
     names = purpose.named(name, "compares a picture with texts", "classification")
     prompts = patterns(purpose.prompts)
     if len(names) < 2:
@@ -191,7 +187,6 @@ def detector_source(loaded: Loaded) -> Source:
 
 
 def _detector(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
-    """Return the detector of these names."""
     names = purpose.named(name, "finds what it is told to", "detection")
     try:
         with torch.no_grad():
@@ -210,11 +205,7 @@ class _Owl(nn.Module):
     """Boxes (N, patches, 4) in pixels, x0 y0 x1 y1, and scores (N, patches, names) in [0, 1] of each name by itself.
 
     Minderer et al. 2022 (arXiv 2205.06230), section 3: each patch of the picture is one box, compared with the text of
-    each name. The half for texts is left out.
-
-    Args:
-        network: ``OwlViTForObjectDetection`` or ``Owlv2ForObjectDetection``.
-        rows: (names, features), the texts.
+    each name, whose features are the rows. The half of OWL for texts is left out.
     """
 
     rows: Tensor
@@ -236,7 +227,6 @@ class _Owl(nn.Module):
 
 
 def _half(network: Any) -> Any:
-    """Return the CLIP in an OWL."""
     return getattr(network, network.base_model_prefix)
 
 
@@ -248,13 +238,9 @@ def _owl(network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str,
 class _Grounded(nn.Module):
     """Boxes (N, queries, 4) in pixels, x0 y0 x1 y1, and scores (N, queries, names) in [0, 1] of each name by itself.
 
-    Liu et al. 2023 (arXiv 2303.05499), section 3: all names are one text, and a box has a score of each of its tokens.
-    A name's is the largest of its own.
-
-    Args:
-        network: ``GroundingDinoForObjectDetection`` or ``MMGroundingDinoForObjectDetection``.
-        text: (1, L) int64, its tokens.
-        places: (names, most) int64, where in it the tokens of each name are; a shorter one's first is there again.
+    Liu et al. 2023 (arXiv 2303.05499), section 3: all names are one text (1, L) of tokens, and a box has a score of
+    each of its tokens. A name's is the largest of its own, which are at `places` (names, most); a shorter one's first
+    is there again.
     """
 
     text: Tensor

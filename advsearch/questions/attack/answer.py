@@ -8,12 +8,18 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from advsearch.report import wording
-from advsearch.report.claims import (
+from advsearch.report.figures import BLUE
+from advsearch.report.markup import InNotebook
+from advsearch.report.phrases import answer_cells, margin_text, percent
+from advsearch.report.shown import (
     ENDED,
     NO_PROOF,
     WHY,
+    AnswerPart,
     Claim,
+    Column,
     Extent,
+    ShownAnswer,
     average_claim,
     case_claim,
     claim,
@@ -22,10 +28,6 @@ from advsearch.report.claims import (
     searches_text,
     share_text,
 )
-from advsearch.report.figures import BLUE
-from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import answer_cells, margin_text, percent
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
 from advsearch.report.wording import count, interval_text, number_text, short_name
 from advsearch.runs.export import table_to_pandas
 from advsearch.runs.results.attack import (

@@ -17,7 +17,7 @@ from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.cluster import Call
 from advsearch.config import AttackConfig, SceneConfig
-from advsearch.controls.clean import sentences
+from advsearch.controls.values import sentences
 from advsearch.engine.attack_parts import (
     LOADING,
     AttackParts,
@@ -60,8 +60,7 @@ from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.attack.several import curve_from_config, matrix_from_config
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
-from advsearch.tasks import AnyTask, Task, make_task
-from advsearch.tasks.own import OwnTask, function_of
+from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 
 PREPARING = "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""

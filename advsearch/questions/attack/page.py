@@ -16,8 +16,7 @@ from advsearch.files import JsonObject
 from advsearch.questions.attack.answer import answered_text, failures_part, failures_text, range_text
 from advsearch.questions.attack.method import PLAN_HEADS, method_facts, plan_rows, plan_text
 from advsearch.report import wording
-from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report.markup import NARROW, WIDE, Curve, Html, element, join_html, objective_chart
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, is_command, marks_text, objective_label
 from advsearch.runs import directory, images, store
 from advsearch.runs.results.attack import AttackSummary, FoundValue, PicturedAnswer

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from advsearch.config.derivative import DerivativeConfig, TimedConfig
+from advsearch.config.attack import DerivativeConfig, TimedConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, setting, setting_as_in
 

@@ -8,9 +8,18 @@ from typing import ClassVar
 from pydantic import Field
 
 from advsearch.report import wording
-from advsearch.report.claims import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.report.phrases import percent, share_of_text
-from advsearch.report.shown import AnswerPart, Column, Picture, ShownAnswer
+from advsearch.report.shown import (
+    AnswerPart,
+    Claim,
+    Column,
+    Extent,
+    Picture,
+    ShownAnswer,
+    claim,
+    nothing_claimed,
+    share_text,
+)
 from advsearch.report.wording import conditions_text, interval_text
 from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
 

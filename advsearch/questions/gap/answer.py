@@ -8,11 +8,10 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from advsearch.report import wording
-from advsearch.report.claims import Claim, average_claim, case_claim, searches_text
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.markup import InNotebook
 from advsearch.report.phrases import margin_text, percent
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, Column, ShownAnswer, average_claim, case_claim, searches_text
 from advsearch.runs.export import table_to_pandas
 from advsearch.runs.results.attack import AverageCase, VerifiedRate
 from advsearch.runs.results.base import Fields, JsonFloat, StudyResult

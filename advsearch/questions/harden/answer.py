@@ -8,11 +8,10 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from advsearch.report import wording
-from advsearch.report.claims import NO_PROOF, Claim, Extent, claim, share_text
 from advsearch.report.figures import BLUE, RED, Figures, drawn
 from advsearch.report.markup import InNotebook
 from advsearch.report.phrases import percent
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import NO_PROOF, AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
 from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import Fields, Interval, RunResult
 

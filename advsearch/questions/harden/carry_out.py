@@ -25,8 +25,8 @@ from advsearch.engine.loading import Controls
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
-from advsearch.models.imported import split_weights
-from advsearch.models.trainable import trainable
+from advsearch.models.reference import trainable
+from advsearch.models.source import split_weights
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.harden.answer import HardenedControl, HardenResult, Share, SplitSide, hardened_figure
 from advsearch.questions.harden.lessons import FOLDER, Lesson

@@ -26,7 +26,7 @@ from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.models.trainable import trainable
+from advsearch.models.reference import trainable
 from advsearch.questions.attack.carry_out import attack_on
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
 from advsearch.questions.harden.settings import ALL, HardenConfig

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from advsearch import seeds, threads
 from advsearch.models import Model
-from advsearch.models.trainable import Trainable
+from advsearch.models.reference import Trainable
 from advsearch.progress import Progress
 from advsearch.questions.harden.answer import TrainingRound
 from advsearch.questions.harden.lessons import (

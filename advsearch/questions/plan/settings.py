@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from advsearch.config.derivative import DerivativeConfig, TimedConfig
+from advsearch.config.attack import DerivativeConfig, TimedConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import setting_as_in
 

@@ -7,8 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import AttackConfig
-from advsearch.config.derivative import DerivativeConfig
+from advsearch.config.attack import AttackConfig, DerivativeConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
 

@@ -7,11 +7,10 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from advsearch.report.claims import Claim, Extent, claim, share_text
 from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
 from advsearch.report.markup import InNotebook
 from advsearch.report.phrases import percent
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
 from advsearch.runs.results.attack import LinearTransport
 from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, JsonFloat, SceneResult, having
 

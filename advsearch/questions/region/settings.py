@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from advsearch.config.attack import AttackConfig
-from advsearch.config.derivative import DerivativeConfig
+from advsearch.config.attack import AttackConfig, DerivativeConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import setting, setting_as_in
 

@@ -9,9 +9,8 @@ from typing import ClassVar
 from pydantic import Field
 
 from advsearch.report import wording
-from advsearch.report.claims import Claim, case_claim
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, ShownAnswer, case_claim
 from advsearch.runs.results.attack import ControlGroup, VerifiedRate
 from advsearch.runs.results.base import Fields, SceneResult
 

@@ -6,8 +6,8 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report.claims import Claim
 from advsearch.report.markup import Html, element, join_html
+from advsearch.report.shown import Claim
 from advsearch.report.wording import interval_text
 from advsearch.runs.results.base import Fields, Result
 from advsearch.viewer.document import again, document, facts_table, heading, study_table

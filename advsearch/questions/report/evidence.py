@@ -15,7 +15,7 @@ from advsearch.options import FROM_RUN
 from advsearch.questions.photographs.answer import FOLDER, PhotoAgreement
 from advsearch.questions.report.answer import Evidence, EvidenceRun
 from advsearch.report import wording
-from advsearch.report.claims import Claim, Extent, claim, nothing_claimed, share_text
+from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result, VariedValue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from advsearch.config.derivative import TimedConfig
+from advsearch.config.attack import TimedConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 

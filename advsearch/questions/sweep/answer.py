@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from advsearch.report import wording
-from advsearch.report.claims import Claim, Extent, claim, extent_of, share_text
 from advsearch.report.figures import figure_size, sweep_axes
 from advsearch.report.phrases import answer_text, beside_text, margin_text, percent
-from advsearch.report.shown import AnswerPart, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, Extent, ShownAnswer, claim, extent_of, share_text
 from advsearch.report.sweeps import (
     DRIVE_HEADS,
     distance_of,

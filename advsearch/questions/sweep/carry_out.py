@@ -59,8 +59,7 @@ from advsearch.runs.summary import attack_of, read_answer
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
-from advsearch.tasks import AnyTask, Task, make_task
-from advsearch.tasks.own import OwnTask, function_of
+from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 
 OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
 """Settings that a scene of the caller's own has."""

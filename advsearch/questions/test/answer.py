@@ -16,10 +16,9 @@ from advsearch import __version__
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.questions.test.settings import AnyClaim, NoWorseClaim, RightClaim
-from advsearch.report.claims import Claim, Kind
 from advsearch.report.markup import InNotebook
 from advsearch.report.phrases import percent, with_article
-from advsearch.report.shown import AnswerPart, Picture, ShownAnswer
+from advsearch.report.shown import AnswerPart, Claim, Kind, Picture, ShownAnswer
 from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Fields, Interval, JsonFloat, RunResult

@@ -1,4 +1,4 @@
-"""`advsearch import`: what is understood of a mesh or scene file, before anything is searched."""
+"""`advsearch import`: what is understood of a mesh or scene file, before anything is searched; and `import-3db`."""
 
 from __future__ import annotations
 
@@ -11,28 +11,26 @@ from typing import TYPE_CHECKING, Any
 import advsearch
 from advsearch.cli import output
 from advsearch.cli.output import at_work
+from advsearch.cli.question import Command
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
+from advsearch.runs.summary import read_result
 
 if TYPE_CHECKING:
     from advsearch.scene.assets import ObjectAsset
     from advsearch.scene.importing.scenes import Contents
 
-HELP = "show what advsearch reads from a mesh or scene file, as text or as a picture"
-MORE = ". Nothing is written but the picture"
-EXAMPLES = ("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json")
 VIEWS, SIDE = 4, 192
 """Views of the picture, and the side of each in pixels."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _import_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba")
     parser.add_argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)")
     output.add_flags(parser)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print what was understood."""
+def _import(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
@@ -51,7 +49,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
-    """Print what was understood of a mesh or glTF file."""
     whole = found.object
     facts = {
         "triangles": len(whole.mesh.faces),
@@ -152,3 +149,35 @@ def _tell_scene(args: argparse.Namespace, listed: Mapping[str, Any], warnings: S
     for warning in warnings:
         print(f"Note: {warning}")
     return 0
+
+
+IMPORT = Command(
+    _import_arguments,
+    _import,
+    ". Nothing is written but the picture",
+    ("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json"),
+)
+
+
+def _threedb_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page."
+    )
+    parser.add_argument("folder", metavar="FOLDER", help="what 3DB wrote")
+    parser.add_argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the run that is there")
+    output.add_flags(parser)
+
+
+def _import_threedb(args: argparse.Namespace) -> int:
+    from advsearch.engine.sweeps.summary import import_threedb  # takes seconds
+
+    path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)
+    if args.json:
+        output.print_json(read_result(path).to_dict())
+    else:
+        print(f"{path}: {read_result(path).brief}; {path / 'report.html'} shows it")
+    return 0
+
+
+IMPORT_3DB = Command(_threedb_arguments, _import_threedb)
