@@ -82,8 +82,7 @@ def _labels(args: argparse.Namespace) -> int:
     has no names for its classes."""
     with at_work(as_json=True, quiet=False):
         # late, so that --help answers at once
-        from advsearch.models import matching_labels
-        from advsearch.models.labels import names_nothing
+        from advsearch.models.labels import matching_labels, names_nothing
 
         labels = class_names(getattr(args, "model", "reference"), getattr(args, "labels", None))
         if args.word is None:

@@ -242,8 +242,6 @@ def shown_text(result: Result) -> str:
         parts.append("\n".join(filter(None, [one.title, "\n\n".join(filter(None, inside))])))
     facts = [[name.lower(), text] for name, text in facts_of(result, given).items()]
     parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))
-    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
-
     return "\n\n".join(filter(None, parts)) + "".join(
         f"\n\nNote: {with_flags(text)}" for text in remarks_of(result, given)
     )

@@ -119,13 +119,13 @@ class QuestionCommand:
             name = next(iter(split_names(name)), name)
         return find_run(name) / CONFIG
 
-    def config(self, args: argparse.Namespace) -> Config:
-        """Return the configuration that the arguments describe."""
+    def config(self, args: argparse.Namespace, **over: Any) -> Config:
+        """Return the configuration that the arguments describe, over settings from elsewhere."""
         # late, so that --help answers at once
         from advsearch.cli.flags import config_from
         from advsearch.config import CONFIGS
 
-        return config_from(args, CONFIGS[self.name])
+        return config_from(args, CONFIGS[self.name], **over)
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the answer and return the exit status."""

@@ -26,8 +26,9 @@ from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription, is_path
-from advsearch.scene.environments import import_environment, real_harmonics
+from advsearch.scene.environments import import_environment
 from advsearch.scene.exposure import metered_gain
+from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.settings import CHANNELS, LIT
 
 COEFFICIENTS = 27

@@ -69,13 +69,12 @@ def drawn(
     """Return a figure of a size in inches (width, height) as files of some kinds; the style is what differs from
     `STYLE`."""
     # late: matplotlib takes long to import
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
+    import matplotlib.figure
 
     files = {}
-    with mpl.rc_context({**STYLE, **(style or {})}), warnings.catch_warnings():
+    with matplotlib.rc_context({**STYLE, **(style or {})}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a browser has the letter
-        figure = Figure(figsize=size, layout="constrained")
+        figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
         draw(figure)
         for kind in kinds:
             stream = io.BytesIO()

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Bools, EnvironmentAsset, Floats
@@ -121,31 +117,3 @@ def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
         found = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target) / covered
     down, across = (-(-least // extent) for least, extent in zip(SMALLEST, found.shape[:2], strict=True))
     return np.asarray(found.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32)
-
-
-@lru_cache(maxsize=4)
-def real_harmonics(height: int, width: int) -> Tensor:
-    """Return the nine real spherical harmonics of degrees 0 to 2 over a map of equal angles: (height, width, 9).
-
-    Each has root mean square 1 over the sphere (Ramamoorthi and Hanrahan 2001, section 3).
-    """
-    theta = (torch.arange(height) + 0.5) * math.pi / height
-    phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
-    x = theta.sin()[:, None] * phi.cos()[None]
-    y = theta.sin()[:, None] * phi.sin()[None]
-    z = theta.cos()[:, None].expand(height, width)
-    root3, root15, root5 = math.sqrt(3.0), math.sqrt(15.0), math.sqrt(5.0)
-    return torch.stack(
-        [
-            torch.ones_like(z),
-            root3 * y,
-            root3 * z,
-            root3 * x,
-            root15 * x * y,
-            root15 * y * z,
-            root5 / 2.0 * (3.0 * z * z - 1.0),
-            root15 * x * z,
-            root15 / 2.0 * (x * x - y * y),
-        ],
-        dim=-1,
-    )

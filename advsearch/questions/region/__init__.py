@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli.question import QuestionCommand
 from advsearch.errors import InputError
@@ -21,7 +21,7 @@ EXAMPLES = (
 class _Region(QuestionCommand):
     """The command, which may take scene and controls from the run that it goes around."""
 
-    def config(self, args: argparse.Namespace) -> Config:
+    def config(self, args: argparse.Namespace, **over: Any) -> Config:
         """Return what the flags describe over the scene and the controls of the run."""
         file = self.file(args)
         if file is None:
@@ -29,12 +29,11 @@ class _Region(QuestionCommand):
                 raise InputError(
                     "advsearch region: expected --object NAME, or --around RUN; see advsearch region --help"
                 )
-            return super().config(args)
-        from advsearch.cli.flags import config_from  # settings take a third of a second, and help needs none
-        from advsearch.config import AttackConfig
+            return super().config(args, **over)
+        from advsearch.config import AttackConfig  # settings take a third of a second, and help needs none
         from advsearch.questions.region.settings import RegionConfig
 
-        return config_from(args, RegionConfig, **RegionConfig.shared(AttackConfig.from_yaml(file)))
+        return super().config(args, **over, **RegionConfig.shared(AttackConfig.from_yaml(file)))
 
 
 COMMAND = _Region("region", about="around")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.cli.output import at_work
@@ -40,11 +40,9 @@ class _Stability(QuestionCommand):
             return super().run(args)
         with at_work(as_json=args.json, quiet=args.quiet):
             # late, so that --help answers at once
-            from advsearch.cli.flags import config_from
             from advsearch.questions.stability.carry_out import chosen
-            from advsearch.questions.stability.settings import StabilityConfig
 
-            config = config_from(args, StabilityConfig)
+            config: Any = self.config(args)
             cases = chosen(config.cases, config.groups)
         return _print_cases(cases, as_json=args.json)
 

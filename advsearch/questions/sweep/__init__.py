@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli.question import QuestionCommand
 
@@ -23,18 +23,17 @@ EXAMPLES = (
 class _Sweep(QuestionCommand):
     """The command, which may take scene and model from the run whose answer it sweeps."""
 
-    def config(self, args: argparse.Namespace) -> Config:
+    def config(self, args: argparse.Namespace, **over: Any) -> Config:
         """Return what the flags describe, over what the run of an answer brings."""
         # late, so that --help answers at once
-        from advsearch.cli.flags import config_from
         from advsearch.config import AttackConfig, SweepConfig
 
         file = self.file(args)
         if file is None:
-            return super().config(args)
+            return super().config(args, **over)
 
         varies = "grid" in args or "controls" in args
-        return config_from(args, SweepConfig, **SweepConfig.of_answer(AttackConfig.from_yaml(file), varies=varies))
+        return super().config(args, **over, **SweepConfig.of_answer(AttackConfig.from_yaml(file), varies=varies))
 
 
 COMMAND = _Sweep("sweep", about="answer_of")

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.environments import real_harmonics
+from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import PluginPart
 from advsearch.scene.renderer import Renderer
