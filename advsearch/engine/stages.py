@@ -282,7 +282,8 @@ class Attack:
         if matrix is None:
             self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
             return
-        self._renders_because(matrix if surface == surface_light.NO_CAMERA or steps < WORTH else surface)
+        too_short = reason_against(problem, max(steps, WORTH), self.config.specialise) is None
+        self._renders_because(matrix if too_short or surface == surface_light.NO_CAMERA else surface)
 
     def against_surface_light(self) -> str | None:
         """Why light on surfaces does not predict the search, in words; None if it may."""

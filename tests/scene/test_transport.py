@@ -259,7 +259,8 @@ def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_wit
     ("options", "reason"),
     [
         ({}, "pays from 16"),
-        ({"over": ["camera"], "denoise": "none"}, "pays from 16"),
+        ({"over": ["camera"]}, "pays from 16"),
+        ({"controls": {"camera": {}}}, "light on surfaces pays from 32"),
         ({"specialise": False}, "nothing is left out"),
     ],
 )
