@@ -9,13 +9,14 @@ import importlib
 import json
 import os
 import platform
+import re
 import stat
 import tempfile
 import threading
 import time
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
@@ -135,8 +136,7 @@ def write_files(work: Work, files: Files, folder: Path) -> Work:
     for name in work.files:
         value = settings.get(name)
         if isinstance(value, str):
-            parts = (part.strip().partition("#") for part in value.split(","))
-            settings[name] = ",".join(new.get(path, path) + mark + inner for path, mark, inner in parts)
+            settings[name] = "".join(new.get(part, part) for part in _split(value, new))
     return replace(work, settings=settings)
 
 
@@ -154,10 +154,18 @@ def _contents(path: Path) -> dict[str, bytes]:
 def _paths(work: Work) -> Iterable[Path]:
     for name in work.files:
         value = work.settings.get(name)
-        for part in value.split(",") if isinstance(value, str) else ():
-            path = Path(part.strip().partition("#")[0])
-            if path.is_absolute() and path.is_file():
-                yield path
+        for part in _split(value, {}) if isinstance(value, str) else ():
+            if os.path.isabs(part) and Path(part).is_file():
+                yield Path(part)
+
+
+def _split(value: str, known: Collection[str]) -> Iterator[str]:
+    """Take ``/a.glb#NODE,/b.obj`` or ``/camera.csv+/object.csv`` apart into paths and what stands between them; a path
+    that is known, or a file here, may have a + in it."""
+    for part in re.split("(,)", value):
+        path, mark, inner = part.strip().partition("#")
+        yield from [path] if path in known or Path(path).is_file() else re.split(r"(\+)", path)
+        yield mark + inner
 
 
 def _with_others(path: Path) -> Sequence[Path]:

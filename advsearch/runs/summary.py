@@ -187,7 +187,8 @@ def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
 
 
 def _paths(value: object) -> Iterator[str]:
-    """What may be a file in ``a.pt2,reference@weights.safetensors`` or ``scene.glb#NODE``, in lists and mappings."""
+    """What may be a file in ``a.pt2,reference@weights.safetensors``, ``scene.glb#NODE`` or ``camera.csv+object.csv``,
+    in lists and mappings."""
     if isinstance(value, Mapping):
         for one in value.values():
             yield from _paths(one)
@@ -196,9 +197,8 @@ def _paths(value: object) -> Iterator[str]:
             yield from _paths(one)
     elif isinstance(value, str):
         for name in value.split(","):
-            yield from dict.fromkeys(
-                one.strip() for one in (name, name.rpartition("@")[2], name.partition("#")[0]) if one.strip()
-            )
+            parts = (name, name.rpartition("@")[2], name.partition("#")[0], *name.split("+"))
+            yield from dict.fromkeys(one.strip() for one in parts if one.strip())
 
 
 def _digest_of_folder(folder: Path, which: str) -> str:

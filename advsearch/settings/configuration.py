@@ -373,7 +373,8 @@ class Config(BaseModel):
         given = {name: value for name, value in self.plain().items() if name not in self.free}
         for name in FILES:
             if isinstance(value := given.get(name), str):
-                given[name] = ",".join(Path(part).name for part in written.split_names(value))
+                parts = value.split("+") if name == "path" else written.split_names(value)
+                given[name] = ",".join(Path(part).name for part in parts)
         return given
 
     def command_line(self) -> str:
@@ -414,11 +415,14 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
 
 
 def _absolute(value: str | None) -> str | None:
-    """Return the absolute path of `value` where it is a file, and the name it is otherwise; of a list, each part."""
+    """Return the absolute path of `value` where it is a file, and the name it is otherwise; of a list, and of two files
+    as in ``camera.csv+object.csv``, each part."""
     return None if value is None else ",".join(map(_absolute_file, written.split_names(value)))
 
 
 def _absolute_file(name: str) -> str:
+    if "+" in name and not written.is_file(name.partition("#")[0]):
+        return "+".join(map(_absolute_file, name.split("+")))
     path, mark, part = (name, "", "") if written.is_file(name) else name.partition("#")
     is_path = ("/" in path or Path(path).suffix != "") and written.is_file(path)
     return f"{Path(path).resolve()}{mark}{part}" if is_path else name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +14,17 @@ from simulated_cluster import Failure, Simulated, coordinator
 from advsearch import threads
 from advsearch.cluster import Done, Work
 from advsearch.cluster.coordinator import DEPTH, PATIENCE, Coordinator
-from advsearch.cluster.worker import MOST_LOADED, Carried, Files, Ready, carry_out_batch, prepare, version
+from advsearch.cluster.worker import (
+    MOST_LOADED,
+    Carried,
+    Files,
+    Ready,
+    carry_out_batch,
+    prepare,
+    read_files,
+    version,
+    write_files,
+)
 from advsearch.errors import ClusterError
 
 COUNT, SIZE = 400, 16
@@ -239,6 +250,28 @@ def test_a_worker_that_forgot_gets_ready_again_and_is_counted_once() -> None:
     shared = coordinator(pool)
     assert len(list(shared.results(ranges()))) == COUNT // SIZE and not forgotten
     assert shared.facts.workers == shared.facts.most == 2
+
+
+def test_files_of_lists_nodes_and_two_paths_are_read_here_and_found_there(tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir()
+    for name in ("mug.glb", "two+cups.glb", "camera.csv", "object.csv"):
+        (here / name).write_text(name)
+    given: dict[str, Any] = {
+        "object": f"{here}/mug.glb#Cup,bowl, {here}/two+cups.glb#A",
+        "path": f"{here}/camera.csv+{here}/object.csv",
+    }
+    work = Work("a:b", given, ("object", "path"))
+    files = read_files(work)
+    assert {Path(path).name for path in files.named} == {path.name for path in here.iterdir()}
+    assert write_files(work, files, there).settings == {**given, "object": given["object"].replace(", ", ",")}
+    here.rename(tmp_path / "gone")
+    moved: Any = write_files(work, files, there).settings
+    found = [*moved["object"].split(","), *moved["path"].split("csv+")]
+    assert all(one == "bowl" or one.startswith(f"{there}/") for one in found)
+    first, second = moved["path"].split("csv+")
+    assert (Path(f"{first}csv").read_text(), Path(second).read_text()) == ("camera.csv", "object.csv")
+    assert Path(found[2].partition("#")[0]).read_text() == "two+cups.glb" and found[0].endswith("mug.glb#Cup")
 
 
 def test_a_worker_that_lacks_files_which_it_was_sent_is_refused() -> None:

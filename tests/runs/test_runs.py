@@ -27,7 +27,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import attack, exr, rated, sweep
 
-from advsearch.config import AttackConfig
+from advsearch.config import AttackConfig, SweepConfig
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.files import open_regular
 from advsearch.runs import directory, images, summary
@@ -432,6 +432,7 @@ def test_the_recipe_repeats_the_run_elsewhere(home: Path) -> None:
     [
         ("camera", "camchain.yaml#cam1", "camchain.yaml"),
         ("path", "way.csv", "way.csv"),
+        ("path", "approach+way.csv", "way.csv"),
         ("labels", "names.txt", "names.txt"),
         ("environment", "sky.hdr", "sky.hdr"),
         ("model", "reference@weights.safetensors", "weights.safetensors"),
@@ -460,6 +461,13 @@ def test_files_of_one_in_several_are_repeated_elsewhere(home: Path) -> None:
     Path("camchain.yaml").write_text("one")
     assert (
         AttackConfig(object="mug", camera="camchain.yaml#cam1").to_repeat().camera == f"{home / 'camchain.yaml'}#cam1"
+    )
+    Path("car.csv").write_text("one")
+    there = SweepConfig(object="mug", path="approach+car.csv").to_repeat().path
+    assert there == f"approach+{home / 'car.csv'}" and str(home / "car.csv") in summary.made_with({"path": there})
+    assert all(
+        SweepConfig(object="mug", path=one).deciding()["path"] == "approach,car.csv"
+        for one in (there, "approach+car.csv")
     )
 
 
