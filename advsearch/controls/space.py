@@ -95,14 +95,16 @@ class Space:
         Raises:
             InputError: two controls set one input.
         """
-        parts, merged = u.split(self.sizes), dict[str, Tensor]()
+        parts, merged, set_by = u.split(self.sizes), dict[str, Tensor](), dict[str, str]()
         for number in self._turns:
             control = self.controls[number]
             own = control.inputs(parts[number], merged)
             for name in own:
                 if name in merged and name not in control.refines:
+                    both = f"{set_by[name]} and {control.name}"
                     hint = "; one `texture` takes several materials" if name.endswith(".base_color") else ""
-                    raise InputError(f"controls: two controls set {name}; leave one of them out{hint}")
+                    raise InputError(f"controls: two controls set {name}, {both}; leave one of them out{hint}")
+                set_by.setdefault(name, control.name)
             merged = {**merged, **own}
         return merged
 

@@ -86,7 +86,7 @@ def test_one_texel_of_a_hundred_thousand_is_finite() -> None:
         ({"environment": {"epsilon": -1, "rotation": [0, 90]}}, "environment.epsilon: expected a number over 0"),
         ({"light:": {}}, "expected a name of letters, digits, - and _ after the colon, got ''"),
         ({"light:a b": {}}, "expected a name of letters, digits, - and _ after the colon, got 'a b'"),
-        ({"pose": {}, "second": {"kind": "pose"}}, "two controls set object.to_world"),
+        ({"pose": {}, "second": {"kind": "pose"}}, "two controls set object.to_world, pose and second; leave"),
         ({"sky": {}, "environment": {}}, "two controls set environment.data"),
         ({"object": {"kind": "light"}}, "the scene has something of that name already"),
     ],
