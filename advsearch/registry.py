@@ -110,8 +110,12 @@ _GUARD: ContextVar[tuple[str, frozenset[str]] | None] = ContextVar("guard", defa
 
 @contextmanager
 def only_named_code(file: str | os.PathLike[str], named: Iterable[str]) -> Iterator[None]:
-    """Import no Python code by its name inside the block but what is `named`, as it stands in the file: the settings
-    are somebody's file."""
+    """Import no Python code by its name inside the block but what is named: the settings are somebody's file.
+
+    Args:
+        file: for messages.
+        named: "package.module:attribute", each as it stands in the file.
+    """
     token = _GUARD.set((os.fspath(file), frozenset(named)))
     try:
         yield

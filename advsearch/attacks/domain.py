@@ -186,8 +186,13 @@ class Domain:
     def project(self, u: Tensor) -> Tensor:
         """Return the nearest configuration of the domain, block by block (Euclidean; periodic blocks wrap instead).
 
-        u is (d,) float32, finite; configurations inside come back bit for bit. An l-infinity ball cut by bounds is
-        itself a box, so clipping is exact; for an l2 ball see `project_l2_box`.
+        An l-infinity ball cut by bounds is itself a box, so clipping is exact; for an l2 ball see `project_l2_box`.
+
+        Args:
+            u: (d,) float32, finite.
+
+        Returns:
+            (d,) float32. Configurations inside come back bit for bit.
         """
         u = u.detach()
         projected = torch.clamp(u, self.lower, self.upper)
@@ -218,7 +223,7 @@ class Domain:
         return u.shape == self.start.shape and self.violation(u) <= tolerance
 
     def sample(self, generator: torch.Generator, n: int = 1, *, extreme: bool = False) -> Tensor:
-        """Draw n configurations (n, d) float32 at random within the budget.
+        """Draw configurations at random within the budget.
 
         - "linf" and "box": uniform in the box that the bounds (and the ball) leave; of a discrete choice, the centre of
           a random option.
@@ -226,6 +231,14 @@ class Domain:
         - with `extreme`, a norm ball is sampled where random search is strongest: an l-infinity ball at random
           corners, an l2 ball at its surface in a direction of random signs. A "box" has no such place (the corners of
           a range of poses are no worse than its middle) and is sampled as before.
+
+        Args:
+            generator: source of randomness; advances.
+            n: number of configurations.
+            extreme: sample the norm balls at their extremes.
+
+        Returns:
+            (n, d) float32, all inside.
         """
         return torch.stack([self._draw(generator, extreme) for _ in range(n)])
 
@@ -245,14 +258,20 @@ class Domain:
         return self.project(u)
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
-        """Return one whole step (d,) uphill from u: the displacement that a linear objective likes most, in each
-        block's norm; zero for a block whose gradient is zero. Add a multiple of it to u and project.
+        """Return one whole step uphill: the displacement that a linear objective likes most, in each block's norm.
 
         - "linf": radius * sign(gradient);
         - "l2": radius * gradient / ||gradient||;
         - a discrete choice: nothing;
         - "box": the same, without the elements that point out of a bound at which u already lies (the free part of
           the gradient, as in projected-gradient methods for bounds), so that they do not use up the step.
+
+        Args:
+            u: (d,) float32, the configuration to step from.
+            gradient: (d,) float32, finite.
+
+        Returns:
+            (d,) float32; zero for a block whose gradient is zero. Add a multiple of it to u and project.
         """
         step = torch.empty_like(gradient)
         for block, part in self.parts():

@@ -314,6 +314,9 @@ def get_objective(
         task: judges the model; classification of any wrong answer if None.
         features: for an objective that `needs_features`: `advsearch.models.features.features_of(model)`.
         clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
+
+    Raises:
+        UnknownNameError, InputError: as for `check_objective`; no features.
     """
     task = task or Classification()
     targeted = task.target is not None

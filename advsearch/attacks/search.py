@@ -39,11 +39,22 @@ NON_FINITE_LIMIT = 3
 
 @dataclass(frozen=True)
 class StepRecord:
-    """One evaluation, without its tensors: its number and seed, and `phase` "ranking" for a candidate rendered again at
-    the end; the raw objective, NaN where it was not finite, and the best so far, biased upwards; whether the model was
-    wrong; the policy's step in units of each block's radius and the l2 norm of the cleaned gradient, NaN without;
-    gradient elements that had to be set to zero; seconds; pictures that all evaluations so far took together; and times
-    the search's own samples a pixel."""
+    """One evaluation, without its tensors.
+
+    Attributes:
+        step: number of the evaluation, from 0; ranking goes on counting.
+        seed: that it was rendered with.
+        phase: "search", or "ranking" for a candidate rendered again at the end.
+        objective: raw objective; NaN where it was not finite.
+        best: best raw objective of the search so far; NaN before there is one. Biased upwards.
+        success: whether the model was wrong on this render.
+        step_size: the policy's, in units of each block's radius; NaN where it has none.
+        gradient_norm: l2 norm of the gradient after cleaning; NaN without one.
+        non_finite: gradient elements that had to be set to zero.
+        seconds: time the evaluation took.
+        renders: pictures that all evaluations so far took together, this one included.
+        samples: times the search's own samples per pixel that it was rendered with.
+    """
 
     step: int
     seed: int
@@ -77,13 +88,17 @@ class SearchResult:
         claimed_objective: the answer's raw objective in the search, biased upwards.
         success_rate: fraction of the answer's new renders (else of its one raw render) that the model got wrong.
         ending: FOUND if that fraction is at least a half; else why the search stopped. INTERRUPTED takes precedence.
+        stopped: why the loop stopped, whatever it had found.
         history: one record per evaluation of the search itself.
+        ranking: one record per new render of a candidate.
         renders: pictures in all, those that differences took and those of the ranking included.
         gradients: how many of them included a gradient.
         non_finite_objectives: evaluations whose objective was NaN or infinite.
         non_finite_elements: gradient elements that were set to zero, over all evaluations.
+        seconds: total time, evaluations included.
         agreement: cosines of gradients with those before them, in their order: what noise and the way between left of
             them; none for gradients of zero.
+        counts: what the policy had to do about gradients and steps.
         distribution: what the policy answers beside `best_u`, if it is one that answers with a distribution.
         failures: what the policy knows of different failures, if it is one that looks for them.
     """
@@ -149,19 +164,25 @@ def search(
     through.
 
     Args:
+        evaluate: renders and judges configurations.
+        domain: where to search.
+        policy: what proposes.
         steps: renders of the search, at least 1; as many evaluations where no gradient costs any. By default all are
             spent: the worst case is wanted, not the first.
         seed: root seed of this search's own randomness (not of the renders), at least 0.
         candidates, repeats, close: see above; together they cost at most `candidates * (repeats + close)` renders on
             top of `steps`.
+        on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this, over 0; None for no limit. There
             is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
         late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on
             after it was stopped.
+        kind: of the queries.
         noise: root seed of the renders.
 
     Raises:
         InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
+        RuntimeError, ValueError: the policy left the domain or `evaluate` broke its contract; a bug.
     """
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}")

@@ -27,13 +27,22 @@ CONFIDENCE = 0.95
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the exact two-sided binomial interval of a rate of k successes in n trials, exactly from 0 or to 1 where
-    none or all are.
+    """Return the exact two-sided binomial interval of a success rate.
 
     low solves P(X >= successes | low) = a/2 and high solves P(X <= successes | high) = a/2, with a = 1 - confidence.
     These are quantiles of beta distributions: low = B(a/2; k, n - k + 1), high = B(1 - a/2; k + 1, n - k). The interval
-    covers the true rate at least as often as it says, at every n (Clopper and Pearson 1934). InputError: an argument is
-    out of range.
+    covers the true rate at least as often as it says, at every n (Clopper and Pearson 1934).
+
+    Args:
+        successes: k, from 0 to n.
+        trials: n, at least 1.
+        confidence: between 0 and 1.
+
+    Returns:
+        (low, high); low is exactly 0 for k = 0, high exactly 1 for k = n.
+
+    Raises:
+        InputError: an argument is out of range.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
@@ -87,8 +96,14 @@ def wilson(share: Any, n: Any) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Trials:
-    """How often something happened in independent trials of so many samples a pixel, and the confidence of the
-    Clopper-Pearson interval, larger than 95 % where trials might have ended at several looks."""
+    """How often something happened in independent trials.
+
+    Attributes:
+        successes: from 0 to `trials`.
+        trials: at least 1.
+        spp: samples per pixel of every trial.
+        confidence: of the Clopper-Pearson interval; larger than 95 % where trials might have ended at several looks.
+    """
 
     successes: int
     trials: int
@@ -238,8 +253,14 @@ class Rung:
 
 @dataclass(frozen=True)
 class SampleCount:
-    """The choice: samples a pixel, whether all margins are shown to stay on their sides (if not, it is the last rung of
-    the ladder), a row for each configuration and rung that was measured, and the renders spent."""
+    """The choice, and everything it rests on.
+
+    Attributes:
+        spp: samples per pixel to verify with.
+        converged: whether all margins are shown to stay on their sides; if not, it is the last rung of the ladder.
+        table: one row per configuration and rung that was measured, in this order.
+        renders: renders spent.
+    """
 
     spp: int
     converged: bool
@@ -278,9 +299,13 @@ def choose_spp(
     Args:
         margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each renders what it is asked for. The
             first should be the one that is least likely to settle.
+        seed: root seed of the trials.
         ladder: sample counts, rising, at least one. A single one is returned as it is, unmeasured and not converged.
         trials: that will follow under the same conditions. So many renders are one more look, as at the rung that is
             chosen they are those trials; 0 where other trials follow.
+
+    Raises:
+        InputError: ladder out of range.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
         raise InputError(f"verify_spp: expected rising sample counts of at least 1, got {list(ladder)}")

@@ -171,6 +171,7 @@ class Verification:
         adversarial: successes, by `Rule.succeeded`.
         clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
             group is the shorter.
+        renders: renders spent here.
         stopped: why there are no more trials: "asked for" (as many as were), "decided" (the verdict is certain, or
             stands).
         outcomes: of each trial of the second group, whether it is a success; None where it does not count, as under
@@ -210,9 +211,25 @@ def run_trials(
     keep: int = 0,
     until: Callable[[Sequence[Judgement]], bool] | None = None,
 ) -> tuple[Judgement, ...]:
-    """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification", without the
-    `first` ones; the first `keep` pictures are wanted. Two groups run with the same root seed get the same seeds, trial
-    by trial, which is what a control group needs. They end sooner where `until`, asked after every trial, says so."""
+    """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification".
+
+    Two groups run with the same root seed get the same seeds, trial by trial, which is what a control group needs. They
+    end sooner where `until`, asked after every trial, says so.
+
+    Args:
+        evaluate: answers the queries; see `Query`.
+        u: (d,) the configuration.
+        spp: samples a pixel.
+        seed: root of the seeds.
+        trials: how many there are then.
+        first: how many of them there are already, which are left out.
+        kind: of their rows.
+        keep: the pictures of the first so many are wanted.
+        until: see above.
+
+    Raises:
+        InputError: trials or spp under 1.
+    """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
     if spp < 1:
@@ -266,12 +283,23 @@ def verify(
     is shown by the probability of every outcome (`benchmarks/verdicts.py`).
 
     Args:
+        evaluate: answers the queries; see `Query`.
         domain: the budget; the clean configuration is its start.
+        u: (d,) the answer; projected into the domain again.
+        claim: the search's ending.
+        spp: samples per pixel, from `choose_spp`.
         seed: root seed. Must not be one that the search rendered with through the same stream.
         trials: per group; or rising numbers, see above.
         clean: the first trials of the clean configuration, where `run_trials` has run them with the same spp and seed
             (one control group serves the attack and its baseline); what is missing is run here.
+        rule: when the claim counts.
+        kind: of the rows of the answer's trials.
+        control: of the rows of those of the clean configuration.
+        keep: the pictures of so many of them are wanted.
         curtailed: see above; for an answer of which only the verdict matters.
+
+    Raises:
+        InputError: trials or spp under 1.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     least = 0 if curtailed or len(looks) == 1 else rule.fewest

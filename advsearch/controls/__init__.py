@@ -129,8 +129,11 @@ def _default_range(control: type[Control], parameter: str) -> object:
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
-    """Return the settings of each control, with ranges of Mitsuba's names under one. Raises InputError where one has
-    something else than settings."""
+    """Return the settings of each control, with ranges of Mitsuba's names under one.
+
+    Raises:
+        InputError: one has something else than settings.
+    """
     found: dict[str, Mapping[str, object]] = {}
     for name, given in by_key(asked).items():
         if given is not None and not isinstance(given, Mapping):
@@ -140,9 +143,12 @@ def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, obje
 
 
 def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
-    """Return settings by control for names as `make_control` takes them, or with ".parameter" behind.
+    """Return settings by control for names as `make_control` takes them.
 
     `camera.azimuth` and `camera.elevation` become one control that searches both.
+
+    Args:
+        asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or "kind:name.parameter".
     """
     found: dict[str, dict[str, object]] = {}
     for name, given in settings_by_name(asked).items():
@@ -158,8 +164,11 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them into something that can be searched. Raises
-    InputError for no control, two of one name, one that the scene cannot take, or nothing that varies."""
+    """Let controls prepare a scene, bind them to it and compose them into something that can be searched.
+
+    Raises:
+        InputError: no control, two of one name, one that the scene cannot take, or nothing that varies.
+    """
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
     space = compose(controls, scene)

@@ -57,8 +57,11 @@ class Choice:
     most: float | None = None
 
     def check(self, control: str, given: object) -> None:
-        """Check what was chosen in an instance of a control; None is fine where it is the default. Raises InputError
-        where it cannot be chosen."""
+        """Check what was chosen in an instance of a control; None is fine where it is the default.
+
+        Raises:
+            InputError: it cannot be chosen.
+        """
         allowed, fits = "", True
         if self.options:
             allowed, fits = f"one of {', '.join(self.options)}", given in self.options
@@ -157,8 +160,12 @@ class Control(ABC):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given settings of these names: those of the class, unless the
-        scene or the settings name them."""
+        """Return the parameters of an instance that is given some settings: those of the class, unless the scene or the
+        settings name them.
+
+        Args:
+            settings: names of what is given, perhaps with the values.
+        """
         return cls.parameters
 
     @property
@@ -167,7 +174,11 @@ class Control(ABC):
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene. Raises UnknownNameError where there is none of that name."""
+        """Return that mesh in a scene.
+
+        Raises:
+            UnknownNameError: there is none of that name.
+        """
         mesh = self.mesh
         if mesh in scene.meshes:
             return scene.meshes[mesh]
@@ -188,9 +199,16 @@ class Control(ABC):
         return {**named, **{choice.name: getattr(self, choice.name) for choice in self.choices}}
 
     def chosen_form(self, forms: Sequence[str], form: str | None) -> str:
-        """Return which form of itself a control takes, where each of its parameters stands for one: the one that was
-        asked for by name, or else the first. Raises InputError where two are asked for or a parameter was given a range
-        of its own, UnknownNameError where there is no such form."""
+        """Return which form of itself a control takes, where each of its parameters stands for one.
+
+        Args:
+            forms: the forms, in the order of the parameters; the first is the default.
+            form: the one that was asked for by name, or None.
+
+        Raises:
+            InputError: two forms are asked for, or a parameter was given a range of its own.
+            UnknownNameError: there is no such form.
+        """
         named = []
         for one, stands_for in zip(self.parameters, forms, strict=True):
             given = getattr(self, one.name)
@@ -208,10 +226,16 @@ class Control(ABC):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with whatever this control needs to be in it (a light, a medium); by default unchanged.
-        Raises InputError where the scene cannot take it."""
+
+        Raises:
+            InputError: the scene cannot take it.
+        """
         return scene
 
     @abstractmethod
     def bind(self, scene: SceneDescription) -> BoundControl:
-        """Fit the control to a scene that all controls of the space have prepared. Raises InputError where a setting of
-        the control is impossible in this scene."""
+        """Fit the control to a scene that all controls of the space have prepared.
+
+        Raises:
+            InputError: a setting of the control is impossible in this scene.
+        """

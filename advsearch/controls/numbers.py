@@ -102,8 +102,11 @@ class NumberControl(Control, ABC):
     # ---- what a subclass says ---------------------------------------------------------------------------------------
 
     def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing. Raises InputError
-        where a choice is out of range."""
+        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing.
+
+        Raises:
+            InputError: a choice is out of range.
+        """
 
     def in_scene(self, scene: SceneDescription, parameter: Parameter) -> Parameter:
         """Return a parameter as this scene has it, where its unit depends on that."""
@@ -175,8 +178,11 @@ class NumberControl(Control, ABC):
         return BoundNumbers(self, scene, tuple(slots))
 
     def moved(self, scene: SceneDescription, slots: Sequence[Slot]) -> Iterator[Moved]:
-        """Yield the values of the clean scene that the start has not. Raises InputError where one of them was asked
-        for."""
+        """Yield the values of the clean scene that the start has not.
+
+        Raises:
+            InputError: one of them was asked for.
+        """
         for slot in slots:
             parameter = slot.parameter
             if self.amount not in (None, parameter.name):

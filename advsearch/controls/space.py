@@ -145,8 +145,14 @@ class Space:
         return {f"{name}.{one}": value for name, numbers in each for one, value in numbers.items()}
 
     def holding(self, u: Tensor) -> Space:
-        """Return the space whose first controls stay where u, (d,) of as many whole controls, has them, so that the
-        others vary. Raises InputError where no number of controls has so many coordinates."""
+        """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
+
+        Args:
+            u: (d,) of as many whole controls.
+
+        Raises:
+            InputError: no number of controls has so many coordinates.
+        """
         sizes = self.sizes
         count = next((k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)), None)
         if count is None:
@@ -157,8 +163,11 @@ class Space:
         return replace(self, controls=(*held, *self.controls[count:]), environment=lit_by)
 
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
-        """Return what lights a described configuration in the place of the scene's environment; None if nothing
-        does."""
+        """Return what lights a configuration in the place of the scene's environment; None if nothing does.
+
+        Args:
+            values: the configuration as it is described.
+        """
         for group in self.groups:
             if group.setting == ENVIRONMENT:
                 chosen = str(values[group.name]["value"])

@@ -77,8 +77,11 @@ class FreeAnswer(Task):
         self.truth(facts)
 
     def truth(self, facts: Facts) -> Words:
-        """Return the right words: what was said, or else the object's own label. Raises InputError where there are
-        none, or one is the target too."""
+        """Return the right words: what was said, or else the object's own label.
+
+        Raises:
+            InputError: there are none, or one is the target too.
+        """
         text = facts.own_label if facts.label is None else facts.label
         if text is None:
             raise InputError(f"label: expected the right words for {facts.object}, got none")

@@ -33,8 +33,13 @@ Own = TypeVar("Own", bound="Task")
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer of a model to a picture: a label in words, its number among the model's classes, where there are any,
-    and a probability, where the model gives one."""
+    """One answer of a model to a picture.
+
+    Attributes:
+        label: in words.
+        index: its number among the model's classes; None where there are no classes.
+        probability: in [0, 1]; None where the model gives none.
+    """
 
     label: str
     index: int | None = None
@@ -107,8 +112,13 @@ class Mark:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the camera sees first through the middle of each pixel of a picture, without noise: where it is the object,
-    (H, W) bool, and how far it is, (H, W) float, as in `Facts.depth` and in `Facts.z_depth`."""
+    """What the camera sees first through the middle of each pixel of a picture, without noise.
+
+    Attributes:
+        mask: (H, W) bool, where it is the object.
+        depth: (H, W) float, how far it is, see `Facts.depth`.
+        z_depth: (H, W) float, see `Facts.z_depth`.
+    """
 
     mask: Tensor
     depth: Tensor
@@ -168,8 +178,11 @@ class Facts:
 
     @property
     def z_depth(self) -> Tensor:
-        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives. Raises
-        InputError as for `sight`."""
+        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives.
+
+        Raises:
+            InputError: as for `sight`.
+        """
         return self.sight.z_depth
 
     @cached_property
@@ -190,8 +203,11 @@ class Facts:
         return self.describe()
 
     def number(self, name: str) -> float:
-        """Return the number that a parameter has in this configuration. Raises InputError where nothing in the scene is
-        called that."""
+        """Return the number that a parameter has in this configuration.
+
+        Raises:
+            InputError: nothing in the scene is called that.
+        """
         if name not in self.numbers:
             known = ", ".join(sorted(self.numbers)) or "none"
             raise InputError(
@@ -241,8 +257,11 @@ class Task(ABC):
 
     @abstractmethod
     def truth(self, facts: Facts) -> Truth:
-        """Return what is true of the scene. Raises InputError where the facts do not say it, or the model cannot answer
-        it."""
+        """Return what is true of the scene.
+
+        Raises:
+            InputError: the facts do not say it, or the model cannot answer it.
+        """
 
     @abstractmethod
     def margin(self, output: Output, truth: Truth) -> Tensor:
@@ -275,8 +294,12 @@ class Task(ABC):
         return False
 
     def seeing(self: Own, output: Output, truth: Truth | None) -> Own:
-        """Return the task with what its model's answer to one clean picture of the scene shows of how answers are read;
-        the truth is None where nobody knows it."""
+        """Return the task with what its model's answer to a clean picture of the scene shows of how answers are read.
+
+        Args:
+            output: of one picture.
+            truth: of the scene; None where nobody knows it.
+        """
         return self
 
     @property
@@ -314,8 +337,11 @@ class Task(ABC):
         return self
 
     def check(self, facts: Facts) -> None:
-        """Refuse a scene of which nothing could be judged, before anything is rendered. Raises InputError as for
-        `truth`."""
+        """Refuse a scene of which nothing could be judged, before anything is rendered.
+
+        Raises:
+            InputError: as for `truth`.
+        """
         if not self.varies:
             self.truth(facts)
 

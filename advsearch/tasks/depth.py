@@ -149,8 +149,11 @@ class Depth(Task):
     # ---- what is read -----------------------------------------------------------------------------------------------
 
     def read(self, answer: Any, count: int) -> list[Map]:
-        """Return the map (h, w) of each picture in what a network answered, by what its numbers are. Raises ValueError
-        where there is none."""
+        """Return the map (h, w) of each picture in what a network answered, by what its numbers are.
+
+        Raises:
+            ValueError: there is none.
+        """
         kind = ""
         if isinstance(answer, Mapping):
             kind = next((one for one in KINDS if one in answer), "")
@@ -170,8 +173,11 @@ class Depth(Task):
         return [{kind: one} for one in answer.float()]
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Depth:
-        """See `Task.on`. Raises InputError where the model was loaded for another task or with names of classes, or
-        there is a target."""
+        """See `Task.on`.
+
+        Raises:
+            InputError: the model was loaded for another task or with names of classes, or there is a target.
+        """
         if model.read is None:
             raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="depth"')
         if model.labels:
@@ -224,13 +230,20 @@ class Depth(Task):
         return (f"{text}, which are found by least squares on what is seen beside the object.",)
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`. Raises InputError where there is a label."""
+        """See `Task.check`.
+
+        Raises:
+            InputError: there is a label.
+        """
         if facts.label is not None:
             raise InputError("label: task depth has no classes; leave it out")
 
     def truth(self, facts: Facts) -> Distances:
-        """Return where the object is seen, and how far everything is. Raises InputError where the lens sees so far
-        aside that the distance along its axis says nothing."""
+        """Return where the object is seen, and how far everything is.
+
+        Raises:
+            InputError: the lens sees so far aside that the distance along its axis says nothing.
+        """
         if bool((facts.z_depth < ASIDE * facts.depth).any()):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, and this lens sees things more "

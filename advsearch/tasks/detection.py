@@ -91,8 +91,9 @@ class Detection(ClassTask):
         seek: what an attack is after, one of `GOALS`.
         input_size: (height, width) of the model's input in pixels.
         seen_unit, seen_order: what the model's own answers show; "" where they have not yet.
-        undecided, masks: whether only numbers tell scores from classes; whether mask coefficients are left out.
+        undecided: whether only numbers tell scores from classes in its answers.
         shape: (A, B) of an answer that is read as a YOLO's head; None of others.
+        masks: whether mask coefficients stand in its answers, which are left out.
         told: whether its network says that its boxes are corners in pixels, as those of libraries do (`KNOWN`).
         fills_with_nan: whether rows of NaN stand where nothing is found, and not for an answer that is not a number.
         doubts: what is odd about these.

@@ -64,7 +64,11 @@ class Segmentation(ClassTask):
         self.check_numbers(lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "accuracy")
 
     def read(self, answer: Any, count: int) -> Tensor:
-        """Return the logits (N, classes, h, w) in what a network answered. Raises ValueError where there are none."""
+        """Return the logits (N, classes, h, w) in what a network answered.
+
+        Raises:
+            ValueError: there are none.
+        """
         if isinstance(answer, Mapping):
             answer = answer.get("out", answer.get("logits"))
         elif hasattr(answer, "logits"):
