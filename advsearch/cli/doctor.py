@@ -22,10 +22,6 @@ from dataclasses import asdict, dataclass
 from importlib import metadata, resources
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
 from advsearch import __version__, threads
 from advsearch.cli import output
 from advsearch.cli.question import Command
@@ -265,6 +261,11 @@ def _ending(status: int | None, errors: str) -> str:
 
 def _print_table(parts: list[Component], good: bool) -> None:
     """Print the parts as a table, and below it what has to be done."""
+    # late: what is missing is told without it, too
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
     colours = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
     table = Table(box=None, pad_edge=False)
     for heading in ("part", "version", "", "detail"):

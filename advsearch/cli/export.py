@@ -14,7 +14,6 @@ from advsearch.cli import output
 from advsearch.cli.output import at_work, output_errors
 from advsearch.cli.question import Command
 from advsearch.errors import InputError
-from advsearch.report.sheets import MOST_SHEETS, write_sheets
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows, write_threedb
 from advsearch.runs.fiftyone import write_fiftyone
@@ -74,6 +73,7 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
     longest = USUAL_SIZE if args.size is None else args.size
     with at_work(as_json=True, quiet=False):
         from advsearch.api.export import printable  # takes seconds
+        from advsearch.report.sheets import MOST_SHEETS, write_sheets  # draws with matplotlib
 
         pieces = printable(args.run, longest)
         profile = None if args.icc is None else Path(args.icc)

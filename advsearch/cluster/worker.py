@@ -164,7 +164,7 @@ def _split(value: str, known: Collection[str]) -> Iterator[str]:
     that is known, or a file here, may have a + in it."""
     for part in re.split("(,)", value):
         path, mark, inner = part.strip().partition("#")
-        yield from [path] if path in known or Path(path).is_file() else re.split(r"(\+)", path)
+        yield from [path] if path in known or os.path.isfile(path) else re.split(r"(\+)", path)
         yield mark + inner
 
 

@@ -5,7 +5,7 @@ same colours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -46,15 +46,25 @@ def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **m
     return Domain(start, blocks, **more)
 
 
-class Named(dict[str, Tensor]):
+class Named(Mapping[str, Tensor]):
     """Tensors (N, ...) of N configurations by name; a message says `what` a name stands for that is none."""
 
     def __init__(self, what: str, each: Sequence[Mapping[str, Tensor]]) -> None:
-        super().__init__({name: torch.stack([one[name] for one in each]) for name in each[0]})
-        self._what = what
+        self._what, self._each = what, each
 
-    def __missing__(self, name: str) -> Tensor:
-        raise UnknownNameError(self._what, name, self)
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self:  # also of `get`
+            raise UnknownNameError(self._what, name, self._each[0])
+        return torch.stack([one[name] for one in self._each])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._each[0]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._each[0])
+
+    def __len__(self) -> int:
+        return len(self._each[0])
 
 
 class Asked:

@@ -38,7 +38,7 @@ from advsearch.engine.objective import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import WORTH, CleanMatrix, Predictor, Transport, reason_against, remark
+from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason_against, remark
 from advsearch.engine.verifier import Verifier, check_failures, ladder_of
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
@@ -282,7 +282,8 @@ class Attack:
         if matrix is None:
             self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
             return
-        too_short = reason_against(problem, max(steps, WORTH), self.config.specialise) is None
+        longer = reason_against(problem, 1 << 30, self.config.specialise)
+        too_short = not findings.surface_refused and longer is None
         self._renders_because(matrix if too_short or surface == surface_light.NO_CAMERA else surface)
 
     def against_surface_light(self) -> str | None:

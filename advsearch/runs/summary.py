@@ -197,7 +197,8 @@ def _paths(value: object) -> Iterator[str]:
             yield from _paths(one)
     elif isinstance(value, str):
         for name in value.split(","):
-            parts = (name, name.rpartition("@")[2], name.partition("#")[0], *name.split("+"))
+            both = () if os.path.exists(name.partition("#")[0]) else name.split("+")
+            parts = (name, name.rpartition("@")[2], name.partition("#")[0], *both)
             yield from dict.fromkeys(one.strip() for one in parts if one.strip())
 
 

@@ -373,8 +373,9 @@ class Config(BaseModel):
         given = {name: value for name, value in self.plain().items() if name not in self.free}
         for name in FILES:
             if isinstance(value := given.get(name), str):
-                parts = value.split("+") if name == "path" else written.split_names(value)
-                given[name] = ",".join(Path(part).name for part in parts)
+                given[name] = ",".join(
+                    "+".join(Path(one).name for one in _both(part)) for part in written.split_names(value)
+                )
         return given
 
     def command_line(self) -> str:
@@ -420,9 +421,21 @@ def _absolute(value: str | None) -> str | None:
     return None if value is None else ",".join(map(_absolute_file, written.split_names(value)))
 
 
+def _both(name: str) -> list[str]:
+    """The two parts of ``camera.csv+object.csv`` or ``approach+object.csv``, the camera's path and the object's; any
+    other name as it is."""
+    first, _, second = name.partition("+")
+    whole = (
+        written.is_file(name)
+        or not second.lower().endswith(".csv")
+        or not (first.lower().endswith(".csv") or "/" not in first)
+    )
+    return [name] if whole else [first, second]
+
+
 def _absolute_file(name: str) -> str:
-    if "+" in name and not written.is_file(name.partition("#")[0]):
-        return "+".join(map(_absolute_file, name.split("+")))
+    if len(both := _both(name)) > 1:
+        return "+".join(map(_absolute_file, both))
     path, mark, part = (name, "", "") if written.is_file(name) else name.partition("#")
     is_path = ("/" in path or Path(path).suffix != "") and written.is_file(path)
     return f"{Path(path).resolve()}{mark}{part}" if is_path else name

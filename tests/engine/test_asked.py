@@ -126,6 +126,8 @@ def test_what_is_asked_for_is_of_every_picture(scene: advsearch.Scene) -> None:
     assert asked("inputs")["object.base_color"].shape[0] == 3
     with pytest.raises(UnknownNameError, match=r"unknown number of the configuration 'camera.azimut'. Did you mean"):
         asked("configuration")["camera.azimut"]
+    with pytest.raises(UnknownNameError, match=r"unknown number of the configuration 'camera.azimut'"):
+        asked("configuration").get("camera.azimut")
 
 
 def test_a_texture_that_is_not_there_is_refused_before_anything_is_rendered(scene: advsearch.Scene) -> None:

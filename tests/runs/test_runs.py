@@ -466,7 +466,7 @@ def test_files_of_one_in_several_are_repeated_elsewhere(home: Path) -> None:
     there = SweepConfig(object="mug", path="approach+car.csv").to_repeat().path
     assert there == f"approach+{home / 'car.csv'}" and str(home / "car.csv") in summary.made_with({"path": there})
     assert all(
-        SweepConfig(object="mug", path=one).deciding()["path"] == "approach,car.csv"
+        SweepConfig(object="mug", path=one).deciding()["path"] == "approach+car.csv"
         for one in (there, "approach+car.csv")
     )
 

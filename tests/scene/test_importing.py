@@ -1106,6 +1106,12 @@ GLTF_CHANGES: dict[str, tuple[list[Any], Any, str]] = {
     "integer as list": (["scene"], [0], r"glTF whose scene is a valid integer, got '\[0\]'"),
     "text as integer": (["accessors", 0, "count"], "8", r"glTF whose accessors\[0\]\.count is a valid integer"),
     "extensions as text": (["nodes", 0, "extensions"], "all", r"glTF whose extensions are objects, got '\"all\"'"),
+    "extensions as list": (["nodes", 0, "extensions"], [], r"glTF whose extensions are objects, got '\[\]'"),
+    "light of no number": (
+        ["nodes", 0, "extensions"],
+        {"KHR_lights_punctual": {}},
+        r"glTF with nodes\[0\]\.extensions\.KHR_lights_punctual\.light, got nothing",
+    ),
     "extension as number": (
         ["extensions"],
         {"KHR_lights_punctual": 2},

@@ -72,11 +72,14 @@ def read_header(path: Path, data: bytes) -> Header:
         if isinstance(entry, list):
             level.extend(entry)
         elif isinstance(entry, dict):
-            held = entry.get("extensions") or {}
+            held = {} if entry.get("extensions") is None else entry["extensions"]
             if not isinstance(held, dict) or not all(isinstance(held.get(name) or {}, dict) for name in READ):
                 raise damaged(path, "glTF whose extensions are objects", shown(json.dumps(held)))
             found.update(held)
             level.extend(value for key, value in entry.items() if key != "extras")
+    for number, (node, entry) in enumerate(zip(header.nodes, content.get("nodes", ()), strict=True)):
+        if node.lamp is None and (entry.get("extensions") or {}).get("KHR_lights_punctual") is not None:
+            raise damaged(path, f"glTF with nodes[{number}].extensions.KHR_lights_punctual.light", "nothing")
     header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *found})})
     check_header(path, header)
     return header

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AliasPath, BaseModel, ConfigDict, FailFast, Field, JsonValue
+from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, FailFast, Field, JsonValue
 
 T = TypeVar("T")
 
@@ -161,7 +161,9 @@ class TextureTransform(_Entry):
 class TextureUse(_Entry):
     index: Index
     texCoord: Map = 0
-    transform: TextureTransform = _extension("KHR_texture_transform", default=TextureTransform())
+    transform: Annotated[TextureTransform, BeforeValidator(lambda given: given or {})] = _extension(
+        "KHR_texture_transform", default=TextureTransform()
+    )
     """What is done to the texture coordinates before it is looked up."""
 
     @property
