@@ -173,3 +173,12 @@ def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> Non
         raise FileFormatError(f"{path}: expected {expected}, got {got}")
     if status.st_size > scaled(limit):
         raise too_large(path, f"{expected} of at most {scaled(limit):,} bytes", f"{status.st_size:,}")
+
+
+def split_paths(name: str) -> list[str]:
+    """Return both parts of ``camera.csv+object.csv``, ``approach+object.csv`` or ``camera.csv+orbit``, the path of the
+    camera and that of the object; any other name as it is."""
+    first, _, second = name.partition("+")
+    camera, thing = (one.lower().endswith(".csv") for one in (first, second))
+    both = second and (camera or (thing and "/" not in first)) and not os.path.isfile(name)
+    return [first, second] if both else [name]

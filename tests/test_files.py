@@ -12,6 +12,7 @@ import pytest
 
 from advsearch import files
 from advsearch.errors import FileFormatError, InputError
+from advsearch.files import split_paths
 
 
 def _pipe(folder: Path) -> Path:
@@ -114,3 +115,19 @@ def test_a_file_that_waits_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(files, "open_regular", lambda *_: Waiting())
     with pytest.raises(FileFormatError, match="a: expected a label file, got a file that waits for something"):
         files.read_bytes(tmp_path / "a", "a label file", 100)
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("/x/camera.csv+/y/object.csv", ["/x/camera.csv", "/y/object.csv"]),
+        ("approach+/x/object.csv", ["approach", "/x/object.csv"]),
+        ("/x/camera.csv+orbit", ["/x/camera.csv", "orbit"]),
+        ("approach+orbit", ["approach+orbit"]),
+        ("/v+1/camera.csv", ["/v+1/camera.csv"]),
+        ("/x/two+cups.obj", ["/x/two+cups.obj"]),
+        ("camera.csv", ["camera.csv"]),
+    ],
+)
+def test_two_paths_are_told_from_a_name_with_a_plus(name: str, parts: list[str]) -> None:
+    assert split_paths(name) == parts

@@ -16,7 +16,7 @@ import threading
 import time
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
@@ -26,6 +26,7 @@ from typing import Any
 from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster import Call, Work
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
+from advsearch.files import split_paths
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
 _CPU_INFO = Path("/proc/cpuinfo")
@@ -136,7 +137,7 @@ def write_files(work: Work, files: Files, folder: Path) -> Work:
     for name in work.files:
         value = settings.get(name)
         if isinstance(value, str):
-            settings[name] = "".join(new.get(part, part) for part in _split(value, new))
+            settings[name] = "".join(new.get(part, part) for part in _split(value))
     return replace(work, settings=settings)
 
 
@@ -154,18 +155,18 @@ def _contents(path: Path) -> dict[str, bytes]:
 def _paths(work: Work) -> Iterable[Path]:
     for name in work.files:
         value = work.settings.get(name)
-        for part in _split(value, {}) if isinstance(value, str) else ():
+        for part in _split(value) if isinstance(value, str) else ():
             if os.path.isabs(part) and Path(part).is_file():
                 yield Path(part)
 
 
-def _split(value: str, known: Collection[str]) -> Iterator[str]:
-    """Take ``/a.glb#NODE,/b.obj`` or ``/camera.csv+/object.csv`` apart into paths and what stands between them; a path
-    that is known, or a file here, may have a + in it."""
+def _split(value: str) -> Iterator[str]:
+    """Take ``/a.glb#NODE,/b.obj`` or ``/camera.csv+/object.csv`` apart into paths and what stands between them."""
     for part in re.split("(,)", value):
         path, mark, inner = part.strip().partition("#")
-        yield from [path] if path in known or os.path.isfile(path) else re.split(r"(\+)", path)
-        yield mark + inner
+        first, *second = split_paths(path)
+        yield first
+        yield from ("+", *second) if second else (mark + inner,)
 
 
 def _with_others(path: Path) -> Sequence[Path]:

@@ -282,8 +282,7 @@ class Attack:
         if matrix is None:
             self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
             return
-        longer = reason_against(problem, 1 << 30, self.config.specialise)
-        too_short = not findings.surface_refused and longer is None
+        too_short = not findings.surface_refused and not reason_against(problem, 1 << 30, self.config.specialise)
         self._renders_because(matrix if too_short or surface == surface_light.NO_CAMERA else surface)
 
     def against_surface_light(self) -> str | None:

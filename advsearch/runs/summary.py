@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError
-from advsearch.files import opened_for, parse_json, read_bytes, read_text
+from advsearch.files import opened_for, parse_json, read_bytes, read_text, split_paths
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results import kind_of
 from advsearch.runs.results.attack import AttackSummary
@@ -197,8 +197,7 @@ def _paths(value: object) -> Iterator[str]:
             yield from _paths(one)
     elif isinstance(value, str):
         for name in value.split(","):
-            both = () if os.path.exists(name.partition("#")[0]) else name.split("+")
-            parts = (name, name.rpartition("@")[2], name.partition("#")[0], *both)
+            parts = (name, name.rpartition("@")[2], name.partition("#")[0], *split_paths(name))
             yield from dict.fromkeys(one.strip() for one in parts if one.strip())
 
 

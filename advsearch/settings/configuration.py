@@ -15,7 +15,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.files import JsonObject
+from advsearch.files import JsonObject, split_paths
 from advsearch.settings import values as written
 
 if TYPE_CHECKING:
@@ -374,7 +374,7 @@ class Config(BaseModel):
         for name in FILES:
             if isinstance(value := given.get(name), str):
                 given[name] = ",".join(
-                    "+".join(Path(one).name for one in _both(part)) for part in written.split_names(value)
+                    "+".join(Path(one).name for one in split_paths(part)) for part in written.split_names(value)
                 )
         return given
 
@@ -421,20 +421,8 @@ def _absolute(value: str | None) -> str | None:
     return None if value is None else ",".join(map(_absolute_file, written.split_names(value)))
 
 
-def _both(name: str) -> list[str]:
-    """The two parts of ``camera.csv+object.csv`` or ``approach+object.csv``, the camera's path and the object's; any
-    other name as it is."""
-    first, _, second = name.partition("+")
-    whole = (
-        written.is_file(name)
-        or not second.lower().endswith(".csv")
-        or not (first.lower().endswith(".csv") or "/" not in first)
-    )
-    return [name] if whole else [first, second]
-
-
 def _absolute_file(name: str) -> str:
-    if len(both := _both(name)) > 1:
+    if len(both := split_paths(name)) > 1:
         return "+".join(map(_absolute_file, both))
     path, mark, part = (name, "", "") if written.is_file(name) else name.partition("#")
     is_path = ("/" in path or Path(path).suffix != "") and written.is_file(path)
