@@ -1,6 +1,7 @@
 """Whether recommended settings keep their promise on scenes that nobody tuned them on.
 
     python benchmarks/precision.py [--error 0.1] [--seconds 120] [--resolution 128] [--scene bowl/kitchen ...]
+    python benchmarks/precision.py --intervals      how often intervals of errors cover the truth; nothing is rendered
 
 For each scene: the settings that `advsearch precision` recommends for the picture and for the gradient, then the error
 that they really have, measured anew with other seeds against a reference with other seeds. The ratio of that to the
@@ -10,10 +11,13 @@ new reference cannot tell is marked. Exit status 3 if one falls short."""
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
 import sys
 import tempfile
 from typing import Any
+
+import numpy as np
 
 from advsearch import threads
 
@@ -29,7 +33,7 @@ from advsearch.questions.precision.benches import (  # noqa: E402
 )
 from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
 from advsearch.questions.precision.gradient import GradientBench, estimated_parts  # noqa: E402
-from advsearch.questions.precision.points import MeasuredSetting, point_of  # noqa: E402
+from advsearch.questions.precision.points import MeasuredSetting, ReferenceValue, point_of  # noqa: E402
 from advsearch.questions.precision.rounds import TimeBudget  # noqa: E402
 from advsearch.questions.precision.settings import PrecisionConfig  # noqa: E402
 
@@ -48,10 +52,61 @@ def main() -> int:
     parser.add_argument("--resolution", type=int, default=128)
     parser.add_argument("--control", default=CONTROL)
     parser.add_argument("--scene", nargs="+", default=SCENES, metavar="OBJECT/ENVIRONMENT")
+    parser.add_argument("--intervals", action="store_true", help="simulate the intervals of errors instead")
     args = parser.parse_args()
+    if args.intervals:
+        return intervals()
     print("  scene           what       setting                    samples   promised   measured   ratio")
     kept = [one(scene, args) for scene in args.scene]
     return 0 if all(kept) else 3
+
+
+NOISE = ("normal", "lognormal 1", "lognormal 2", "fireflies 0.1", "fireflies 1", "fireflies 10", "fireflies 100")
+PIXELS, TRIES = 64 * 64, 400
+
+
+def intervals() -> int:
+    """Print, for noise of several tails, how often an error has an interval, and how often that covers the truth; fails
+    if it covers less than 90 % where tails are light."""
+    print(f"  noise of {PIXELS} pixels    repeats   has an interval   that covers   one for all would cover")
+    kept = True
+    rng = np.random.default_rng(0)
+    for noise in NOISE:
+        for repeats in (4, 8):
+            covered, all_covered = [], []
+            for _ in range(TRIES):
+                samples, true = simulated(noise, repeats, rng)
+                setting = MeasuredSetting("image", noise, 4, 4.0)
+                point = point_of(setting, samples)
+                bare = point_of(setting, [({"error": one["error"]}, seconds) for one, seconds in samples])
+                all_covered.append(bare.interval[0] <= true <= bare.interval[1])
+                if not point.heavy:
+                    covered.append(all_covered[-1])
+            share = f"{100 * statistics.fmean(covered):.0f} %" if covered else ""
+            given, bare_share = 100 * len(covered) / TRIES, 100 * statistics.fmean(all_covered)
+            print(f"  {noise:22} {repeats:7} {given:14.0f} % {share:>13} {bare_share:>20.0f} %")
+            kept = kept and (noise not in NOISE[:2] or statistics.fmean(covered) >= 0.9)
+    return 0 if kept else 3
+
+
+def simulated(noise: str, repeats: int, rng: np.random.Generator) -> tuple[list[tuple[dict[str, float], float]], float]:
+    """Return measurements of pictures with a noise, and their true root mean square error. Of fireflies there are so
+    many a picture, and they hold as much of the error as all else."""
+    kind, _, given = noise.partition(" ")
+    size = (repeats, PIXELS)
+    if kind == "lognormal":
+        spread = float(given)
+        found = rng.lognormal(0.0, spread, size) - math.exp(spread**2 / 2)
+        variance = (math.exp(spread**2) - 1.0) * math.exp(spread**2)
+    else:
+        found, variance = rng.normal(size=size), 1.0
+    if kind == "fireflies":
+        share = float(given) / PIXELS
+        found = found + (rng.random(size) < share) * rng.exponential(1.0, size) * math.sqrt(0.5 / share)
+        variance = 2.0
+    reference = ReferenceValue(np.zeros(PIXELS), 0.0, 1.0, 2)
+    errors = [reference.relative_errors(one) for one in found]
+    return [({"error": error, "fourth": fourth}, 1.0) for error, fourth in errors], math.sqrt(PIXELS * variance)
 
 
 def one(scene: str, args: argparse.Namespace) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -26,7 +25,15 @@ from advsearch.questions.precision.points import (
     quartiles,
     reference_through,
 )
-from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples, seconds_a_sample
+from advsearch.questions.precision.rounds import (
+    Parts,
+    Stopwatch,
+    TimeBudget,
+    gather,
+    one_by_one,
+    part_samples,
+    seconds_a_sample,
+)
 from advsearch.scene.renderer import Renderer
 
 Margin = Callable[[Tensor], float]
@@ -143,23 +150,22 @@ class PictureBench:
             self._refer(family, share, seed, on_done)
 
     def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
-        """Make one picture and return its errors, and the seconds that rendering and denoising took; of a predicted one
-        those of the matrix or the light too, and beside that what another picture takes."""
-        variant, later = self.variants[setting.series], dict[str, float]()
-        begun = time.perf_counter()
+        """Make one picture and return its errors, and the processor time that rendering and denoising took; of a
+        predicted one that of the matrix or the light too, and beside that what another picture takes."""
+        variant, watch = self.variants[setting.series], Stopwatch()
         if variant.family == PREDICTED:
             made = predicting(variant.series, self.renderers[setting.series], self._there, seed, setting.spp)
             radiance = self._radiance(made, seed, setting.spp)
-            seconds, again = time.perf_counter() - begun, time.perf_counter()
+            seconds, times, again = watch.processor, {"wall_seconds": watch.wall}, Stopwatch()
             radiance = self._radiance(made, seed, setting.spp)
-            later = {"later_seconds": time.perf_counter() - again}
+            times["later_seconds"] = again.processor
         else:
             radiance = self._radiance(self.renderers[setting.series], seed, setting.spp)
-            seconds = time.perf_counter() - begun
+            seconds, times = watch.processor, {"wall_seconds": watch.wall}
         picture = self._picture(radiance)
-        error = self._reference(variant.family, "error").relative_error(flat(picture))
+        error, fourth = self._reference(variant.family, "error").relative_errors(flat(picture))
         margin = self._reference(variant.family, "margin_error").relative_error(np.array([self._margin(picture)]))
-        return {"error": error, "margin_error": margin, **later}, seconds
+        return {"error": error, "margin_error": margin, "fourth": fourth, **times}, seconds
 
     def floor(self, setting: MeasuredSetting, measure: str) -> float:
         """The reference's own relative error for a setting."""
@@ -214,8 +220,8 @@ Verified = Callable[[Tensor], float]
 
 
 class SearchMark(NamedTuple):
-    """How far one search had come: the renders that it could spend until then, the seconds that it had taken without
-    verification, and the verified objective of the best configuration until then."""
+    """How far one search had come: the renders that it could spend until then, the processor time that it had taken
+    without verification, and the verified objective of the best configuration until then."""
 
     renders: int
     seconds: float
@@ -256,24 +262,24 @@ class ObjectiveBench:
         return [MeasuredSetting("objective", name, spp, 1.0) for name in self.policies]
 
     def measure(self, setting: MeasuredSetting, seed: int) -> tuple[list[SearchMark], float]:
-        """Run one search; its marks, verified, and the seconds of search and verification together."""
-        begun = time.perf_counter()
+        """Run one search; its marks, verified, and the processor time of search and verification together."""
+        watch = Stopwatch()
         held = self._search(setting.series, seed)
         objectives = {u.numpy().tobytes(): u for _, _, u in held}
         verified = {key: self.verified(u) for key, u in objectives.items()}
         marks = [SearchMark(renders, seconds, verified[u.numpy().tobytes()]) for renders, seconds, u in held]
-        return marks, time.perf_counter() - begun
+        return marks, watch.processor
 
     def _search(self, policy: str, seed: int) -> list[tuple[int, float, Tensor]]:
         """The best configuration at each mark, with the seconds until then. Nothing is rendered again at the end."""
         held: list[tuple[int, float, Tensor]] = []
         best: tuple[float, Tensor] = (float("-inf"), self.domain.start)
         wanted = list(marks_at(self.steps))
-        begun = time.perf_counter()
+        watch = Stopwatch()
 
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
             nonlocal best
-            seconds = time.perf_counter() - begun
+            seconds = watch.processor
             while wanted and record.renders > wanted[0]:  # what a mark holds was found before this step
                 held.append((wanted.pop(0), seconds, best[1]))
             if evaluation.objective > best[0]:
@@ -293,8 +299,8 @@ class ObjectiveBench:
             noise=self.noise,
             seconds=max(1e-9, self.budget.left),
         )
-        if time.perf_counter() - begun < self.budget.left:
-            held += [(mark, time.perf_counter() - begun, best[1]) for mark in wanted]  # it stopped by itself
+        if self.budget.left > 0.0:
+            held += [(mark, watch.processor, best[1]) for mark in wanted]  # it stopped by itself
         return held
 
 

@@ -28,8 +28,9 @@ from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.precision.answer import PrecisionResult, precision_figures
+from advsearch.questions.precision.answer import PrecisionResult
 from advsearch.questions.precision.benches import REFERENCE_SAMPLER, ObjectiveBench, PictureBench, curve_of, variants
+from advsearch.questions.precision.figures import precision_figures
 from advsearch.questions.precision.gradient import (
     GradientBench,
     GradientPart,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,7 +22,15 @@ from advsearch.questions.precision.points import (
     Theory,
     reference_of,
 )
-from advsearch.questions.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples, seconds_a_sample
+from advsearch.questions.precision.rounds import (
+    Parts,
+    Stopwatch,
+    TimeBudget,
+    gather,
+    one_by_one,
+    part_samples,
+    seconds_a_sample,
+)
 from advsearch.scene.gradients import BY_ADJOINT, Group, compared
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
@@ -167,21 +174,21 @@ class GradientBench:
             self._by_estimator(budget, seed, on_done)
 
     def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
-        """Take one gradient and return its error and cosine, and the seconds, the picture itself included; of a
-        predicted one those of the matrix or the light too, and beside that what another gradient takes."""
-        begun = time.perf_counter()
+        """Take one gradient and return its error and cosine, and the processor time, the picture itself included; of a
+        predicted one that of the matrix or the light too, and beside that what another gradient takes."""
+        watch = Stopwatch()
         later: dict[str, float] = {}
         if setting.series in COUNTS_OF:
             made = predicting(setting.series, self._renderer, self._u, seed, setting.spp)
-            ready = time.perf_counter()
+            again = Stopwatch()
             found = self.part.of(made.gradient(self._loss, self._u, seed, setting.spp)[1])
-            later = {"later_seconds": time.perf_counter() - ready}
+            later = {"later_seconds": again.processor}
         else:
             found = self._estimated(self._renderer, setting.series, seed, setting.spp)
-        seconds = time.perf_counter() - begun
+        seconds, later["wall_seconds"] = watch.processor, watch.wall
         assert self.reference is not None
-        error, cosine = self.reference.relative_error(found), self.reference.cosine(found)
-        return {"error": error, "cosine": cosine, **later}, seconds
+        error, fourth = self.reference.relative_errors(found)
+        return {"error": error, "cosine": self.reference.cosine(found), "fourth": fourth, **later}, seconds
 
     def floor(self, setting: MeasuredSetting, measure: str) -> float:
         """The reference's own relative error."""

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.special import stdtrit
 from scipy.stats import linregress
 
-from advsearch.questions.precision.answer import PrecisionSlope, Recommended
+from advsearch.questions.precision.answer import WARM_UP, PrecisionSlope, Recommended
 
 Array = npt.NDArray[np.float64]
 
@@ -26,9 +26,10 @@ KNOWN = 2.0
 """Times the reference's own error that a measured one must have to be known."""
 LEVEL = 0.95
 """Of every interval."""
-WARM_UP = 3
-"""Calls of a setting whose times don't count where there are more: the first compiles and records kernels, the second
-may record them again, and so may the first one after other scenes were rendered."""
+WIDE, LEAST_VALUES = 1000, 100
+"""From so many numbers on in a picture or gradient it is looked at how many of them hold its error. Below so many, in
+all measurements together, a few noisy pixels decide it, and an interval would cover the truth too seldom
+(`benchmarks/precision.py --intervals`)."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ class MeasuredSetting:
 
 
 Sample = tuple[Mapping[str, float], float]
-"""One measurement: error by measure ("error", "margin_error") and other numbers ("cosine"), and the seconds."""
+"""One measurement: error by measure ("error", "margin_error") and other numbers ("cosine"), and the processor time in
+seconds. "fourth" is the sum of the fourth powers of all relative errors in a picture, whose squares "error" adds up."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +69,13 @@ class Point:
     Attributes:
         error: root mean square of the relative error, the reference's own taken off; where it is not known, an upper
             limit: the root mean square as it was measured.
-        interval: of the error, 95 %, from the scatter of the samples; (NaN, NaN) for a single one.
+        interval: of the error, 95 %, from the scatter of the samples; (NaN, NaN) for a single one and for heavy tails.
         known: whether the error is well above the reference's own.
         floor: the reference's own relative error.
-        seconds: median time.
+        seconds: median processor time.
         repeats: samples behind it.
-        more: means of the other numbers.
+        more: means of the other numbers, medians of those in seconds.
+        heavy: whether so few pixels hold the error that no interval from its scatter would cover it.
     """
 
     setting: MeasuredSetting
@@ -84,6 +87,7 @@ class Point:
     seconds: float
     repeats: int
     more: Mapping[str, float] = field(default_factory=dict)
+    heavy: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +109,12 @@ class ReferenceValue:
     def relative_error(self, value: Array) -> float:
         """Return |value - reference| / |reference|, in the Euclidean norm."""
         return _ratio(float(np.linalg.norm(value - self.value)), self.size)
+
+    def relative_errors(self, value: Array) -> tuple[float, float]:
+        """Return that, and the sum of the fourth powers of the relative errors of the single numbers; the latter is NaN
+        where they are too few to say anything about tails."""
+        fourth = float(np.sum(((value - self.value) / self.size) ** 4)) if self.size > 0.0 else math.nan
+        return self.relative_error(value), fourth if len(value) >= WIDE else math.nan
 
     def cosine(self, value: Array) -> float:
         """Return the cosine of the angle between a value and the reference; NaN where one of them is zero."""
@@ -159,15 +169,31 @@ def point_of(setting: MeasuredSetting, samples: Sequence[Sample], measure: str =
     raw = statistics.fmean(squares)
     known = raw > (KNOWN * floor) ** 2 and math.isfinite(raw) and raw > 0.0
     error = math.sqrt(raw - floor**2) if known else math.sqrt(raw)
-    others = {name for numbers, _ in samples for name in numbers if name not in (measure, "error", "margin_error")}
-    more = {name: statistics.fmean(numbers[name] for numbers, _ in samples) for name in sorted(others)}
+    others = {name for numbers, _ in samples for name in numbers} - {measure, "error", "margin_error", "fourth"}
+    more = {}
+    for name in sorted(others):
+        values = [numbers[name] for numbers, _ in samples]
+        more[name] = typical(values) if name.endswith("seconds") else statistics.fmean(values)
+    heavy = measure == "error" and heavy_tailed([numbers for numbers, _ in samples])
     interval = _interval(squares, error, raw) if known else (0.0, math.sqrt(raw))
-    return Point(setting, measure, error, interval, known, floor, typical_seconds(samples), len(samples), more)
+    interval = (math.nan, math.nan) if heavy else interval
+    seconds = typical([taken for _, taken in samples])
+    return Point(setting, measure, error, interval, known, floor, seconds, len(samples), more, heavy)
 
 
-def typical_seconds(samples: Sequence[Sample]) -> float:
-    """Return the median time without the calls that warm up; of the last call where there are no others."""
-    seconds = [taken for _, taken in samples]
+def heavy_tailed(numbers: Sequence[Mapping[str, float]]) -> bool:
+    """Whether fewer than `LEAST_VALUES` pixels hold the error of some pictures: (sum of squares)^2 / (sum of fourth
+    powers) counts how many, if all of them were equal. False where the pictures are too small to tell.
+
+    What happens in none of the pictures, such as a firefly in every hundredth one, can't be seen.
+    """
+    squares = sum(one["error"] ** 2 for one in numbers)
+    fourth = sum(one.get("fourth", math.nan) for one in numbers)
+    return fourth > 0.0 and squares**2 < LEAST_VALUES * fourth
+
+
+def typical(seconds: Sequence[float]) -> float:
+    """Return the median of times without those of calls that warm up; the last one where there are no others."""
     return statistics.median(seconds[WARM_UP:] or seconds[-1:])
 
 
@@ -312,28 +338,39 @@ def levels_off(points: Sequence[Point]) -> bool:
 
 
 def recommend(
-    lines: Mapping[tuple[str, str, str], Sequence[Point]], goal: float, round_up: RoundUp | None = None
+    lines: Mapping[tuple[str, str, str], Sequence[Point]],
+    goal: float,
+    round_up: RoundUp | None = None,
+    theories: Mapping[tuple[str, str, str], Theory] | None = None,
 ) -> Recommended | None:
     """Return the setting with the least time that reaches a relative error, over 0, by the points of each line; None
-    where none is known to. `round_up` says what sample counts a series takes."""
-    found = [one for points in lines.values() if (one := reaching(points, goal, round_up)) is not None]
+    where none is known to. `round_up` says what sample counts a series takes, `theories` what slope a line has where
+    its points are too few to tell."""
+    found = [
+        one
+        for line, points in lines.items()
+        if (one := reaching(points, goal, round_up, (theories or {}).get(line, UNKNOWN))) is not None
+    ]
     return min(found, key=lambda one: one.seconds or 0.0, default=None)
 
 
-def reaching(points: Sequence[Point], goal: float, round_up: RoundUp | None = None) -> Recommended | None:
+def reaching(
+    points: Sequence[Point], goal: float, round_up: RoundUp | None = None, theory: Theory = UNKNOWN
+) -> Recommended | None:
     """Return the least sample count at which one line reaches a goal, and what it takes there.
 
     Where the fitted line goes through the interval of every known point, of at least four, it stands for them: it
     knows more than any one of them. Elsewhere the error is interpolated between points on logarithmic axes; beyond the
-    last one it follows the fitted slope, at most `FURTHEST` times as far, and not at all where the line levels off. A
-    limit counts as an error of that size. Time is interpolated, and beyond the last point grows with the samples.
+    last one it follows the fitted slope, or that of theory where points are too few for a fit, at most `FURTHEST` times
+    as far, and not at all where the line levels off. A limit counts as an error of that size. Time is interpolated, and
+    beyond the last point grows with the samples.
     """
     if not points or not goal > 0.0:
         return None
     ordered = sorted(points, key=lambda point: point.setting.spp)
     setting = ordered[0].setting
     fitted = _explaining(ordered)
-    count, basis = _samples_for(ordered, goal) if fitted is None else _on_line(fitted, ordered, goal)
+    count, basis = _samples_for(ordered, goal, theory) if fitted is None else _on_line(fitted, ordered, goal)
     if count is None:
         return None
     spp = (round_up or (lambda _, samples: math.ceil(samples - 1e-9)))(setting.series, count)
@@ -396,7 +433,7 @@ def _line_at(line: PrecisionSlope, spp: int) -> float:
     return math.exp(line.offset + line.slope * math.log(spp))
 
 
-def _samples_for(ordered: Sequence[Point], goal: float) -> tuple[float | None, str]:
+def _samples_for(ordered: Sequence[Point], goal: float, theory: Theory) -> tuple[float | None, str]:
     """The samples at which ordered points stay at or below a goal from there on."""
     good = None
     for point in reversed(ordered):
@@ -404,7 +441,7 @@ def _samples_for(ordered: Sequence[Point], goal: float) -> tuple[float | None, s
             break
         good = point
     if good is None:
-        return _extrapolated(ordered, goal), "extrapolated"
+        return _extrapolated(ordered, goal, theory), "extrapolated"
     if good is ordered[0]:
         return float(good.setting.spp), "measured"
     before = ordered[ordered.index(good) - 1]
@@ -413,11 +450,12 @@ def _samples_for(ordered: Sequence[Point], goal: float) -> tuple[float | None, s
     return before.setting.spp * ratio**share, "interpolated"
 
 
-def _extrapolated(ordered: Sequence[Point], goal: float) -> float | None:
+def _extrapolated(ordered: Sequence[Point], goal: float, theory: Theory) -> float | None:
     line, last = fit_line(ordered), ordered[-1]
-    if line is None or not last.known or line.slope > -0.1 or levels_off(ordered):
+    slope = theory.slope if line is None else line.slope
+    if slope is None or not last.known or slope > -0.1 or levels_off(ordered):
         return None
-    factor = (goal / last.error) ** (1.0 / max(line.slope, -1.0))
+    factor = (goal / last.error) ** (1.0 / max(slope, -1.0))
     return last.setting.spp * factor if factor <= FURTHEST else None
 
 

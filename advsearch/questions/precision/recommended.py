@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,7 @@ from advsearch.questions.precision.answer import (
     PrecisionResult,
     Recommended,
     SettingPlace,
+    busy,
 )
 from advsearch.questions.precision.benches import OIDN, PREDICTED, PolicyCurve, missing, sooner
 from advsearch.questions.precision.gradient import COUNTS_OF, SURFACE_LIGHT
@@ -113,16 +114,28 @@ def report_of(section: Section, goal: float, **asked: Any) -> PrecisionResult:
             if (slope := fit_line(one.points, against, one.theory)) is not None:
                 slopes.append(slope)
                 warnings += filter(None, [warning_of(slope, one.points)])
+    points = _points(section)
+    warnings += filter(None, [busy(points), _heavy(points)])
     return PrecisionResult(
         **asked,
         goal=goal,
-        points=_points(section),
+        points=points,
         slopes=slopes,
         references=section.references,
         recommendations=_recommended(section, goal) + _policy(section, goal),
         warnings=warnings,
         left_out=[NotMeasured(**vars(_place(one)), reason="did not fit into the time") for one in section.left_out],
         figures=[],
+    )
+
+
+def _heavy(points: Sequence[PrecisionPoint]) -> str | None:
+    names = sorted({one.estimator for one in points if one.heavy_tailed})
+    if not names:
+        return None
+    return (
+        f"{', '.join(names)}: a few pixels hold most of the error (fireflies), so that repeats say too little and it "
+        "has no interval; a denoiser or more `rounds` help"
     )
 
 
@@ -143,7 +156,8 @@ def _together(by_measure: Mapping[str, Point], family: str | None) -> PrecisionP
     return PrecisionPoint(
         **vars(_place(point.setting)),
         error=point.error,
-        interval=point.interval,
+        interval=None if point.heavy else point.interval,
+        heavy_tailed=point.heavy or None,
         known=point.known,
         reference_error=point.floor,
         margin_error=None if margin is None else margin.error,
@@ -151,6 +165,7 @@ def _together(by_measure: Mapping[str, Point], family: str | None) -> PrecisionP
         margin_known=None if margin is None else margin.known,
         margin_reference_error=None if margin is None else margin.floor,
         seconds=last.seconds,
+        wall_seconds=last.more.get("wall_seconds"),
         repeats=last.repeats,
         cosine=last.more.get("cosine"),
         later_seconds=last.more.get("later_seconds"),
@@ -198,7 +213,8 @@ def _recommended(section: Section, goal: float) -> list[Recommended]:
     found = []
     for (quantity, control, measure, family), lines in asked.items():
         round_up = rounding(section, quantity)
-        one = recommend({line: each.points for line, each in lines.items()}, goal, round_up)
+        theories = {line: each.theory for line, each in lines.items()}
+        one = recommend({line: each.points for line, each in lines.items()}, goal, round_up, theories)
         if one is None:
             one = Recommended(quantity=quantity, control=control or None, measure=measure, among=None, estimator=None)
         chosen = lines.get((quantity, control, one.estimator or ""))

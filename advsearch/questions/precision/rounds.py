@@ -24,7 +24,7 @@ from advsearch.questions.precision.points import Array, MeasuredSetting
 
 Result = TypeVar("Result")
 Measure = Callable[[MeasuredSetting, int], tuple[Result, float]]
-"""From a setting and a seed to what came out and the seconds it took."""
+"""From a setting and a seed to what came out and the processor time that it took, in seconds."""
 
 LEAST = 5
 """Calls of a setting that have to fit into the budget for it to be begun."""
@@ -34,29 +34,47 @@ MOST_PARTS = 64
 """Independent parts of a reference, at most."""
 
 
+class Stopwatch:
+    """Counts processor time, of all threads of this process, and wall time, from now on."""
+
+    def __init__(self) -> None:
+        self._processor, self._wall = time.process_time(), time.perf_counter()
+
+    @property
+    def processor(self) -> float:
+        """Seconds of processor time: what other processes take does not count."""
+        return time.process_time() - self._processor
+
+    @property
+    def wall(self) -> float:
+        """Seconds by the clock."""
+        return time.perf_counter() - self._wall
+
+
 class TimeBudget:
     """Seconds from now on that may be spent, by a clock."""
 
     def __init__(self, seconds: float, clock: Callable[[], float] = time.perf_counter) -> None:
-        self._clock = clock
+        self.clock = clock
         self._end = clock() + seconds
 
     @property
     def left(self) -> float:
         """Seconds left, not below 0."""
-        return max(0.0, self._end - self._clock())
+        return max(0.0, self._end - self.clock())
 
     def share(self, part: float) -> TimeBudget:
         """Return a budget of a part, in [0, 1], of what is left."""
-        return TimeBudget(part * self.left, self._clock)
+        return TimeBudget(part * self.left, self.clock)
 
 
 @dataclass
 class Rounds(Generic[Result]):
-    """What was measured: what came out and its seconds, for each setting; what did not fit into the budget at all; and
-    whether every setting had all its rounds."""
+    """What was measured: what came out and its processor time, for each setting; the seconds of each call by the clock;
+    what did not fit into the budget at all; and whether every setting had all its rounds."""
 
     results: dict[MeasuredSetting, list[tuple[Result, float]]] = field(default_factory=dict)
+    walls: dict[MeasuredSetting, list[float]] = field(default_factory=dict)
     left_out: tuple[MeasuredSetting, ...] = ()
     complete: bool = True
 
@@ -76,18 +94,20 @@ def in_rounds(
     measured.
 
     In the first round a setting is begun only if `least` calls of it, and those that the settings before it still need
-    for as many, fit into what is left (see `Forecast`); it has `warm_up` calls more, which compile and record kernels.
-    A call that should not fit is not begun: a budget is kept to within a setting's first calls. Each call has a seed of
-    its own.
+    for as many, fit into what is left (see `Forecast`). The first call compiles and records kernels, so that every
+    setting has `warm_up` calls more: without one, nothing would be known of its time. A call that should not fit is not
+    begun: a budget is kept to within a setting's first calls. Each call has a seed of its own.
     """
     ordered = sorted(settings, key=lambda one: one.cost)
     found: Rounds[Result] = Rounds()
-    forecast = Forecast(found.results, cold=warm_up + 1 if warm_up else 0)
+    forecast = Forecast(found.walls, cold=warm_up + 1 if warm_up else 0)
 
     def call(setting: MeasuredSetting) -> None:
         taken = found.results.setdefault(setting, [])
         name = f"precision {'/'.join(setting.line)}/{setting.spp}"
+        begun = budget.clock()
         taken.append(measure(setting, seeds.stream(seed, name, len(taken))))
+        found.walls.setdefault(setting, []).append(budget.clock() - begun)
         if on_done is not None:
             on_done(setting)
 
@@ -97,8 +117,7 @@ def in_rounds(
             continue
         call(setting)
         for _ in range(warm_up):
-            if budget.left > 0.0:
-                call(setting)
+            call(setting)
     begun = [one for one in ordered if one in found.results]
     for _ in range(1, rounds):
         for setting in begun:
@@ -111,19 +130,20 @@ def in_rounds(
     return found
 
 
-class Forecast(Generic[Result]):
-    """What a call should take, judged by the results before it, whose `cold` first calls take longer and say little."""
+class Forecast:
+    """What a call should take by the clock, judged by those before it (seconds by setting), whose `cold` first ones
+    take longer and say little."""
 
-    def __init__(self, results: dict[MeasuredSetting, list[tuple[Result, float]]], cold: int) -> None:
-        self._results, self._cold = results, cold
+    def __init__(self, walls: dict[MeasuredSetting, list[float]], cold: int) -> None:
+        self._walls, self._cold = walls, cold
 
     def seconds(self, setting: MeasuredSetting) -> float:
         """A call but the first: as the setting's own, else in proportion to its line's dearest setting, else at the
         highest rate of any line; 0 where nothing is known."""
-        if setting in self._results:
+        if setting in self._walls:
             return self._warm(setting)
         rates: dict[tuple[str, str, str], tuple[float, float]] = {}
-        for one in self._results:
+        for one in self._walls:
             rates[one.line] = max(rates.get(one.line, (0.0, 0.0)), (one.cost, self._warm(one) / one.cost))
         if setting.line in rates:
             return rates[setting.line][1] * setting.cost
@@ -132,8 +152,8 @@ class Forecast(Generic[Result]):
     def first(self) -> float:
         """What the first calls take beyond that: the median so far."""
         more = [
-            sum(seconds for _, seconds in taken[: self._cold]) - self._cold * self._warm(one)
-            for one, taken in self._results.items()
+            sum(taken[: self._cold]) - self._cold * self._warm(one)
+            for one, taken in self._walls.items()
             if len(taken) > self._cold
         ]
         return max(0.0, statistics.median(more)) if more else 0.0
@@ -141,11 +161,11 @@ class Forecast(Generic[Result]):
     def owed(self, least: int, left: float) -> float:
         """What the settings begun still need for as many calls each. One that needs more than a share `CLAIM` of what
         is left turned out too dear, and waits until the end."""
-        needs = [max(0, least - len(taken)) * self._warm(one) for one, taken in self._results.items()]
+        needs = [max(0, least - len(taken)) * self._warm(one) for one, taken in self._walls.items()]
         return sum(need for need in needs if need <= CLAIM * left)
 
     def _warm(self, setting: MeasuredSetting) -> float:
-        taken = [seconds for _, seconds in self._results[setting]]
+        taken = self._walls[setting]
         return statistics.median((taken[self._cold :] or taken[-1:])[-3:])
 
 
