@@ -1,12 +1,14 @@
-"""Rows of small sweeps and searches, kept and compared bit for bit, so that a change of form is seen to change nothing.
+"""Answers of small runs, kept and compared bit for bit, so that a change of form is seen to change nothing.
 
     python benchmarks/golden.py keep FOLDER [--only texture]      before a change
     python benchmarks/golden.py compare FOLDER [--only texture]   after it
 
-Every control is swept and attacked, every policy and objective searches, and each question about a space is asked once,
-on the bundled mug at 48 x 48 pixels with 2 samples, deterministic. The exported rows and the numbers of each summary
-are compared; only seconds, dates and paths are left out. The exit status is 3 if anything differs. Rows are of one
-processor and one libLLVM: another machine's need not equal them.
+Every control is swept and attacked, every policy and objective searches, and every question is asked, on the bundled
+mug at 48 x 48 pixels with 2 samples, deterministic. Longer runs are predicted in every way there is: by a matrix, by a
+bank of them, by light on surfaces, in searches and in sweeps. Imported files, a camera file, drives and other tasks are
+there too. Exported rows, the numbers of each summary and digests of pictures are compared; only seconds, dates and paths
+are left out. The exit status is 3 if anything differs. Rows are of one processor and one libLLVM: another machine's need
+not equal them.
 """
 
 from __future__ import annotations
@@ -14,14 +16,23 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import hashlib
 import io
 import json
+import os
+import struct
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as imageio
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from advsearch import Model, load_model
 from advsearch.attacks.objectives import OBJECTIVES
 from advsearch.attacks.policies import POLICIES
 from advsearch.cli.main import main as advsearch
@@ -59,23 +70,29 @@ PLACES = ("run", "path", "folder", "resume", "version", "versions", "machine", "
 """Keys that are about where a run lies and what it ran on."""
 
 
-def commands() -> dict[str, list[str]]:
-    """Return every command by its name here."""
+PREDICTED = "predicted-"
+"""Names of commands that have to predict pictures: one that renders them all is refused."""
+
+
+def commands() -> dict[str, list[list[str]]]:
+    """Return every command by its name here, after those whose runs it reads: `run-0` is the run of the first one.
+
+    Paths are relative to a folder with the files of `make_files`.
+    """
     few = ["--steps", "3", "--trials", "6"]
     found = {}
     for control, grid in SWEPT.items():
         name = FORMS.get(control, control)
         axes = ["--control", name, "--samples", "4"] if control in FORMS else ["--grid", grid]
-        found[f"sweep-{control}"] = ["sweep", *axes, "--trials", "6"]
-        found[f"attack-{control}"] = ["attack", "--control", name, *few]
+        found[f"sweep-{control}"] = [["sweep", *axes, "--trials", "6"]]
+        found[f"attack-{control}"] = [["attack", "--control", name, *few]]
     for policy in POLICIES:
         controls = "pose.yaw" if policy == "grid" else "pose,camera"
-        found[f"policy-{policy}"] = ["attack", "--control", controls, "--policy", policy, *few]
+        found[f"policy-{policy}"] = [["attack", "--control", controls, "--policy", policy, *few]]
     for objective in OBJECTIVES:
-        found[f"objective-{objective}"] = ["attack", "--control", "pose", "--objective", objective, *few]
+        found[f"objective-{objective}"] = [["attack", "--control", "pose", "--objective", objective, *few]]
     texture = FORMS["texture"]
-    return {
-        **found,
+    single = {
         "mixture": ["attack", "--control", f"pose,light,{texture}", *few],
         "over": ["attack", "--control", texture, "--over", "camera,light", *few],
         "average": ["attack", "--control", "pose", "--average", "4", *few],
@@ -85,17 +102,209 @@ def commands() -> dict[str, list[str]]:
         "gap": ["gap", "--control", "pose,camera", "--average", "4", *few],
         "region": ["region", "--control", "pose", "--samples", "8"],
     }
+    return {name: [command] for name, command in single.items()} | found | predictions() | worlds() | questions()
 
 
-def answers(command: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Run one command in this process; returns its rows and the numbers of its answer."""
-    run = folder / "run"
-    shared = [word.replace("--spp", "--verify-spp") for word in SMALL] if command[0] == "region" else SMALL
-    said = written([*command, *shared, "--run", str(run), "--json"])
-    found: dict[str, Any] = {"answer": timeless(json.loads(said)) if said.strip() else None}
+def predictions() -> dict[str, list[list[str]]]:
+    """Return runs that are long enough to be predicted."""
+    texture, few = FORMS["texture"], ["--trials", "6", "--verify-spp", "4", "--measure", "no"]
+    wide = ["--epsilon", "0.3", "--steps", "40", "--trials", "20", "--measure", "no"]
+    found = {
+        "matrix": ["attack", "--control", texture, "--steps", "20", *few],
+        "light": ["attack", "--control", "light.power", "--steps", "40", "--policy", "random", *few],
+        "camera": ["attack", "--control", "camera", "--steps", "40", *few],
+        "bank": ["attack", "--control", texture, "--over", "light", *wide],
+        "over-camera": ["attack", "--control", texture, "--over", "camera", *wide],
+        "sweep-light": ["sweep", "--grid", "light.power=1:9:16", "--grid", "light.azimuth=0:360:16", "--trials", "0"],
+        "sweep-camera": ["sweep", "--control", "camera", "--samples", "200", "--trials", "0"],
+    }
+    return {f"{PREDICTED}{name}": [command] for name, command in found.items()}
+
+
+def worlds() -> dict[str, list[list[str]]]:
+    """Return runs with objects, cameras, paths and tasks of other kinds."""
+    picture = ["--out", "picture.png", "--set", "camera.azimuth=30"]
+    few = ["--steps", "3", "--trials", "6"]
+    found = {f"object-{ending}": ["render", "--object", f"box.{ending}", *picture] for ending in ("obj", "ply", "glb")}
+    found["camera-file"] = ["render", "--camera", "camera.yaml", *picture]
+    found["drive"] = ["sweep", "--path", "approach", "--fps", "1", "--grid", "pose.yaw=0,90"]
+    found["over-path"] = ["attack", "--control", FORMS["texture"], "--over", "path", "--path", "approach", *few]
+    for task, model in (("detection", "Finder"), ("depth={kind: relative disparity}", "Ranger")):
+        name = task.partition("=")[0]
+        asked = ["--task", task, "--model", f"golden:{model.lower()}"]
+        found[name] = ["attack", "--control", "light", *asked, *few]
+        found[f"sweep-{name}"] = ["sweep", "--grid", "light.power=2,9", *asked]
+    return {name: [command] for name, command in found.items()}
+
+
+def questions() -> dict[str, list[list[str]]]:
+    """Return the questions that read runs, or take settings of other kinds. `precision` is left out: its times decide."""
+    small = ["attack", "--control", "pose", "--steps", "3", "--trials", "6"]
+    swept = ["sweep", "--control", "pose,light", "--samples", "120", "--trials", "0"]
+    few = ["--rounds", "1", "--scenes", "1", "--views", "1", "--epochs", "1", "--measured", "2"]
+    return {
+        "check": [["check", "--control", "light,pose.yaw"]],
+        "plan": [["plan", "--control", "light,pose"]],
+        "compare": [["compare", "reference", "golden:colours", "--control", "pose", "--samples", "24"]],
+        "explain": [swept, ["explain", "run-0", "--confirm", "0", "--pairs", "2", "--clusters", "8"]],
+        "replay": [small, ["replay", "run-0", "--trials", "6", "--ways", "samples,resolution,depth,curve,jpeg,sensor"]],
+        "evidence": [small, swept, ["report", "run-0", "run-1", "--evidence"]],
+        "test": [["test", "suite.yaml"]],
+        "recipe": [["recipe", "liquid", "--quick"]],
+        "harden": [["harden", "--object", "ball,book", "--control", "texture", "--epsilon", "0.03", *few]],
+    }
+
+
+def finder() -> Model:
+    """A detector of the mug's blue band."""
+
+    class Finder(nn.Module):
+        def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+            blue = (x[:, 2] - x[:, 0])[:, 15:21, 8:22].mean(dim=(1, 2))
+            box = x.new_tensor([[[0.12, 0.12, 0.86, 0.86]]]).expand(x.shape[0], -1, -1)
+            scores = torch.stack([30.0 * (blue - 0.1), 30.0 * (0.1 - blue)], dim=1).sigmoid()
+            return box, scores[:, None]
+
+    return load_model(Finder(), task="detection", labels=["mug", "bowl"], input_size=32, name="finder")
+
+
+def ranger() -> Model:
+    """Disparity: what is bright is near."""
+
+    class Ranger(nn.Module):
+        def forward(self, x: Tensor) -> Tensor:
+            return 5.0 * x.mean(dim=1) + 0.1
+
+    return load_model(Ranger(), task="depth", input_size=32, name="ranger")
+
+
+def colours() -> Model:
+    """A classifier by mean colours whose weights come from a seed."""
+
+    class Colours(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(4)
+                self.last = nn.Linear(48, 14)
+
+        def forward(self, x: Tensor) -> Tensor:
+            found: Tensor = self.last(nn.functional.adaptive_avg_pool2d(x, 4).flatten(1))
+            return found
+
+    return load_model(Colours(), labels=load_model("reference").labels.names, input_size=32, name="colours")
+
+
+def make_files(folder: Path) -> None:
+    """Write a textured wedge as .obj, .ply and .glb, a camera with distortion, and a suite of claims."""
+    points = np.array(
+        [[0, 0, 0], [1, 0, 0], [1, 0.6, 0], [0, 0.6, 0], [0.2, 0.1, 0.8], [0.8, 0.1, 0.5]], dtype=np.float32
+    )
+    faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 5], [0, 5, 4], [1, 2, 5], [2, 3, 4], [2, 4, 5], [3, 0, 4]])
+    uv = points[:, :2] * np.float32(0.9) + np.float32(0.05)
+    picture = np.random.default_rng(1).integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    imageio.imwrite(folder / "skin.png", picture)
+    (folder / "box.mtl").write_text("newmtl skin\nmap_Kd skin.png\n", "utf-8")
+    lines = ["mtllib box.mtl", *(f"v {x:g} {y:g} {z:g}" for x, y, z in points), *(f"vt {u:g} {v:g}" for u, v in uv)]
+    lines += ["usemtl skin", *("f " + " ".join(f"{corner + 1}/{corner + 1}" for corner in face) for face in faces)]
+    (folder / "box.obj").write_text("\n".join(lines) + "\n", "utf-8")
+    head = [f"element vertex {len(points)}", *(f"property float {name}" for name in "xyzst")]
+    head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    rows = [" ".join(f"{value:g}" for value in row) for row in np.concatenate([points, uv], axis=1)]
+    rows += ["3 " + " ".join(map(str, face)) for face in faces]
+    (folder / "box.ply").write_text("\n".join(["ply", "format ascii 1.0", *head, *rows]) + "\n", "utf-8")
+    (folder / "box.glb").write_bytes(glb(points, uv, faces.astype(np.uint32), (folder / "skin.png").read_bytes()))
+    camera = {
+        "image_width": 64, "image_height": 48, "camera_matrix": {"rows": 3, "cols": 3, "data": [60, 0, 31, 0, 60, 25, 0, 0, 1]},
+        "distortion_model": "plumb_bob", "distortion_coefficients": {"rows": 1, "cols": 5, "data": [-0.3, 0.1, 0.001, 0, 0]},
+    }  # fmt: skip
+    (folder / "camera.yaml").write_text(json.dumps(camera), "utf-8")
+    claims = {
+        "seen": {"claim": "right", "at_least": 0.5, "pictures": 24, "settings": {"controls": {"camera": {"azimuth": [0, 360]}}}},
+        "held": {"claim": "not_broken", "settings": {"controls": "pose", "policy": "random", "steps": 4, "trials": 6, "measure": "no"}},
+    }  # fmt: skip
+    settings = {"object": "mug", "resolution": 48, "spp": 2, "threads": 1}
+    (folder / "suite.yaml").write_text(json.dumps({"title": "Small", "settings": settings, "claims": claims}), "utf-8")
+
+
+def glb(points: np.ndarray, uv: np.ndarray, faces: np.ndarray, picture: bytes) -> bytes:
+    """Return a binary glTF with one textured mesh."""
+    chunks = [points.tobytes(), uv.tobytes(), faces.tobytes(), picture + b"\0" * (-len(picture) % 4)]
+    begins = np.cumsum([0, *map(len, chunks)])
+    views = [
+        {"buffer": 0, "byteOffset": int(at), "byteLength": len(one)} for at, one in zip(begins, chunks, strict=False)
+    ]
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": 0, "componentType": 5126, "count": len(points), "type": "VEC3",
+         "min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()},
+        {"bufferView": 1, "componentType": 5126, "count": len(uv), "type": "VEC2"},
+        {"bufferView": 2, "componentType": 5125, "count": faces.size, "type": "SCALAR"},
+    ]  # fmt: skip
+    views[3]["byteLength"] = len(picture)
+    mesh = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+    head = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [mesh]}], "accessors": accessors, "bufferViews": views,
+        "buffers": [{"byteLength": int(begins[-1])}], "images": [{"bufferView": 3, "mimeType": "image/png"}],
+        "textures": [{"source": 0}], "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+    }  # fmt: skip
+    text = json.dumps(head).encode()
+    text += b" " * (-len(text) % 4)
+    body = b"".join(chunks)
+    parts = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
+
+
+PLAIN = ("--seed", "5", "--threads", "1", "--quiet")
+SHARED: Mapping[str, Sequence[str]] = {
+    "region": [word.replace("--spp", "--verify-spp") for word in SMALL],
+    "check": [word for word in SMALL if word != "--deterministic"],
+    "explain": PLAIN,
+    "test": (*PLAIN[:2], "--deterministic", "--quiet"),
+    "replay": PLAIN[2:],
+    "report": (),
+    "recipe": ("--resolution", "32", *PLAIN[:2], "--deterministic", "--quiet"),
+    "harden": ("--model", "golden:colours", "--resolution", "32", "--texture-resolution", "8", *PLAIN),
+}
+"""What stands behind a command, where that is not `SMALL`."""
+
+
+def answers(name: str, folder: Path) -> list[dict[str, Any]]:
+    """Run a command, and those before it, in this process; returns their rows and the numbers of their answers."""
+    make_files(folder)
+    here = Path.cwd()
+    os.chdir(folder)
+    try:
+        found = [answer(command, f"run-{number}") for number, command in enumerate(commands()[name])]
+    finally:
+        os.chdir(here)
+    if name.startswith(PREDICTED) and not any(counted(found, "predicted")):
+        raise SystemExit(f"{name}: expected predicted pictures, got none")
+    return [timeless(one) for one in found]
+
+
+def answer(command: Sequence[str], run: str) -> dict[str, Any]:
+    """Run one command; returns its rows, the numbers of its answer and the digest of its picture, where it has them."""
+    shared = SHARED.get(command[0], SMALL)
+    twice = shared[:2] == SMALL[:2] and {"--object", "compare"} & {*command}
+    where = {"render": (), "report": ("--out", run)}.get(command[0], ("--run", str(Path.cwd() / run)))
+    said = written([*command, *(shared[2:] if twice else shared), *where, "--json"])
+    found: dict[str, Any] = {"answer": json.loads(said) if said.strip() else None}
     if command[0] in ("attack", "sweep"):
-        found["rows"] = [timeless(row) for row in csv.DictReader(io.StringIO(written(["export", str(run)])))]
+        found["rows"] = list(csv.DictReader(io.StringIO(written(["export", run]))))
+    if command[0] == "render":
+        found["digest"] = hashlib.sha256(imageio.imread("picture.png").tobytes()).hexdigest()
     return found
+
+
+def counted(value: Any, key: str) -> Iterator[int]:
+    """Yield the numbers under a key, wherever they are."""
+    if isinstance(value, Mapping):
+        for name, one in value.items():
+            yield from [int(one)] if name == key and isinstance(one, int | float) else counted(one, key)
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            yield from counted(one, key)
 
 
 def written(words: Sequence[str]) -> str:
@@ -160,11 +369,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     bad = 0
     for name in names:
         with tempfile.TemporaryDirectory() as folder:
-            found = json.loads(json.dumps(answers(commands()[name], Path(folder))))
+            found = json.loads(json.dumps(answers(name, Path(folder))))
         file = args.folder / f"{name}.json"
         if args.do == "keep":
             file.write_text(json.dumps(found, indent=1), "utf-8")
-            print(f"{name:24s} kept, {len(found.get('rows', ()))} rows", flush=True)
+            print(f"{name:24s} kept, {sum(len(one.get('rows', ())) for one in found)} rows", flush=True)
             continue
         where = list(differences(json.loads(file.read_text("utf-8")), found)) if file.exists() else ["not kept before"]
         bad += bool(where)
