@@ -25,6 +25,7 @@ from advsearch import __version__
 from advsearch.cli.output import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS
+from advsearch.registry import allow_code, nothing_allowed
 from advsearch.rooms import there
 
 GROUPS = {
@@ -96,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. An exception that is a bug of ours passes through."""
     if argv is None:  # this process is ours
         open_descriptors()
-    with screens():
+    with screens(), nothing_allowed():
         status = _interruptible(sys.argv[1:]) if argv is None else _status(list(argv))
         if argv is None:  # native code knows no handler of ours
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -164,6 +165,7 @@ def _run(given: list[str]) -> int:
         args = _parse(given, command)
     except SystemExit as stop:  # --help and --version have printed their text
         return int(stop.code or 0)
+    allow_code(*getattr(args, "code", ()))
     return int(found(args.command).run(args))
 
 
