@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from functools import cached_property, wraps
 from importlib import import_module
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from advsearch.errors import InputError
@@ -198,6 +199,11 @@ def check_import(name: str) -> None:
         f"a file names {name}, Python code{where} that would be imported and run; read it, and if you trust it, allow "
         f"it yourself: in Python with advsearch.allow_code({name!r}), or with `code={name}`"
     )
+
+
+OWN_FOLDER = Path(__file__).resolve().parents[1]
+"""Where processes of Python that we start begin: Python looks there for modules first, and the folder that a user is in
+may be somebody else's."""
 
 
 @contextmanager

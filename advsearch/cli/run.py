@@ -76,6 +76,11 @@ def run_file(
     If the file is a run's own, `resumed` is its folder; `args` has `json` and `quiet`.
     """
     config = config_of_file(command, file, changes)
+    for one in config.left_out:
+        if resumed is None or one.name not in config.free:
+            raise InputError(f"{file}: {one.name}: {one.does}, which a file can't ask for; type {one.ask}")
+        if not args.quiet:
+            print(f"advsearch: {one.name} is left out: it {one.does}; type {one.ask}", file=sys.stderr)
     return int(main.found(command).carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
 
 
