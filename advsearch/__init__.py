@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from advsearch.questions.replay.carry_out import replay as replay
     from advsearch.questions.stability.carry_out import stability as stability
     from advsearch.questions.sweep.carry_out import sweep as sweep
+    from advsearch.registry import allow_code as allow_code
 
 __version__ = "0.1.0"
 
@@ -47,6 +48,7 @@ _HOMES = {
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
     "SweepResult": "advsearch.engine.sweeps.summary",
+    "allow_code": "advsearch.registry",
     "attack": "advsearch.questions.attack.carry_out",
     "check": "advsearch.questions.check.carry_out",
     "compare": "advsearch.questions.compare.carry_out",

@@ -6,19 +6,22 @@ A package adds to a registry through an entry point of the registry's group, as 
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import os
+import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import cached_property, wraps
 from importlib import import_module
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from advsearch.errors import InputError
 
 Entry = TypeVar("Entry")
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Registry(Mapping[str, Entry], Generic[Entry]):
@@ -73,7 +76,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
     def _class(self, name: str) -> Entry:
         """Import "package.module:Class". Raises InputError where it cannot be imported, is something else, or must not
-        be imported (`only_named_code`)."""
+        be imported (`check_import`)."""
         module, _, attribute = name.partition(":")
         check_import(name)
         try:
@@ -104,33 +107,86 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return found
 
 
-_GUARD: ContextVar[tuple[str, frozenset[str]] | None] = ContextVar("guard", default=None)
-"""The file whose settings are carried out, and the code that may be imported for it; None for no such file."""
+_ALLOWED: set[str] = set()
+"""The Python code that whoever uses this process has named. Of the process, so that it holds in every thread; empty at
+first, so that what only a file names is refused, whoever reads that file."""
+
+_CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
+
+
+def allow_code(*names: str) -> None:
+    """Allow this process to import Python code that a file names, such as the `run.yaml` of a run: read it before.
+
+    Args:
+        names: "package.module:attribute", each as it stands in the file, without weights behind an @.
+
+    Raises:
+        InputError: a name is none of this form.
+    """
+    for name in names:
+        if not isinstance(name, str) or not _CODE.fullmatch(name):
+            raise InputError(f"code: expected package.module:attribute, got {str(name)[:80]!r}")
+    _ALLOWED.update(names)
+
+
+def allowed_code() -> tuple[str, ...]:
+    """Return what may be imported."""
+    return tuple(sorted(_ALLOWED))
+
+
+def allow_named(settings: Mapping[str, Any]) -> None:
+    """Allow the code that stands in settings which a person has typed or given in Python: as models, controls or
+    metrics, in any form that they may have there. Settings that come from a file are never given to this."""
+    names: list[object] = []
+    for value in (settings.get(key) for key in ("model", "compared", "than")):
+        names += [part.partition("@")[0] for one in _listed(value) if isinstance(one, str) for part in one.split(",")]
+    for value in (settings.get(key) for key in ("controls", "over")):
+        given = value if isinstance(value, Mapping) else {}
+        for one in (*_listed(value), *given.values()):
+            names += one.split(",") if isinstance(one, str) else [getattr(one, "kind", None)]
+            names += [one.get("kind")] if isinstance(one, Mapping) else []
+    metrics = settings.get("metrics")
+    for one in metrics.values() if isinstance(metrics, Mapping) else ():
+        names.append(f"{one.__module__}:{getattr(one, '__qualname__', '')}" if callable(one) else one)
+    _ALLOWED.update(name for one in names if isinstance(one, str) and _CODE.fullmatch(name := one.strip()))
+
+
+def names_code(function: Function) -> Function:
+    """Let what a caller gives a function, which is for Python only and not for what a file says, allow code too."""
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def asked(*args: Any, **given: Any) -> Any:
+        with suppress(TypeError):  # of arguments that do not fit, which the function says itself
+            allow_named(signature.bind(*args, **given).arguments)
+        return function(*args, **given)
+
+    return asked  # type: ignore[return-value]
+
+
+def _listed(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, (list, tuple, Mapping)) else [value]
 
 
 @contextmanager
-def only_named_code(file: str | os.PathLike[str], named: Iterable[str]) -> Iterator[None]:
-    """Import no Python code by its name inside the block but what is named: the settings are somebody's file.
-
-    Args:
-        file: for messages.
-        named: "package.module:attribute", each as it stands in the file.
-    """
-    token = _GUARD.set((os.fspath(file), frozenset(named)))
+def nothing_allowed() -> Iterator[None]:
+    """Allow inside the block what is named there alone, and after it what was allowed before."""
+    before = allowed_code()
+    _ALLOWED.clear()
     try:
         yield
     finally:
-        _GUARD.reset(token)
+        _ALLOWED.clear()
+        _ALLOWED.update(before)
 
 
 def check_import(name: str) -> None:
     """Check that "package.module:attribute" may be imported.
 
     Raises:
-        InputError: a file names it, and nobody else.
+        InputError: nobody but a file names it.
     """
-    guard = _GUARD.get()
-    if guard is None or name in guard[1]:
+    if name in _ALLOWED:
         return
     package = name.partition(":")[0].partition(".")[0]
     with current_directory_importable():
@@ -140,9 +196,14 @@ def check_import(name: str) -> None:
             found = None
     where = f" from {found.origin}" if found is not None and found.origin else ""
     raise InputError(
-        f"{guard[0]}: names {name}, Python code{where} that would be imported and run; read it, and if you trust it, "
-        f"name it yourself with `code={name}`"
+        f"a file names {name}, Python code{where} that would be imported and run; read it, and if you trust it, allow "
+        f"it yourself: in Python with advsearch.allow_code({name!r}), or with `code={name}`"
     )
+
+
+OWN_FOLDER = Path(__file__).resolve().parents[1]
+"""Where processes of Python that we start begin: Python looks there for modules first, and the folder that a user is in
+may be somebody else's."""
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.questions.test.settings import SuiteConfig, suite_of
+from advsearch.registry import allow_named
 
 if TYPE_CHECKING:
     from advsearch.engine.loading import Scene
@@ -127,6 +128,7 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
     from advsearch.engine.naming import in_turn
     from advsearch.questions.test.carry_out import test_from_config
 
+    allow_named(settings)
     with in_turn():
         result = test_from_config(SuiteConfig(**{"suite": str(suite), **settings}))
     bad = [one for one in result.claims if not one.accepted]
@@ -154,6 +156,8 @@ def _asserted(
     name = str(claim["claim"]).replace("_", "-")
     with ExitStack() as stack:
         stack.enter_context(in_turn())
+        for named in (settings, *({"model": one} for one in models.values())):
+            allow_named(named)
         given, said = dict(settings), dict(claim)
         if isinstance(object, loading.Scene):
             given |= {key: value for key, value in loading.scene_as_settings(object).items() if value is not None}

@@ -31,6 +31,15 @@ QUICK, QUICKEST = 0.15, 5.0
 """CPU seconds of a quick test, at most; and of the quickest of a file, which is quick all the same."""
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_models() -> None:
+    """Allow the small models of the tests, which configurations of theirs name as files do. A command allows nothing
+    but what it names."""
+    from advsearch.registry import allow_code
+
+    allow_code(*(f"small_models:{name}" for name in ("easy", "hard", "strange", "Colours")))
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real test data, or a skip that says what is missing."""

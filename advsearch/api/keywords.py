@@ -25,6 +25,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import told
 from advsearch.progress import watched
+from advsearch.registry import allow_named
 from advsearch.settings import Config, as_python, is_shallow, settings
 
 Names = str | Sequence[str]
@@ -211,6 +212,7 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                 bound = signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
+            allow_named({**bound.arguments, **given})
             kept = ("scene", "model", "beside", "progress", "metrics")
             plain = {key: one if key in kept or not is_shallow(one) else as_python(one) for key, one in given.items()}
             with ExitStack() as stack:

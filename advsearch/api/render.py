@@ -29,6 +29,7 @@ from advsearch.errors import InputError
 from advsearch.files import read_bytes
 from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress, shows_progress
+from advsearch.registry import allow_named, names_code
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.images import read_png
 from advsearch.runs.results.attack import AttackSummary
@@ -113,6 +114,7 @@ class ModelKeywords(TypedDict, total=False):
 def load_model(
     spec: str | Path | nn.Module | Model, *, task: AnyTask | None = None, **options: Unpack[ModelKeywords]
 ) -> Model:
+    allow_named({"model": spec})
     return models.load_model(spec, task=None if task is None else make_task(task), **options)
 
 
@@ -120,7 +122,7 @@ load_model.__doc__ = models.load_model.__doc__
 load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]
 
 
-render = in_turn()(shows_progress(rendering.render))
+render = names_code(in_turn()(shows_progress(rendering.render)))
 
 
 def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:

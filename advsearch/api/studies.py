@@ -37,7 +37,7 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import INTERRUPTED, Result, StudyResult
 from advsearch.runs.summary import attack_of, read_result
 from advsearch.scene.library import list_objects, load_object
-from advsearch.settings import FILES, Config, read_yaml
+from advsearch.settings import FILES, Config
 from advsearch.tasks import make_task
 from advsearch.viewer.pages import keep_answer
 
@@ -49,8 +49,7 @@ def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
         return carry_out(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
     if finished(path):
         return read_result(path)
-    kind = CONFIGS[str(read_yaml(path / CONFIG)["command"])]
-    return carry_out(kind.from_yaml(path / CONFIG), progress=progress, resumed=path)
+    return carry_out(type(config).from_yaml(path / CONFIG, config.asked), progress=progress, resumed=path)
 
 
 Study = TypeVar("Study", bound=StudyResult)
@@ -273,7 +272,7 @@ class StudyRun:
         what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
         self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
         if is_run(path) and (path / CONFIG).is_file():
-            began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG)
+            began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG, config.asked)
             summary = (
                 attack_once()(began, progress=self.progress, resumed=path, clean=clean).summary
                 if began

@@ -36,6 +36,7 @@ def _dashboard_arguments(parser: argparse.ArgumentParser) -> None:
         "--https", action="store_true", help="speak HTTPS on this machine too; at other addresses that is always so"
     )
     parser.add_argument("--json", action="store_true", help="print the address as JSON")
+    output.add_code_flag(parser)
 
 
 def _dashboard(args: argparse.Namespace) -> int:

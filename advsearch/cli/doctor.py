@@ -26,6 +26,7 @@ from advsearch import __version__, threads
 from advsearch.cli import output
 from advsearch.cli.question import Command
 from advsearch.errors import AdvsearchError
+from advsearch.registry import OWN_FOLDER
 from advsearch.scene.mitsuba_backend import llvm
 
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
@@ -101,7 +102,9 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
     The part that ended the process, and those after it, are absent; under the name ``""`` stands how it ended.
     """
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False, cwd=OWN_FOLDER
+        )
         output, errors, status = done.stdout, done.stderr, done.returncode
     except subprocess.TimeoutExpired as expired:
         text = expired.stdout.decode("utf-8", "replace") if isinstance(expired.stdout, bytes) else expired.stdout or ""

@@ -140,6 +140,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"
     )
     parser.add_argument("--paper", help="print: a4, a3 or letter (default: a4)")
+    output.add_code_flag(parser)
     parser.add_argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)")
 
 

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.errors import InputError
+from advsearch.registry import allow_named
 from advsearch.settings import Config, Setting, check_once, parse_assignment, settings, shown, split_names
 
 _NO_SETTINGS = {"code": "--code", "sheets": "--sheets", "paper": "--paper", "size": "--size"}
@@ -58,11 +59,13 @@ def add_settings(
 def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any) -> AnyConfig:
     """Return the configuration of a kind that the flags describe, with values for settings that were not given. Raises
     InputError where a value is not allowed."""
-    data = dict(otherwise)
+    typed: dict[str, Any] = {}
     for one in settings(config):
         if one.field in args:
             text, read = getattr(args, one.field), READERS.get(one.form)
-            data[one.field] = text if read is None else read(text, one.flag)
+            typed[one.field] = text if read is None else read(text, one.flag)
+    allow_named(typed)
+    data = {**otherwise, **typed}
     if "scene" in args and data.get("object") is None:
         raise InputError(f"object: expected something in {args.scene}, got nothing; name one of {_inside(args.scene)}")
     if "scene" in args and isinstance(data.get("object"), str):

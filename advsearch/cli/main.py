@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import re
 import shutil
 import signal
@@ -25,6 +26,7 @@ from advsearch import __version__
 from advsearch.cli.output import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS
+from advsearch.registry import allow_code, nothing_allowed
 from advsearch.rooms import there
 
 GROUPS = {
@@ -96,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. An exception that is a bug of ours passes through."""
     if argv is None:  # this process is ours
         open_descriptors()
-    with screens():
+    with screens(), nothing_allowed():
         status = _interruptible(sys.argv[1:]) if argv is None else _status(list(argv))
         if argv is None:  # native code knows no handler of ours
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -107,6 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _interruptible(given: list[str]) -> int:
     """As `_status`, with Ctrl-C for as long as there is something to interrupt, and never a traceback of it."""
     sys.unraisablehook = _unless_interrupted
+    os.environ.setdefault("PYTHONSAFEPATH", "1")  # of workers, which would look for modules here first
     try:
         signal.signal(signal.SIGINT, INTERRUPTS)
         status = _status(given)
@@ -164,6 +167,7 @@ def _run(given: list[str]) -> int:
         args = _parse(given, command)
     except SystemExit as stop:  # --help and --version have printed their text
         return int(stop.code or 0)
+    allow_code(*getattr(args, "code", ()))
     return int(found(args.command).run(args))
 
 

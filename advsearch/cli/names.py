@@ -13,6 +13,7 @@ from advsearch.cli.flags import add_settings
 from advsearch.cli.output import at_work
 from advsearch.cli.question import Command
 from advsearch.errors import InputError
+from advsearch.registry import allow_named
 from advsearch.rooms import there
 
 _EVERY = {
@@ -109,6 +110,7 @@ def class_names(model: str, labels: str | None) -> tuple[str, ...]:
 
     if labels is not None:
         return read_labels(labels)
+    allow_named({"model": model})
     loaded = load_model(model)
     if not loaded.named:
         raise InputError(f"model {loaded.name} has {loaded.classes} classes without names; give a file with `labels`")

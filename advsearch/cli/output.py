@@ -150,7 +150,7 @@ def add_code_flag(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="MODULE:NAME",
-        help="Python code that the file names and that may be imported, as it stands there; may be repeated",
+        help="Python code that a file or a run names and that may be imported, as it stands there; may be repeated",
     )
 
 

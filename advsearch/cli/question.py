@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -57,8 +56,8 @@ class QuestionCommand:
         name: of the command; `advsearch.config.CONFIGS` has its settings, and `advsearch.api.carry_out` answers them.
         answer: makes a text for a person of its result; what is shown of it where it has no other.
         short: whether a result falls short of what was checked.
-        about: the setting that names runs, or a file, which the question is about; Python code that the first of them
-            names is imported only if `--code` or `--model` names it too.
+        about: the setting that names runs, or a file, which the question is about; `--code` allows Python code that
+            these name.
         place: how that setting is given without its flag.
         more, examples: as of `Command`.
     """
@@ -92,19 +91,13 @@ class QuestionCommand:
 
     def run(self, args: argparse.Namespace) -> int:
         """Ask what the arguments say. Raises InputError where what it is about is missing."""
-        # late, so that --help answers at once
-        from advsearch.registry import only_named_code
-
         named = getattr(args, self.about, None)
         if self.place and named in (None, []):
             command = f"advsearch {self.name}"
             raise InputError(f"{command}: expected {self.place.expected}; see {command} --help")
         if isinstance(named, list):
             setattr(args, self.about, ",".join(named))
-        file = self.file(args)
-        models = [name.partition("@")[0].strip() for name in getattr(args, "model", "").split(",")]
-        with nullcontext() if file is None else only_named_code(file, [*args.code, *models]):
-            return self.carry_out(self.config(args), as_json=args.json, quiet=args.quiet)
+        return self.carry_out(self.config(args), as_json=args.json, quiet=args.quiet)
 
     def file(self, args: argparse.Namespace) -> Path | None:
         """Return the settings of the first run that the question is about, if it is about one."""

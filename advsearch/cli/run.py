@@ -13,10 +13,11 @@ from advsearch.cli.question import Command
 from advsearch.cli.show import show_run
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.registry import only_named_code
+from advsearch.registry import allow_named
 from advsearch.runs.directory import CONFIG, HOME, find_run, only_here
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.settings import Config, parse_assignment, read_yaml
+from advsearch.settings.values import put
 
 COMMANDS = (
     *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden", "explain"),
@@ -45,8 +46,13 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def changes_in(words: Sequence[str]) -> dict[str, object]:
-    """Return setting to value from ``NAME=VALUE``. Raises InputError where a word is no such assignment."""
-    return dict(parse_assignment(text, f"change {text!r}") for text in words)
+    """Return setting to value from ``NAME=VALUE``, which allows the code that they name. Raises InputError where a word
+    is no such assignment."""
+    changes, typed = dict(parse_assignment(text, f"change {text!r}") for text in words), dict[str, object]()
+    for name, value in changes.items():
+        put(typed, name, value)
+    allow_named(typed)
+    return changes
 
 
 def command_in(file: str | Path) -> str:
@@ -67,11 +73,15 @@ def run_file(
     """Do what a YAML file describes, with `changes` put over it. Raises UnknownNameError where there is no such
     command.
 
-    If the file is a run's own, `resumed` is its folder; `args` has `json`, `quiet` and `code`.
+    If the file is a run's own, `resumed` is its folder; `args` has `json` and `quiet`.
     """
     config = config_of_file(command, file, changes)
-    with only_named_code(file, args.code):
-        return int(main.found(command).carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+    for one in config.left_out:
+        if resumed is None or one.name not in config.free:
+            raise InputError(f"{file}: {one.name}: {one.does}, which a file can't ask for; type {one.ask}")
+        if not args.quiet:
+            print(f"advsearch: {one.name} is left out: it {one.does}; type {one.ask}", file=sys.stderr)
+    return int(main.found(command).carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
 
 
 RUN = Command(_run_arguments, _run)

@@ -18,6 +18,7 @@ from advsearch.cli.question import Command, QuestionCommand
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
+from advsearch.registry import allow_named
 from advsearch.report.phrases import seen_cells, seen_text
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, find_run
@@ -135,6 +136,7 @@ def _show_control(name: str, as_json: bool) -> int:
     with at_work(as_json=True, quiet=False):
         from advsearch.controls import CONTROLS  # takes seconds
 
+    allow_named({"controls": name})
     if name not in CONTROLS:
         raise UnknownNameError("control", name, CONTROLS)
     control = CONTROLS[name]

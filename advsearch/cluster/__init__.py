@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from advsearch.files import JsonObject
+from advsearch.registry import allowed_code
 
 Call = Callable[[Sequence[Any]], Any]
 """What carries out one batch; a pure function of it."""
@@ -18,8 +19,8 @@ Call = Callable[[Sequence[Any]], Any]
 class Work:
     """What batches are of, so that another process can carry them out: ``"package.module:function"``, which takes the
     settings and returns a `Call`; which settings may hold paths, separated by commas, whose files go along; processor
-    threads of a worker; seconds that a batch may take at least (None: by the median); and whether a worker has its next
-    batch `ahead`, not where batches take long."""
+    threads of a worker; seconds that a batch may take at least (None: by the median); whether a worker has its next
+    batch `ahead`, not where batches take long; and the code that a worker may import by its name, as this process."""
 
     function: str
     settings: JsonObject
@@ -27,6 +28,7 @@ class Work:
     threads: int = 1
     seconds: float | None = None
     ahead: bool = True
+    code: tuple[str, ...] = field(default_factory=allowed_code)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster import Call, Work
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
 from advsearch.files import split_paths
+from advsearch.registry import allow_code
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
 _CPU_INFO = Path("/proc/cpuinfo")
@@ -236,6 +237,7 @@ def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
                     (own / KERNELS).mkdir(exist_ok=True)
                     os.environ["DRJIT_CACHE_DIR"] = str(own / KERNELS)
                 this_machine()
+                allow_code(*work.code)
                 _load(key, write_files(work, files, own / INPUTS))
             machine = this_machine()
     except MissingError as error:

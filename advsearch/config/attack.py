@@ -9,7 +9,7 @@ from pydantic import JsonValue, field_validator, model_validator
 
 from advsearch.config.scene import ControlsByName, RenderConfig, SceneConfig, name_in, read_named
 from advsearch.files import JsonObject
-from advsearch.settings import Clash, check_once, parse_assignment, setting, setting_as_in, split_names
+from advsearch.settings import Clash, check_once, parse_assignment, power, setting, setting_as_in, split_names
 from advsearch.settings.configuration import Config
 
 LARGEST_EPSILON = 1e6
@@ -239,7 +239,7 @@ class AttackConfig(DerivativeConfig):
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
         None, "run", "experiment tracker to which every evaluation is sent; its package has to be installed",
-        otherwise="none",
+        otherwise="none", power=power.tracker,
     )
     over: ControlsByName = setting_as_in(
         SceneConfig, "controls", default=dict,
@@ -280,11 +280,11 @@ class AttackConfig(DerivativeConfig):
     workers: int | None = setting(
         None, "run",
         "worker processes; they share the attacks of several objects or models, or the independent renders of one",
-        otherwise="this one alone", unit="processes", ge=1, le=100_000,
+        otherwise="this one alone", unit="processes", ge=1, le=100_000, power=power.many_processes,
     )
     cluster: str | None = setting(
         None, "run", "where the workers are", "the address of a Dask scheduler, local, or a .yaml file",
-        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1,
+        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1, power=power.connection,
     )
     # fmt: on
 

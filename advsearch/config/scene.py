@@ -23,6 +23,7 @@ from advsearch.settings import (
     check_once,
     number_or_text,
     parse_assignment,
+    power,
     setting,
     setting_as_in,
     shown,
@@ -202,10 +203,10 @@ class SceneConfig(Config):
     deterministic: bool = setting(False, "run", "use one thread, so that a run repeats bit for bit; slower")
     run: str | None = setting(
         None, "run", "where the run is stored", "a name (kept in runs/) or the path of a folder",
-        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1,
+        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1, power=power.place,
     )
     # fmt: on
-    overwrite: bool = setting(False, "run", "replace a run that is already there")
+    overwrite: bool = setting(False, "run", "replace a run that is already there", power=power.replacing)
 
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneConfig:
@@ -377,7 +378,7 @@ class RenderConfig(SceneConfig):
     )
     out: str = setting(
         ..., "picture", "the file to write: a .png holds what the model sees, an .exr linear radiance times the gain",
-        "the path of a .png or .exr file",
+        "the path of a .png or .exr file", power=power.file,
     )
     # fmt: on
 

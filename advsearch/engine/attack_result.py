@@ -27,6 +27,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.errors import InputError
+from advsearch.registry import names_code
 from advsearch.report.figures import new_axes, search_axes
 from advsearch.report.marks import marked
 from advsearch.report.markup import answer_html, side_by_side
@@ -93,6 +94,7 @@ class AttackResult:
         """Whether a verified configuration was found."""
         return self.summary.ending == Ending.FOUND.value
 
+    @names_code
     @in_turn()
     def render(
         self,

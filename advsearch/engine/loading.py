@@ -18,6 +18,7 @@ from advsearch.controls import CONTROLS, Control, Space, gathered, make_control,
 from advsearch.errors import InputError
 from advsearch.models.guards import plainly
 from advsearch.options import told
+from advsearch.registry import names_code
 from advsearch.scene import settings
 from advsearch.scene.assembly import Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
@@ -65,6 +66,7 @@ class Scene:
     description: SceneDescription
     only_here: bool = False
 
+    @names_code
     def renderer(
         self,
         controls: Controls,

@@ -19,6 +19,7 @@ import torch
 from torch import nn
 
 from advsearch import files
+from advsearch.registry import OWN_FOLDER
 
 LONGEST = 120
 """Seconds that a file's first passes may take each, and its loading, where that runs a part of it."""
@@ -82,7 +83,9 @@ def try_torchscript(archive: io.BytesIO) -> str:
     """
     command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
     try:
-        done = subprocess.run(command, input=archive.getbuffer(), capture_output=True, timeout=files.scaled(LONGEST))
+        done = subprocess.run(
+            command, input=archive.getbuffer(), capture_output=True, timeout=files.scaled(LONGEST), cwd=OWN_FOLDER
+        )
     except subprocess.TimeoutExpired:
         raise TookTooLong from None
     return f"torch crashed while loading it (signal {-done.returncode})" if done.returncode < 0 else ""

@@ -208,7 +208,7 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     Raises:
         ModelError: it cannot be imported, raises, returns something else, or the weights do not fit.
         UnknownNameError: the module has no such attribute; near matches are named.
-        InputError: it must not be imported (`registry.only_named_code`).
+        InputError: it must not be imported (`registry.check_import`).
     """
     target, weights = split_weights(spec)
     check_import(target)

@@ -16,7 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError,
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.files import JsonObject, split_paths
+from advsearch.settings import power
 from advsearch.settings import values as written
+from advsearch.settings.power import LeftOut, Power
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -40,6 +42,7 @@ def setting(
     metavar: str = "",
     form: Form = "text",
     switched: str = "",
+    power: Power = power.none,
     **constraints: Any,
 ) -> Any:
     """Return a pydantic field.
@@ -56,10 +59,11 @@ def setting(
         metavar: what stands for the value in the help, where that is not the last word of its name.
         form: how it is written on a command line; what is true or false is a switch.
         switched: what the flag does, where that is the opposite of the description.
+        power: says what a value does beyond the run, which only a person may ask for (`settings.power`).
         constraints: as of `pydantic.Field`.
     """
     notes: JsonObject = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise, "flag": flag}
-    notes |= {"metavar": metavar, "form": form, "switched": switched}
+    notes |= {"metavar": metavar, "form": form, "switched": switched, "power": power}
     declared: Any = {"default": default, "description": description, **notes, **constraints}
     alias = constraints.pop("alias", None)
     make = {"default_factory": default} if callable(default) else {"default": default}
@@ -100,6 +104,7 @@ class Setting:
         metavar: what stands for its value in the help.
         form: how it is written on a command line.
         switched: what its flag does, where that is the opposite of the description; may be empty.
+        power: says what a value does beyond the run.
     """
 
     field: str
@@ -115,6 +120,7 @@ class Setting:
     metavar: str
     form: Form
     switched: str
+    power: Power
 
     @property
     def text(self) -> str:
@@ -150,6 +156,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 metavar=notes["metavar"] or field.rpartition("_")[2].upper(),
                 form="switch" if info.annotation is bool else notes["form"],
                 switched=notes["switched"],
+                power=notes["power"],
             )
         )
     return tuple(declared)
@@ -242,6 +249,7 @@ class Config(BaseModel):
     """Settings that decide no number, so that they may be changed before a run goes on."""
 
     _only_here: tuple[str, ...] = PrivateAttr(())
+    _left_out: tuple[LeftOut, ...] = PrivateAttr(())
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
@@ -287,10 +295,13 @@ class Config(BaseModel):
     def from_yaml(cls, path: str | Path, overrides: Mapping[str, object] | None = None) -> Self:
         """Return the configuration that the YAML file at `path` describes, with `overrides` put over it.
 
+        What the file alone asks for and has power over more than the run is `left_out`, as if it did not stand there.
+
         Args:
             path: a file with one mapping from settings to values; `schema`, `command` and `base` may stand beside
                 them (see `read_yaml`).
-            overrides: setting to value; a dotted name reaches inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
+            overrides: setting to value, which a person has asked for; a dotted name reaches inside:
+                ``set.camera.azimuth``, ``controls.pose.yaw``.
 
         Raises:
             FileFormatError: the file is missing, empty or not such a mapping.
@@ -301,9 +312,41 @@ class Config(BaseModel):
         for name, value in (overrides or {}).items():
             written.put(data, name, value)
         try:
-            return cls(**data)
+            left = [one for one in cls(**data).powers if one.name not in (overrides or {})]
+            without = [name for one in left for name in (one.name, one.field)]
+            made = cls(**{name: value for name, value in data.items() if name not in without})
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
+        made._left_out = tuple(left)
+        return made
+
+    @property
+    def powers(self) -> tuple[LeftOut, ...]:
+        """The settings that have power over more than the run."""
+        given = ((one, getattr(self, one.field)) for one in settings(type(self)))
+        return tuple(
+            LeftOut(one.name, one.field, value, does, one.default) for one, value in given if (does := one.power(value))
+        )
+
+    @property
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """What the file that it was read from asked for in vain."""
+        return self._left_out
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The settings that may have such power and decide no number, by name: a part of a run has them from this
+        sitting, not from its own file."""
+        return {
+            one.name: getattr(self, one.field)
+            for one in settings(type(self))
+            if one.power is not power.none and one.name in self.free and one.name not in PLACE
+        }
+
+    def check_powers(self, where: str) -> None:
+        """Refuse, by an InputError, settings with power over more than the run: `where` is a file that has them."""
+        for one in self.powers:
+            raise InputError(f"{where}: {one.name}: {one.does}, which such a file can't ask for; leave it out")
 
     @classmethod
     def of_this_version(cls, given: Mapping[str, Any]) -> dict[str, Any]:

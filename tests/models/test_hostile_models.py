@@ -17,9 +17,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from advsearch import load_model
 from advsearch.errors import FileFormatError
 from advsearch.models import exported as reader
-from advsearch.models import load_model
 
 Program = dict[str, Any]
 

@@ -21,6 +21,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from advsearch import load_model
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.models import (
     LabelSet,
@@ -28,7 +29,6 @@ from advsearch.models import (
     ModelWarning,
     Preprocessing,
     find_label_set,
-    load_model,
     read_labels,
     reference,
 )

@@ -9,7 +9,7 @@ from pydantic import field_validator
 
 from advsearch.config.attack import AttackConfig, DerivativeConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
+from advsearch.settings import Clash, check_once, power, setting, setting_as_in, split_names
 
 QUANTITIES = ("image", "gradient", "objective")
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
@@ -83,6 +83,7 @@ class PrecisionConfig(DerivativeConfig):
         "where the figures and the numbers go, instead of a run directory",
         "the path of a folder",
         otherwise="a run directory",
+        power=power.file,
         min_length=1,
     )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from advsearch.cli import output
 from advsearch.cli.question import Positional, QuestionCommand
@@ -22,17 +21,11 @@ LIST = "list"
 
 
 class _Recipe(QuestionCommand):
-    """The command, which can list the recipes too, and takes a file of one."""
+    """The command, which can list the recipes too."""
 
     def run(self, args: argparse.Namespace) -> int:
         """Carry out the recipe and print what it says, or list the recipes."""
         return _listed(args.json) if getattr(args, "recipe", None) == LIST else super().run(args)
-
-    def file(self, args: argparse.Namespace) -> Path | None:
-        """Return the recipe if it is a file."""
-        from advsearch.questions.recipe.description import is_file_name  # it brings torch, which takes a second
-
-        return Path(args.recipe) if is_file_name(args.recipe) else None
 
 
 def _listed(as_json: bool) -> int:

@@ -29,6 +29,7 @@ from advsearch.questions.recipe.description import (
     PlannedRun,
     Recipe,
     check_figures,
+    check_powers,
     compute,
     draw_figure,
     made_of,
@@ -103,11 +104,13 @@ def recipe_from_config(
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
     described = None if resumed is not None and _noted(resumed) else read_recipe(config.recipe)
     if described is not None:
+        check_powers(described, config)
         _check(described, config)
         check_figures(described, _check_runs(planned(described, config)), config.recipe)
     with RunDirectory.of(config, resumed) as run:
         if described is None:
             described = recipe_of(run.store.noted(NOTE) or {}, f"{run.path}: the recipe that it began with")
+            check_powers(described, config)
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
         notes: list[str] = []
         results = _carried_out(planned(described, config), run, progress or NullProgress(), notes)

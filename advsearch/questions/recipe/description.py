@@ -279,6 +279,14 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     return runs
 
 
+def check_powers(recipe: Recipe, config: RecipeConfig) -> None:
+    """Refuse, by an InputError, a part that would do more than its run: connect, or start more processes than there are
+    processors. A bundled recipe may."""
+    if is_file_name(config.recipe) or recipe != read_recipe(config.recipe):
+        for one in planned(recipe, config):
+            one.config.check_powers(f"{config.recipe}: parts: {one.part}")
+
+
 def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """Return the recipe as it was asked for: quick or not, with the objects, environments and models of `config`."""
     chosen = recipe.made_quick() if config.quick else recipe

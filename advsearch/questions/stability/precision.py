@@ -24,6 +24,7 @@ from advsearch.attacks.evaluation import one_thread
 from advsearch.engine.gradients import smooth_loss
 from advsearch.models import load_model
 from advsearch.questions.stability.scene import SIZE, CaseGroup, Check, ControlSettings, Outcome, Toy, holds, small
+from advsearch.registry import OWN_FOLDER
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.formation import to_8_bit
@@ -263,6 +264,7 @@ def threads_under_a_scene() -> Outcome:
 
 def _in_a_process(code: str) -> tuple[int, str]:
     """Run Python code in a process of its own; return its exit status and the last line of its errors."""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120, cwd=OWN_FOLDER)
     lines = done.stderr.strip().splitlines()
     return done.returncode, lines[-1][:80] if done.returncode and lines else ""

@@ -337,7 +337,7 @@ def _stopped(config: SweepConfig) -> Path | None:
         return None
     path = run_path(config.run)
     recipe = path / CONFIG
-    same = recipe.is_file() and SweepConfig.from_yaml(recipe).plain() == config.to_repeat().plain()
+    same = recipe.is_file() and SweepConfig.from_yaml(recipe, config.asked).plain() == config.to_repeat().plain()
     return path if same and not finished(path) else None
 
 

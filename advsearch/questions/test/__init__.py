@@ -11,8 +11,6 @@ from advsearch.cli.question import Positional, QuestionCommand
 from advsearch.errors import InputError
 
 if TYPE_CHECKING:
-    import argparse
-
     from advsearch.questions.test.answer import SuiteResult
     from advsearch.settings import Config
 
@@ -28,10 +26,6 @@ EXAMPLES = (
 
 class _Test(QuestionCommand):
     """The command: its exit status is the suite's answer, and machines get their files."""
-
-    def file(self, args: argparse.Namespace) -> Path | None:
-        """Return the suite, whose Python code is imported only if it is named."""
-        return Path(args.suite)
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Try the claims, print their answers, write the files, and return the exit status."""

@@ -86,6 +86,8 @@ def test_from_config(
     added = None if config.add is None else add(config.suite, config.add)
     try:
         planned = _planned(described, config, added)
+        for one in planned if described is not suite else ():
+            one.config.check_powers(f"claims.{one.name}.settings")
         _check(planned, described)
     except InputError as error:
         if added is not None:

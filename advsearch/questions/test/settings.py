@@ -15,7 +15,18 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, resembling
-from advsearch.settings import Clash, Config, each_once, read_yaml, setting, setting_as_in, shown, split_names, texts
+from advsearch.settings import (
+    Clash,
+    Config,
+    each_once,
+    power,
+    read_yaml,
+    setting,
+    setting_as_in,
+    shown,
+    split_names,
+    texts,
+)
 from advsearch.settings.configuration import PLACE
 
 
@@ -53,8 +64,11 @@ class SuiteConfig(Config):
         "keep the answer of this run as a counterexample beside the suite, and try it",
         "the name or the folder of a run of attack",
         otherwise="nothing is added",
+        power=power.beside_suite,
     )
-    update: bool = setting(False, "test", "expect from now on what the claims say today, and show what changes")
+    update: bool = setting(
+        False, "test", "expect from now on what the claims say today, and show what changes", power=power.beside_suite
+    )
     all: bool = setting(False, "test", "go on with the other claims where a counterexample fails")
     fresh: bool = setting(False, "test", "draw a new seed, which is told, in place of the suite's")
     seconds: float | None = setting(
@@ -68,13 +82,18 @@ class SuiteConfig(Config):
     )
     model: str | None = setting_as_in(SceneConfig, "model", default=None, otherwise="what the suite says, or reference")
     junit: str | None = setting(
-        None, "files", "write JUnit XML, a test case for each claim", "a file", otherwise="none"
+        None, "files", "write JUnit XML, a test case for each claim", "a file", otherwise="none", power=power.file
     )
     sarif: str | None = setting(
-        None, "files", "write SARIF 2.1.0, a result for each claim that is not held", "a file", otherwise="none"
+        None,
+        "files",
+        "write SARIF 2.1.0, a result for each claim that is not held",
+        "a file",
+        otherwise="none",
+        power=power.file,
     )
     markdown: str | None = setting(
-        None, "files", "write a Markdown table, for the summary of a job", "a file", otherwise="none"
+        None, "files", "write a Markdown table, for the summary of a job", "a file", otherwise="none", power=power.file
     )
     seed: int | None = setting_as_in(SceneConfig, "seed", default=None, otherwise="what the suite says, or 0")
     threads: int | None = setting_as_in(SceneConfig, "threads")

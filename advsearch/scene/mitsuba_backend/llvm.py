@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError, EnvironmentSetupError
+from advsearch.registry import OWN_FOLDER
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MINIMUM = 17
@@ -263,9 +264,9 @@ def own_elf_header() -> bytes:
 
 def asked_version(library: str) -> Version:
     """Load a library in another process, which a bad one may take down, and ask for its version; () if it has none."""
-    command = [sys.executable, "-c", _PROBE, library]
+    command = [sys.executable, "-c", _PROBE, os.path.abspath(library) if os.sep in library else library]
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True).stdout
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True, cwd=OWN_FOLDER).stdout
         return tuple(int(part) for part in answer.split())
     except (OSError, subprocess.SubprocessError, ValueError):
         return ()

@@ -201,6 +201,7 @@ def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_p
     tested: tuple[SuiteResult, Path], tmp_path: Path
 ) -> None:
     assert next(one for one in tested[0].claims if one.name == "in-front").answer == "held"
+    advsearch.allow_code("test_suites:planted")
     config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front", model="test_suites:planted")
     (one,) = carry_out(config.model_copy(update={"run": str(tmp_path / "run")})).claims
     assert one.answer == "failed" and "most wrong where it says vase: light." in one.reason
@@ -240,6 +241,7 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
 
 def test_an_answer_that_does_not_hold_for_the_suite_s_model_is_not_kept(attacked: Path, tmp_path: Path) -> None:
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
+    advsearch.allow_code("test_suites:always")
     always = {"object": "mug", "model": "test_suites:always", **SMALL}
     Path(suite).write_text(yaml.safe_dump({"settings": always, "claims": {"too-few": CLAIMS["too-few"]}}))
     with pytest.raises(AdvsearchError, match="is not kept: right in 6 of 6 trials"):
