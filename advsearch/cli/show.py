@@ -229,7 +229,7 @@ def best_pictures(run: Path) -> list[Path]:
     files = [folder / f"{name}.png" for name in FIRST]
     if not all(one.is_file() for one in files):
         files = sorted(folder.glob("*.png"))[:1]
-    return [one for one in files if not one.is_symlink()]
+    return files
 
 
 def show_pictures(files: Sequence[Path]) -> None:

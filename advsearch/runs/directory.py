@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import os
@@ -35,6 +36,8 @@ COLUMNS = "columns.bin"
 """Of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)."""
 
 IMAGES = "images"
+SMALL_PICTURES = f"{IMAGES}/rows"
+"""Of a sweep, in folders of a thousand."""
 ARTIFACTS = "artifacts"
 OBJECT_FILE = f"{ARTIFACTS}/object.glb"
 """What was attacked, before and after, to turn in a browser."""
@@ -149,7 +152,7 @@ class RunDirectory:
         """Open and lock the directory of a run, to go on with it by `config`, if anything goes on; an InputError says
         if another process works on it, or it would give other numbers than the run began with."""
         path = find_run(run)
-        _check_links(path)
+        check_links(path)
         held = files.RunLock(path)
         try:
             opened = cls(path, held)
@@ -321,11 +324,33 @@ def default_name(object_name: str, controls: Iterable[str]) -> str:
     return re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")[:80] or "attack"
 
 
-def _check_links(path: Path) -> None:
-    """Check that what a run writes to is its own: a folder that somebody else made may link to any file."""
-    links = [name for name in (*CONTENTS, files.NAME) if name != CONFIG and (path / name).is_symlink()]
-    if links:
-        raise FileFormatError(f"{path / links[0]}: expected a file or a folder of this run, got a link; remove it")
+def check_links(run: Path) -> None:
+    """Check that what a run's folder has is its own: one that somebody else made may link to any file, which would be
+    shown, copied or overwritten. The folder itself may be reached by a link.
+
+    Small pictures, of which there may be a million, are checked as each is read (`viewer.thumbnails`).
+
+    Raises:
+        FileFormatError: there is a link in it, or a pipe or the like.
+    """
+    folders = [str(run)]
+    while folders:
+        folder = folders.pop()
+        try:
+            with os.scandir(folder) as found:
+                inside = [one for one in found if folder != str(run) or one.name in (*CONTENTS, files.NAME)]
+        except OSError as error:
+            if error.errno == errno.ENOENT:  # it was removed meanwhile
+                continue
+            raise FileFormatError(f"{folder}: expected a folder of a run, got {error.strerror}") from None
+        for one in inside:
+            if one.is_symlink():
+                raise FileFormatError(f"{one.path}: expected a file or a folder of this run, got a link; remove it")
+            if one.is_dir(follow_symlinks=False):
+                if not folder.endswith(SMALL_PICTURES):
+                    folders.append(one.path)
+            elif not one.is_file(follow_symlinks=False) and one.name != files.NAME:
+                raise FileFormatError(f"{one.path}: expected a file of this run, got a pipe or the like; remove it")
 
 
 def run_path(run: str | Path) -> Path:
@@ -342,10 +367,16 @@ def typed_name(path: str | Path) -> str:
 
 
 def find_run(run: str | Path) -> Path:
-    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml)."""
+    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml).
+
+    Raises:
+        UnknownNameError: there is no such run.
+        FileFormatError: it has links in it (`check_links`).
+    """
     for path in (Path(run).expanduser(), run_path(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):
+            check_links(folder)
             return folder
     known = (path.name for path in HOME.glob("*") if is_run(path))
     raise UnknownNameError("run", str(run), known, "Give a name in runs/ or the path of a run's folder.")
@@ -365,6 +396,8 @@ def is_run(path: Path) -> bool:
     if files.is_results_database(path / store.NAME):
         return True
 
+    if (path / CONFIG).is_symlink():
+        return False
     try:
         with open_regular(path / CONFIG, "a run.yaml", LARGEST) as file:
             return file.read(len(HEADER)) == HEADER.encode()

@@ -251,7 +251,9 @@ MIGRATIONS = (
 
 
 def is_results_database(path: Path) -> bool:
-    """Return whether the file at `path` starts like a results.sqlite of advsearch."""
+    """Return whether the file at `path` starts like a results.sqlite of advsearch; a link does not."""
+    if path.is_symlink():
+        return False
     try:
         with open_regular(path, "a results.sqlite", LARGEST) as file:
             header = file.read(72)

@@ -10,7 +10,6 @@ import time
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
-from urllib.parse import quote
 
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
@@ -19,7 +18,7 @@ from advsearch.runs.directory import PARTS, REPORT
 from advsearch.runs.listing import Listed
 from advsearch.runs.results.base import plain
 from advsearch.runs.store import Row
-from advsearch.viewer.document import data_script, data_url, document, scrolled
+from advsearch.viewer.document import data_script, data_url, document, in_address, scrolled
 from advsearch.viewer.thumbnails import thumbnail
 
 
@@ -40,7 +39,7 @@ def list_page(runs: Mapping[str, Path]) -> str:
 
 
 def _line(name: str, one: Listed, *, comparable: bool) -> Html:
-    place, sweep = f"runs/{quote(name, safe='')}/", one.command == "sweep"
+    place, sweep = f"runs/{in_address(name)}/", one.command == "sweep"
     box = element("input", type="checkbox", name="run", value=name, aria_label=f"compare {name}") if sweep else None
     picture = element("img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72")
     about = ", ".join(filter(None, (one.command, wording.short_names(one.object), " and ".join(one.controls))))
@@ -125,13 +124,11 @@ def _told(row: Row) -> dict[str, object]:
 
 def _parts(run: Path) -> Html | None:
     """The attacks of a study that have ended, each with its page."""
-    names = [path.name for path in sorted((run / PARTS).glob("*")) if path.is_dir() and not path.is_symlink()]
+    names = [path.name for path in sorted((run / PARTS).glob("*")) if path.is_dir()]
     if not names:
         return None
     lines = []
     for name in names:
         done = (run / PARTS / name / REPORT).is_file()
-        lines.append(
-            element("li", element("a", name, href=f"{PARTS}/{quote(name, safe='')}/{REPORT}") if done else name)
-        )
+        lines.append(element("li", element("a", name, href=f"{PARTS}/{in_address(name)}/{REPORT}") if done else name))
     return element("div", element("h2", "Its attacks"), element("ul", *lines))

@@ -8,8 +8,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -33,6 +34,15 @@ _OF_A_FILE = re.compile(
 LONG = 32
 """Letters of a cell above which its text is broken into lines."""
 
+SCRIPTS = (
+    ("sweep.js",),
+    ("make.js", "follow.js"),
+    ("make.js", "align.js"),
+    ("make.js", "attack.js"),
+    ("make.js", "attack.js", "object.js"),
+)
+"""Files of the viewer that run together in a page. There are no other scripts, and the server allows none."""
+
 
 def document(
     title: str,
@@ -48,19 +58,16 @@ def document(
         title: of the window.
         body: what stands in it, before the footer.
         data: scripts that hold what the script reads.
-        scripts: files of the viewer that run in it, one after the other.
+        scripts: files of the viewer that run in it, one after the other: one of `SCRIPTS`.
         connects: whether it asks its server for rows and pictures; else it cannot ask anybody.
         footer: a sentence at its end.
     """
-    code = "\n".join(map(asset, scripts))
-    images, connect = ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
-    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
-    runs = f"; script-src 'sha256-{digest}'" if code else ""
-    policy = f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'{runs}{connect}"
+    code = _code(tuple(scripts))
+    policy = _policy([_digest(code.encode())] if code else [], connects=connects)
     head = element(
         "head",
         element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=policy + "; base-uri 'none'; form-action 'self'"),
+        element("meta", http_equiv="Content-Security-Policy", content=f"{policy}; form-action 'self'"),
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", name="color-scheme", content="light dark"),
         element("title", f"{title} - advsearch"),
@@ -71,6 +78,55 @@ def document(
     shown = Html(re.sub(r"(\d) %", r"\1&nbsp;%", join_html(*body, end)) + join_html(*data))
     page = element("html", head, element("body", shown, element("script", Html(code)) if code else None), lang="en")
     return f"<!doctype html>\n{page}\n"
+
+
+def _code(scripts: tuple[str, ...]) -> str:
+    if scripts and scripts not in SCRIPTS:
+        raise ValueError(f"scripts: expected one of SCRIPTS, got {scripts}; name it there")
+    return "\n".join(map(asset, scripts))
+
+
+def _digest(code: bytes) -> str:
+    return base64.b64encode(hashlib.sha256(code).digest()).decode()
+
+
+@cache
+def _own_digests() -> frozenset[str]:
+    return frozenset(_digest(_code(scripts).encode()) for scripts in SCRIPTS)
+
+
+def has_other_scripts(page: bytes) -> bool:
+    """Whether a page has a script that is none of `SCRIPTS`, such as that of another version, and so will not run where
+    `served_policy` holds."""
+    found = re.findall(rb"<script(?! type=\"application/)[^>]*>(.*?)</script", page, re.DOTALL | re.IGNORECASE)
+    return any(_digest(code) not in _own_digests() for code in found)
+
+
+def _policy(digests: Iterable[str], *, connects: bool) -> str:
+    """What a page may load and run; `digests` are those of its scripts."""
+    images, connect = ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
+    runs = "".join(f" 'sha256-{one}'" for one in sorted(digests))
+    scripts = f"; script-src{runs}" if runs else ""
+    return f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'{scripts}{connect}; base-uri 'none'"
+
+
+@cache
+def served_policy(*, own: bool) -> str:
+    """Return the `Content-Security-Policy` that a server sends.
+
+    Args:
+        own: with a page that it has made itself: this may ask its server for more. All else lies in the folder of a
+            run, which may be somebody else's: it gets an origin of its own, so that it can read and send nothing, and
+            runs no script but those of `SCRIPTS`.
+    """
+    sandbox = "form-action 'none'; sandbox allow-scripts allow-popups allow-popups-to-escape-sandbox"
+    closed = "form-action 'self'" if own else sandbox
+    return f"{_policy(_own_digests(), connects=own)}; frame-ancestors 'none'; {closed}"
+
+
+def in_address(name: str) -> str:
+    """Return a name of a file, which may be no text, as a part of an address."""
+    return quote(os.fsencode(name), safe="")
 
 
 def data_script(value: object, name: str) -> Html:
@@ -163,7 +219,7 @@ def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
     for part in parts:
         name = "" if part is None else Path(part).name
         there = name and (run / PARTS / name / REPORT).is_file()
-        found.append(f"{PARTS}/{quote(name, safe='')}/{REPORT}" if there else "")
+        found.append(f"{PARTS}/{in_address(name)}/{REPORT}" if there else "")
     return found
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import json
-import shutil
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -25,8 +24,8 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer import document
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, write_sweep_page
-from advsearch.viewer.thumbnails import kept_pictures, path_of
+from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, whole_page, write_sweep_page
+from advsearch.viewer.thumbnails import kept_pictures, path_of, read_thumbnail
 
 Answer = TypeVar("Answer", bound=Result)
 
@@ -82,10 +81,17 @@ def write_page(run: Path, result: Result) -> Path:
     the run are damaged, StorageError where the page cannot be written."""
     if isinstance(result, SweepSummary):
         return write_sweep_page(run, result)
+    return write_text(run / REPORT, page_of(run, result), durable=False)
+
+
+def page_of(run: Path, result: Result) -> str:
+    """Return the page of a run, which needs no other file but those of its parts. Raises FileFormatError where other
+    results of the run are damaged."""
+    if isinstance(result, SweepSummary):
+        return whole_page(run, result, read_columns(run))
     own = rooms.in_room(result.command, "page", "page")
     made = own(run, result) if own else None
-    text = made or shown_page(run, result, shown(result))
-    return write_text(run / REPORT, text, durable=False)
+    return made or shown_page(run, result, shown(result))
 
 
 def keep_answer(run: RunDirectory, result: Answer) -> Answer:
@@ -118,8 +124,8 @@ def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
 
 def kept(run: Path, name: str | Path) -> Path | None:
     """Return the file of a picture in the folder of a run; None where it is missing, elsewhere or too large."""
-    file = (run / name).resolve()
-    inside = file.is_relative_to(run.resolve()) and file.is_file() and not (run / name).is_symlink()
+    file = run / name
+    inside = file.resolve().is_relative_to(run.resolve()) and file.is_file()  # a summary may name any
     return file if inside and file.stat().st_size <= LARGEST_FIGURE else None
 
 
@@ -208,12 +214,10 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
     with placed_by("bundle"):
         if len(results) == 1 and not sweeps:
-            run = runs[0]
-            for part in sorted((run / PARTS).glob(f"*/{REPORT}")):
-                if part.is_symlink() or part.parent.is_symlink() or not part.is_file():
-                    continue
-                write_bytes(folder / part.relative_to(run), part.read_bytes())
-            return write_bytes(folder / INDEX, renewed(run).read_bytes())
+            run, result = results[0]
+            for page in sorted((run / PARTS).glob(f"*/{REPORT}")):  # made anew: what lies there may be anybody's
+                write_text(folder / page.relative_to(run), page_of(page.parent, read_result(page.parent)))
+            return write_text(folder / INDEX, page_of(run, result))
         if len(sweeps) < len(results):
             raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
         sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
@@ -226,8 +230,6 @@ def _copied(run: Path, folder: Path, number: int) -> SweepSource:
     write_bytes(folder / rows, read_columns(run).packed())
     kept = kept_pictures(run)
     for one in kept.numbers if kept else ():
-        source = path_of(run, one)
-        target = folder / pictures / source.parent.name / source.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, target)
+        place = path_of(folder / pictures, one)
+        write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, one))
     return SweepSource(run.name, rows, pictures=kept, folder=pictures)

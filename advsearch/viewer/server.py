@@ -1,96 +1,43 @@
 """`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
 
 It answers GET and HEAD of the list, of a run's page, rows and pictures, POST of a photograph, and nothing else. No part
-of an address becomes a path. A request whose `Host` is not this server's is refused (DNS rebinding); so is one that
-another origin's page sends. Beyond this machine every request needs the token, and goes over HTTPS, with a certificate
-that `openssl` makes and that is good for as long as the server runs. A photograph needs the key of this server's page.
+of an address becomes a path but a name in `runs/`. A request whose `Host` is not this server's is refused (DNS
+rebinding); so is one that another origin's page sends. Beyond this machine every request needs the token, and goes over
+HTTPS, with a certificate that `openssl` makes and that is good for as long as the server runs.
+
+What lies in a run's folder is taken for somebody else's: it is served with a policy that gives it an origin of its own
+and lets no script run but those of this package. A photograph needs the key that only the run's own page for it has.
 """
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 import ipaddress
+import os
 import re
 import secrets
-import socket
 import ssl
-import subprocess
-import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from queue import Queue
-from typing import Any
-from urllib.parse import parse_qs, quote, unquote, urlsplit
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, unquote, urlsplit
 
 from advsearch import rooms
 from advsearch.errors import AdvsearchError, InputError
-from advsearch.files import open_regular
-from advsearch.report.markup import element
+from advsearch.files import read_bytes
+from advsearch.report.markup import element, join_html
 from advsearch.runs import files, listing
-from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
+from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
+from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, https_context, is_address, reachable
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.dashboard import START, following_page, is_under_way, list_page, progress_json
+from advsearch.viewer.document import has_other_scripts, in_address, served_policy
 from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
-from advsearch.viewer.thumbnails import cover, kept_pictures, path_of
-
-DAYS = 7
-"""For which a certificate is good."""
-
-
-def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
-    """Return what speaks HTTPS under some names and addresses, and the SHA-256 fingerprint of its new certificate.
-    Raises InputError where there is no `openssl`, or it makes none."""
-    names = ",".join(f"IP:{host}" if is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
-    with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
-        key, certificate = Path(folder) / "key.pem", Path(folder) / "certificate.pem"
-        key.touch(mode=0o600)
-        command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
-        command += ["-keyout", str(key), "-out", str(certificate), "-days", str(DAYS), "-subj", "/CN=advsearch"]
-        command += ["-addext", f"subjectAltName={names}", "-addext", "extendedKeyUsage=serverAuth"]
-        try:
-            subprocess.run(command, check=True, capture_output=True, timeout=30.0, stdin=subprocess.DEVNULL)
-        except FileNotFoundError:
-            raise InputError(
-                "https: needs the program openssl, which makes the certificate; apt-get install openssl, or leave "
-                "`host` and `https` out"
-            ) from None
-        except (OSError, subprocess.SubprocessError) as error:
-            text = (getattr(error, "stderr", None) or b"").decode(errors="replace")[-300:]
-            raise InputError(f"https: openssl made no certificate: {text or error}") from None
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.minimum_version = ssl.TLSVersion.TLSv1_2
-        context.load_cert_chain(certificate, key)
-        data = ssl.PEM_cert_to_DER_cert(certificate.read_text(encoding="ascii"))
-    digest = hashlib.sha256(data).hexdigest().upper()
-    return context, ":".join(digest[place : place + 2] for place in range(0, len(digest), 2))
-
-
-def reachable(host: str) -> str:
-    """Return the address under which others reach what listens at `host`: of any address, the one that leads out."""
-    if host not in ("0.0.0.0", "::", ""):
-        return host
-    family, far = (socket.AF_INET6, "2001:db8::1") if host == "::" else (socket.AF_INET, "192.0.2.1")
-    try:
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect((far, 9))  # chooses an address; nothing is sent
-            return str(probe.getsockname()[0])
-    except OSError:
-        return "::1" if host == "::" else "127.0.0.1"
-
-
-def is_address(host: str) -> bool:
-    """Whether a host is a number and no name."""
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
+from advsearch.viewer.thumbnails import cover, kept_pictures, read_thumbnail
 
 
 class Refused(Exception):
@@ -106,20 +53,16 @@ LOOPBACK = "127.0.0.1"
 FIRST_PART, PART = 4_000, 50_000
 """Rows of a sweep that goes on that are sent at once; reading more takes longer than somebody waits for the first."""
 
-LARGEST = 1 << 30
-"""Most bytes of a sweep's columns."""
+LARGEST, LARGEST_PAGE = 1 << 30, 1 << 28
+"""Most bytes of a sweep's columns, and of a page that lies in a run."""
 
-WORKERS = 16
-"""Requests that are answered at once; others wait."""
+SENDING = 60.0
+"""Seconds in which a photograph has to have come."""
 
-WAITING = 128
-"""Connections that may wait for a worker; as many more as `BACKLOG` wait in the operating system, without a file open
-here."""
+FAULT = "this page could not be made, which is a fault of advsearch"
 
 BACKLOG = 4096
-
-PATIENCE = 20.0
-"""Seconds after which a connection that sends or takes nothing is closed."""
+"""Connections that may wait in the operating system."""
 
 LONGEST = 4096
 """Characters of an address."""
@@ -139,7 +82,6 @@ class Dashboard(HTTPServer):
 
     Attributes:
         token: what every request has to bring; None on this machine only.
-        key: what a photograph has to bring besides.
         fingerprint: SHA-256 of the certificate; None without HTTPS.
         photographs: as given.
 
@@ -159,22 +101,29 @@ class Dashboard(HTTPServer):
         https: bool = False,
         photographs: object | None = None,
     ) -> None:
-        self._given = tuple(runs)
+        self._given: dict[str, Path] = {}
+        for path in runs:
+            name, number = path.resolve().name, 2
+            while name in self._given:
+                name, number = f"{path.resolve().name} ({number})", number + 1
+            self._given[name] = path
         here = host == "localhost" or (is_address(host) and ipaddress.ip_address(host).is_loopback)
         self.token = None if here else secrets.token_urlsafe(24)
-        self.key, self.photographs = secrets.token_urlsafe(24), photographs
+        self._secret, self.photographs = secrets.token_bytes(32), photographs
+        self._listing = threading.Lock()
         self._host, self.fingerprint = host, None
         self._context: ssl.SSLContext | None = None
         if https or self.token:
             names = (reachable(host), "localhost", LOOPBACK)
             self._context, self.fingerprint = https_context(names)
-        self._waiting: Queue[tuple[socket.socket, Any] | None] = Queue(WAITING)
+        super().__init__((host, port), _Handler, bind_and_activate=False)
+        self.clients = Clients(self.socket, self.finish_request, self._context)
         try:
-            super().__init__((host, port), _Handler)
+            self.server_bind()
+            self.server_activate()
         except (OSError, OverflowError) as error:
+            self.server_close()
             raise InputError(f"host and port: cannot listen at {host}:{port}: {error}") from None
-        for _ in range(WORKERS):
-            threading.Thread(target=self._work, daemon=True).start()
 
     @property
     def scheme(self) -> str:
@@ -194,37 +143,53 @@ class Dashboard(HTTPServer):
 
     def runs(self) -> Mapping[str, Path]:
         """The runs that are shown, by the name under which they are."""
-        folders = self._given or tuple(path for path in sorted(HOME.glob("*")) if path.is_dir() and is_run(path))
-        names: dict[str, Path] = {}
-        for path in folders:
-            name, number = path.resolve().name, 2
-            while name in names:
-                name, number = f"{path.resolve().name} ({number})", number + 1
-            names[name] = path
-        return names
+        found = (path for path in sorted(HOME.glob("*")) if path.is_dir() and is_run(path))
+        return self._given or {path.name: path for path in found}
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Let a worker answer."""
-        self._waiting.put((request, client_address))
+    def run(self, name: str) -> Path:
+        """Return the folder of one of them.
 
-    def _work(self) -> None:
-        while (job := self._waiting.get()) is not None:
-            request, client = job
-            try:
-                request.settimeout(PATIENCE)
-                if self._context is not None:
-                    request = self._context.wrap_socket(request, server_side=True)
-                self.finish_request(request, client)
-            except Exception:
-                continue  # whatever one client does, the others are answered
-            finally:
-                self.shutdown_request(request)
+        Raises:
+            Refused: there is none of that name.
+            FileFormatError: it has links in it.
+        """
+        path = self._given.get(name)
+        if not self._given and name not in ("", ".", "..") and not set("/\0") & set(name) and is_run(HOME / name):
+            path = HOME / name
+        if path is None:
+            raise Refused(HTTPStatus.NOT_FOUND, "there is no such run")
+        check_links(path)
+        return path
+
+    def key(self, name: str) -> str:
+        """What a photograph of a run has to bring: its page has it, and no other."""
+        return hmac.new(self._secret, os.fsencode(name), "sha256").hexdigest()
+
+    def list_page(self) -> str:
+        with self._listing:  # one reads, the others find what it has read
+            return list_page(self.runs())
+
+    def serve_forever(self, poll_interval: float = TICK) -> None:
+        """Answer until `shutdown`."""
+        self.clients.serve()
+
+    def shutdown(self) -> None:
+        """Let `serve_forever` and its workers end."""
+        self.clients.close()
 
     def server_close(self) -> None:
-        """Stop listening and let the workers go."""
+        """Stop listening."""
+        self.clients.close()
         super().server_close()
-        for _ in range(WORKERS):
-            self._waiting.put(None)
+
+
+class Served(NamedTuple):
+    """What is answered: its media type and bytes, and under which policy. Whatever comes out of a run's folder may be
+    somebody else's, so that policy is the usual one."""
+
+    kind: str
+    data: bytes
+    policy: str = served_policy(own=False)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -246,20 +211,24 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, *, body: bool) -> None:
         headers: dict[str, str] = {}
+        status = HTTPStatus.OK
+        self.server.clients.wait_for(None)
         try:
             self._check()
-            kind, data, headers = self._found(_POSTED if self.command == "POST" else _ROUTES)
-            status = HTTPStatus.OK
+            found, headers = self._found(_POSTED if self.command == "POST" else _ROUTES)
         except Refused as refused:
-            status, kind, data = refused.status, "text/plain; charset=utf-8", f"{refused}\n".encode()
+            status, found = refused.status, _text(str(refused))
         except AdvsearchError as error:
-            status, kind, data = HTTPStatus.INTERNAL_SERVER_ERROR, "text/plain; charset=utf-8", f"{error}\n".encode()
+            status, found = HTTPStatus.INTERNAL_SERVER_ERROR, _text(str(error))
         except OSError:
-            status, kind, data = HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"it is not there any more\n"
+            status, found = HTTPStatus.NOT_FOUND, _text("it is not there any more")
+        except Exception as error:  # one page must not take others along
+            status, found = HTTPStatus.INTERNAL_SERVER_ERROR, _text(f"{FAULT}: {type(error).__name__}")
         self.send_response(status)
         for name, value in {
-            "Content-Type": kind,
-            "Content-Length": str(len(data)),
+            "Content-Type": found.kind,
+            "Content-Length": str(len(found.data)),
+            "Content-Security-Policy": found.policy,
             "Cache-Control": "no-store",
             "X-Content-Type-Options": "nosniff",
             "X-Frame-Options": "DENY",
@@ -269,9 +238,10 @@ class _Handler(BaseHTTPRequestHandler):
             **headers,
         }.items():
             self.send_header(name, value)
+        self.server.clients.wait_for(PATIENCE + len(found.data) / SLOWEST)
         self.end_headers()
         if body:
-            self.wfile.write(data)
+            self.wfile.write(found.data)
 
     # ---- who may ask -------------------------------------------------------------------------------------------------
 
@@ -285,7 +255,7 @@ class _Handler(BaseHTTPRequestHandler):
         if origin is not None and origin != f"{self.server.scheme}://{host}":
             raise Refused(HTTPStatus.FORBIDDEN, "a page of another origin asks; open the address that was printed")
         if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-            if self.headers.get("Sec-Fetch-Mode") != "navigate":
+            if self.headers.get("Sec-Fetch-Mode") != "navigate" or self.command == "POST":
                 raise Refused(HTTPStatus.FORBIDDEN, "a page of another site asks")
         token = self.server.token
         if token is not None and not any(hmac.compare_digest(token, one) for one in self._tokens()):
@@ -310,113 +280,111 @@ class _Handler(BaseHTTPRequestHandler):
 
     # ---- what is answered --------------------------------------------------------------------------------------------
 
-    def _found(self, routes: Routes) -> tuple[str, bytes, dict[str, str]]:
+    def _found(self, routes: Routes) -> tuple[Served, dict[str, str]]:
         if not self.path.startswith("/"):
             raise Refused(HTTPStatus.BAD_REQUEST, "this server is no proxy")
         address = urlsplit(self.path)
-        query = parse_qs(address.query)
+        query = parse_qs(address.query, errors="surrogateescape")
         headers = {}
         if self.server.token and "token" in query:
+            # Lax: a link on the page of a run, which has an origin of its own, leads back to the list
             cookie = f"{COOKIE}-{self.server.server_port}={self.server.token}"
-            headers["Set-Cookie"] = f"{cookie}; HttpOnly; Secure; SameSite=Strict; Path=/"
+            headers["Set-Cookie"] = f"{cookie}; HttpOnly; Secure; SameSite=Lax; Path=/"
         for pattern, answer in routes:
             match = re.fullmatch(pattern, address.path)
             if match:
-                kind, data = answer(self, query, *map(unquote, match.groups()))
-                return kind, data, headers
+                names = (unquote(one, errors="surrogateescape") for one in match.groups())
+                return Served(*answer(self, query, *names)), headers
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
-    def _run(self, name: str) -> Path:
-        found = self.server.runs().get(name)
-        if found is None:
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such run")
-        return found
-
-    def _page(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        run = self._run(name)
+    def _page(self, _query: Query, name: str) -> Served:
+        run = self.server.run(name)
         if listing.listed_run(run, counts=False).command == "sweep":
-            return _html(sweep_page_html([(run, result_of(run))], [_source(name, run, "")]).encode(), "../../")
-        report = run / REPORT
-        if report.is_symlink():
-            raise Refused(HTTPStatus.NOT_FOUND, f"{name} has no page; advsearch show {name} prints what it has")
+            return _own(sweep_page_html([(run, result_of(run))], [_source(name, run, "")]), "../../")
         if is_under_way(run):
-            return _html(following_page(name, run).encode(), "../../")
-        return _html(report.read_bytes(), "../../")
+            return _own(following_page(name, run), "../../")
+        return _kept(run, "../../")
 
-    def _part(self, _query: Mapping[str, list[str]], name: str, part: str) -> tuple[str, bytes]:
+    def _part(self, _query: Query, name: str, part: str) -> Served:
         """The page of one of the attacks that a study consists of, where the study's page links to it."""
-        found = next((one for one in (self._run(name) / PARTS).iterdir() if one.name == part), None)
-        report = None if found is None or found.is_symlink() else found / REPORT
-        if report is None or report.is_symlink() or not report.is_file():
+        found = next((one for one in (self.server.run(name) / PARTS).iterdir() if one.name == part), None)
+        if found is None or not (found / REPORT).is_file():
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
-        return _html(report.read_bytes(), "../../../../", ("../../", name))
+        return _kept(found, "../../../../", ("../../", name))
 
-    def _compare(self, query: Mapping[str, list[str]]) -> tuple[str, bytes]:
+    def _compare(self, query: Query) -> Served:
         names = list(dict.fromkeys(query.get("run", [])))
         if not names:
             raise Refused(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
-        runs = [(name, self._run(name)) for name in names]
+        runs = [(name, self.server.run(name)) for name in names]
         other = [name for name, run in runs if listing.listed_run(run, counts=False).command != "sweep"]
         if other:
             raise Refused(HTTPStatus.BAD_REQUEST, f"only sweeps can be shown side by side; {', '.join(other)} is none")
-        sources = [_source(name, run, f"../runs/{quote(name, safe='')}/") for name, run in runs]
-        return _html(sweep_page_html([(run, result_of(run)) for _, run in runs], sources).encode(), "../")
+        sources = [_source(name, run, f"../runs/{in_address(name)}/") for name, run in runs]
+        return _own(sweep_page_html([(run, result_of(run)) for _, run in runs], sources), "../")
 
-    def _rows(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        run = self._run(name)
+    def _rows(self, query: Query, name: str) -> Served:
+        run = self.server.run(name)
         after = _after(query, 0)
         if not after and (run / COLUMNS).is_file() and listing.finished(run):
-            with open_regular(run / COLUMNS, "columns of a sweep", LARGEST) as file:
-                return "application/octet-stream", file.read()
+            return Served("application/octet-stream", read_bytes(run / COLUMNS, "columns of a sweep", LARGEST))
         part = PART if after else FIRST_PART
         running = files.is_held(run)  # before the rows are read: what comes later is asked for again
         columns = read_columns(run, after, part)
         more = len(columns.step) == part
-        return "application/octet-stream", replace(columns, more=more, running=running).packed()
+        return Served("application/octet-stream", replace(columns, more=more, running=running).packed())
+
+    def _progress(self, query: Query, name: str) -> Served:
+        return Served("application/json", progress_json(self.server.run(name), _after(query, START)))
+
+    def _cover(self, _query: Query, name: str) -> Served:
+        return Served("image/jpeg", cover(self.server.run(name)))
+
+    def _picture(self, _query: Query, name: str, number: str) -> Served:
+        return Served("image/jpeg", read_thumbnail(self.server.run(name), int(number)))
 
     # ---- photographs -------------------------------------------------------------------------------------------------
 
-    def _align(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
-        path = f"/runs/{quote(name, safe='')}/align/"
+    def _align(self, _query: Query, name: str) -> Served:
+        path = f"/runs/{in_address(name)}/align/"
         elsewhere = self.server.address_of(path) if self.server.token else None
-        _, made = _photographs("photographs_html")(
-            self.server.photographs, self._run(name), name, self.server.key, elsewhere
+        page = _photographs("photographs_html")(
+            self.server.photographs, self.server.run(name), name, self.server.key(name), elsewhere
         )
-        return _html(made, "../../../", ("../", name))
+        return _own(page, "../../../", ("../", name))
 
-    def _take(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
-        _photographs("check_sender")(self.headers, self.server.key)
-        data = partial(_photographs("request_body"), self.headers, self.rfile)
-        return _photographs("take")(self.server.photographs, self._run(name), rendering, data)
+    def _take(self, _query: Query, name: str, rendering: str) -> Served:
+        _photographs("check_sender")(self.headers, self.server.key(name))
+        return Served(*_photographs("take")(self.server.photographs, self.server.run(name), rendering, self._body))
 
-    def _picture(self, _query: Mapping[str, list[str]], name: str, number: str) -> tuple[str, bytes]:
-        file = path_of(self._run(name), int(number))
-        if file.is_symlink():
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such picture")
-        return "image/jpeg", file.read_bytes()
+    def _body(self) -> bytes:
+        self.server.clients.wait_for(SENDING)
+        data: bytes = _photographs("request_body")(self.headers, self.rfile)
+        self.server.clients.wait_for(None)
+        return data
+
+    def _rendering(self, _query: Query, name: str, rendering: str) -> Served:
+        return Served(*_photographs("rendering_picture")(self.server.run(name), rendering))
+
+    def _photo(self, _query: Query, name: str, photo: str) -> Served:
+        return Served(*_photographs("photo")(self.server.run(name), photo))
 
 
-Handler = Callable[..., tuple[str, bytes]]
-Routes = tuple[tuple[str, Handler], ...]
+Query = Mapping[str, list[str]]
+Routes = tuple[tuple[str, Callable[..., Served]], ...]
 
 _ROUTES: Routes = (
-    ("/", lambda self, _: ("text/html; charset=utf-8", list_page(self.server.runs()).encode())),
+    ("/", lambda self, _: _own(self.server.list_page())),
     ("/compare/", _Handler._compare),
     ("/runs/([^/]+)/", _Handler._page),
-    ("/runs/([^/]+)/cover", lambda self, _, name: ("image/jpeg", cover(self._run(name)))),
+    ("/runs/([^/]+)/cover", _Handler._cover),
     ("/runs/([^/]+)/rows", _Handler._rows),
-    (
-        "/runs/([^/]+)/progress",
-        lambda self, query, name: ("application/json", progress_json(self._run(name), _after(query, START))),
-    ),
+    ("/runs/([^/]+)/progress", _Handler._progress),
     (f"/runs/([^/]+)/{PARTS}/([^/]+)/{re.escape(REPORT)}", _Handler._part),
     (r"/runs/([^/]+)/pictures/[0-9]+/([0-9]{1,12})\.jpg", _Handler._picture),
     ("/runs/([^/]+)/align/", _Handler._align),
-    (
-        "/runs/([^/]+)/align/renderings/([^/]+)",
-        lambda self, _, name, one: _photographs("rendering_picture")(self._run(name), one),
-    ),
-    ("/runs/([^/]+)/align/photos/([^/]+)", lambda self, _, name, one: _photographs("photo")(self._run(name), one)),
+    ("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._rendering),
+    ("/runs/([^/]+)/align/photos/([^/]+)", _Handler._photo),
 )
 
 _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
@@ -430,9 +398,9 @@ def _after(query: Mapping[str, list[str]], otherwise: int) -> int:
     return int(after)
 
 
-def _photographs(what: str) -> Callable[..., tuple[str, bytes]]:
+def _photographs(what: str) -> Callable[..., Any]:
     """A part of what takes photographs in, which the tool works without."""
-    found: Callable[..., tuple[str, bytes]] | None = rooms.in_room("photographs", "answer", what)
+    found: Callable[..., Any] | None = rooms.in_room("photographs", "answer", what)
     if found is None:
         raise Refused(HTTPStatus.NOT_FOUND, "there are no photographs")
     return found
@@ -443,8 +411,29 @@ def _source(name: str, run: Path, base: str) -> SweepSource:
     return SweepSource(name, f"{base}rows", parts=True, pictures=kept_pictures(run), folder=f"{base}pictures")
 
 
-def _html(page: bytes, home: str, above: tuple[str, str] | None = None) -> tuple[str, bytes]:
+HTML = "text/html; charset=utf-8"
+
+
+def _text(words: str) -> Served:
+    return Served("text/plain; charset=utf-8", f"{words}\n".encode("utf-8", "replace"))
+
+
+def _own(page: str, home: str | None = None, above: tuple[str, str] | None = None) -> Served:
+    """Return a page that the server has made, with the way back; arguments as for `_with_way`."""
+    data = page.encode("utf-8", "replace")  # names of files may be no text
+    return Served(HTML, _with_way(data, home, above) if home else data, served_policy(own=True))
+
+
+def _kept(run: Path, home: str, above: tuple[str, str] | None = None) -> Served:
+    """Return the page that lies in the folder of a run, with the way back; arguments as for `_with_way`."""
+    page = read_bytes(run / REPORT, "a page", LARGEST_PAGE)
+    said = f"Its scripts are of another advsearch and do not run here; advsearch view {run.name} makes the page anew."
+    return Served(HTML, _with_way(page, home, above, said if has_other_scripts(page) else None))
+
+
+def _with_way(page: bytes, home: str, above: tuple[str, str] | None, said: str | None = None) -> bytes:
     """Return a page with the way back: to the list, and to what it is a part of (an address and its name)."""
     links = [("All runs", home), *([(above[1], above[0])] if above else [])]
     way = element("nav", *(element("a", text, href=address) for text, address in links), aria_label="back")
-    return "text/html; charset=utf-8", page.replace(b"<body>", b"<body>" + way.encode(), 1)
+    way = join_html(way, element("p", said, class_="remarks") if said else None)
+    return page.replace(b"<body>", b"<body>" + way.encode("utf-8", "replace"), 1)

@@ -77,9 +77,13 @@ def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
     """
     columns = read_columns(run)
     write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
+    return write_text(run / directory.REPORT, whole_page(run, summary, columns), durable=False)
+
+
+def whole_page(run: Path, summary: SweepSummary, columns: Columns) -> str:
+    """Return the page of a sweep that needs no other file, with its rows unless they are too many."""
     rows = columns if len(columns.step) <= MOST_ROWS else None
-    source = SweepSource(run.name, rows, pictures=kept_pictures(run))
-    return write_text(run / directory.REPORT, sweep_page_html([(run, summary)], [source]), durable=False)
+    return sweep_page_html([(run, summary)], [SweepSource(run.name, rows, pictures=kept_pictures(run))])
 
 
 def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:

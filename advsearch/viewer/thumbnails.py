@@ -21,7 +21,8 @@ from PIL import Image
 
 from advsearch.described import Value
 from advsearch.errors import InputError
-from advsearch.runs.directory import AOV_FOLDER, CONFIG, IMAGES
+from advsearch.files import read_bytes
+from advsearch.runs.directory import AOV_FOLDER, CONFIG, IMAGES, SMALL_PICTURES
 from advsearch.runs.fiftyone import Pictured
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import Bytes, to_8bit
@@ -37,9 +38,6 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
-FOLDER = "rows"
-"""In `images/` of the run."""
-
 A_FOLDER = 1000
 """Pictures in each folder."""
 
@@ -51,6 +49,9 @@ QUALITY = 85
 
 LARGEST_COVER = 50_000_000
 """Pixels of a picture that a list shows small."""
+
+LARGEST = 1 << 24
+"""Most bytes of the file of a thumbnail."""
 
 BYTES = 5000
 """What a thumbnail of `SIDE` takes, about; measured on pictures of the bundled objects."""
@@ -66,7 +67,7 @@ def cover(run: Path) -> bytes:
     """Return a small picture of a run as a JPEG: its worst answer, or else its first figure; grey where it has none."""
     first = [run / IMAGES / f"{name}.png" for name in ("adversarial", "clean", "worst")]
     for file in (*first, *sorted((run / IMAGES).glob("*.png"))):
-        if file.is_symlink() or not file.is_file():
+        if not file.is_file():
             continue
         with suppress(OSError, SyntaxError, Image.DecompressionBombError), Image.open(file) as image:
             if image.width * image.height <= LARGEST_COVER:
@@ -83,7 +84,23 @@ def _jpeg(image: Image.Image) -> bytes:
 
 def path_of(run: Path, number: int) -> Path:
     """Return where the thumbnail of a picture is kept."""
-    return run / "images" / FOLDER / f"{number // A_FOLDER:04d}" / f"{number}.jpg"
+    return run / SMALL_PICTURES / f"{number // A_FOLDER:04d}" / f"{number}.jpg"
+
+
+def kept_file(run: Path, number: int) -> Path | None:
+    """Return the file of the thumbnail of a picture; None where there is none. A link is none (`check_links` leaves
+    these to this function)."""
+    file = path_of(run, number)
+    return file if file.is_file() and not (file.is_symlink() or file.parent.is_symlink()) else None
+
+
+def read_thumbnail(run: Path, number: int) -> bytes:
+    """Return the thumbnail of a picture. Raises FileNotFoundError where there is none, or a link in its place, and
+    FileFormatError where it is too large."""
+    file = kept_file(run, number)
+    if file is None:
+        raise FileNotFoundError(f"{run}: has no picture {number}")
+    return read_bytes(file, "a small picture", LARGEST)
 
 
 def keep(run: Path, number: int, data: bytes) -> None:
@@ -108,11 +125,12 @@ class Kept:
 
     def png_of(self, step: int) -> bytes | None:
         """Return the picture of a configuration as a PNG; None where it was not kept."""
-        file = path_of(self.run, step // self.models)
-        if not file.is_file():
+        try:
+            data = read_thumbnail(self.run, step // self.models)
+        except OSError:
             return None
         stream = io.BytesIO()
-        with Image.open(file) as image:
+        with Image.open(io.BytesIO(data)) as image:
             image.save(stream, "PNG")
         return stream.getvalue()
 
@@ -125,7 +143,7 @@ class Kept:
             if number not in there:
                 continue
             there.discard(number)
-            data = path_of(self.run, number).read_bytes()
+            data = read_thumbnail(self.run, number)
             spent += len(data) * 4 // 3
             if spent > most:
                 return
@@ -143,7 +161,7 @@ def kept_pictures(run: Path) -> Kept | None:
 
 def _numbers(run: Path) -> Iterator[int]:
     """Yield the numbers of the pictures that are there; links are none."""
-    top = run / "images" / FOLDER
+    top = run / SMALL_PICTURES
     if not top.is_dir():
         return
     with os.scandir(top) as folders:
@@ -208,7 +226,7 @@ def _attacked(run: Path, summary: AttackSummary) -> Iterator[Pictured]:
         ]
     for name, row in (*shown, *trials):
         file = run / IMAGES / f"{name}.png"
-        if file.is_file() and not file.is_symlink():
+        if file.is_file():
             yield Pictured(name, row, file, None, size)
 
 

@@ -194,7 +194,7 @@ def test_beyond_this_machine_the_token_is_asked_for(run: Path) -> None:
         assert answer.status == 200
         cookie = answer.headers["Set-Cookie"]
         assert "HttpOnly" in cookie
-        assert "SameSite=Strict" in cookie
+        assert "SameSite=Lax" in cookie
         assert ask(server, "/runs/first/rows", Cookie=cookie.split(";")[0])[0].status == 200
         assert ask(server, "/runs/first/rows", Cookie="advsearch-1=x")[0].status == 401
 
@@ -219,7 +219,7 @@ def test_a_thousand_at_once_are_answered(server: Dashboard) -> None:
 
 def test_those_who_say_nothing_do_not_fill_the_server(server: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand connections that never ask hold it up for as long as its patience lasts, no longer."""
-    monkeypatch.setattr("advsearch.viewer.server.PATIENCE", 0.01)
+    monkeypatch.setattr("advsearch.viewer.clients.PATIENCE", 0.01)
     with ExitStack() as stack:
         for _ in range(1000):
             stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60))

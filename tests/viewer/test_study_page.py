@@ -147,12 +147,13 @@ def test_the_dashboard_and_a_bundle_have_the_pages_of_the_attacks(tmp_path: Path
         assert "parts/pose/report.html" in got(f"{server.address}runs/study/")
         assert got(f"{server.address}runs/study/parts/pose/report.html") == "the attack pose"
         (run / "parts" / "camera" / "report.html").unlink()
-        (run / "parts" / "camera" / "report.html").symlink_to(run / "run.yaml")
         for path in ("camera", "none", "..", "%2e%2e", "..%2f..%2fstudy"):
             with pytest.raises(HTTPError, match="404"):
                 got(f"{server.address}runs/study/parts/{path}/report.html")
     assert main(["view", str(run), "--bundle", str(tmp_path / "site")]) == 0
-    assert (tmp_path / "site" / "parts" / "pose" / "report.html").read_text() == "the attack pose"
+    page = (tmp_path / "site" / "parts" / "pose" / "report.html").read_text()
+    assert "the attack pose" not in page  # which anybody may have written; it is made anew
+    assert "<h1>" in page
     assert "parts/pose/report.html" in (tmp_path / "site" / "index.html").read_text()
     assert not (tmp_path / "site" / "parts" / "camera").exists()
 

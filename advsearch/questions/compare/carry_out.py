@@ -189,8 +189,8 @@ class _Pictures:
         for place, side in enumerate(sides):
             for number in numbers:
                 file = self.folder / _name(pair, number, place)
-                kept = thumbnails.path_of(side.folder, int(side.numbers[number]))
-                if kept.is_file():
+                kept = thumbnails.kept_file(side.folder, int(side.numbers[number]))
+                if kept is not None:
                     write_bytes(file, kept.read_bytes(), durable=False)
                 elif not file.is_file():
                     missing.append((side, int(side.numbers[number]), file))

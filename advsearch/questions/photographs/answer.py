@@ -14,14 +14,12 @@ import importlib
 import io
 import json
 import re
-import time
 from collections.abc import Callable, Sequence
 from email.message import Message
 from http import HTTPStatus
 from io import BufferedIOBase
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import quote
 
 from PIL import Image, ImageOps
 from pydantic import Field
@@ -32,9 +30,9 @@ from advsearch.report.markup import Html, element, join_html
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results.base import Fields, Interval
-from advsearch.viewer.document import data_script, document
+from advsearch.viewer.document import data_script, document, in_address
 from advsearch.viewer.server import Refused
-from advsearch.viewer.thumbnails import kept_pictures, path_of
+from advsearch.viewer.thumbnails import kept_file, kept_pictures
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
@@ -99,10 +97,10 @@ def rendering_file(run: Path, name: str) -> Path:
     """
     file = None
     if _NUMBER.fullmatch(name):
-        file = path_of(run, int(name))
+        file = kept_file(run, int(name))
     elif _NAME.fullmatch(name):
         file = run / IMAGES / f"{name}.png"
-    if file is None or file.is_symlink() or not file.is_file():
+    if file is None or not file.is_file():
         raise InputError(f"rendering: {run.name} has none called {name[:40]!r}; open its page for those that it has")
     return file
 
@@ -113,7 +111,7 @@ def rendering_names(run: Path) -> tuple[str, ...]:
     if kept is not None:
         return tuple(map(str, kept.numbers))
     files = sorted((run / IMAGES).glob("*.png"))
-    found = [file.stem for file in files if _NAME.fullmatch(file.stem) and not file.is_symlink()]
+    found = [file.stem for file in files if _NAME.fullmatch(file.stem)]
     return tuple(sorted(found, key=lambda name: (name != "adversarial", name)))
 
 
@@ -124,7 +122,7 @@ def photo_file(run: Path, name: str) -> Path:
         InputError: there is none of that name.
     """
     file = run / IMAGES / FOLDER / name
-    if not _PHOTO.fullmatch(name) or file.is_symlink() or not file.is_file():
+    if not _PHOTO.fullmatch(name) or not file.is_file():
         raise InputError("photo: there is none of that name")
     return file
 
@@ -281,10 +279,10 @@ def _row(name: str, *cells: str) -> Html:
 
 def _rendering(one: PhotographedRendering, several: bool) -> Html:
     photos = [
-        join_html(element("a", label or "nothing", href=f"photos/{quote(file, safe='')}"), " ")
+        join_html(element("a", label or "nothing", href=f"photos/{in_address(file)}"), " ")
         for label, file in zip(one.labels, one.files, strict=True)
     ]
-    name = element("a", one.rendering, href=f"renderings/{quote(one.rendering, safe='')}")
+    name = element("a", one.rendering, href=f"renderings/{in_address(one.rendering)}")
     return element(
         "tr",
         element("th", name, scope="row"),
@@ -295,9 +293,6 @@ def _rendering(one: PhotographedRendering, several: bool) -> Html:
         element("td", wording.interval_text(one.interval), class_="number"),
     )
 
-
-SENDING = 60.0
-"""Seconds in which a photograph has to have come."""
 
 KEY = "X-Advsearch-Key"
 """The header with which this server's page sends a photograph; another page could not send it."""
@@ -315,10 +310,10 @@ class PhotoTaker(Protocol):
         """Return the run's table."""
 
 
-def photographs_html(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> Response:
+def photographs_html(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> str:
     """Return the page of a run's photographs; arguments as for `align_page`."""
     table = _there(taker).agreement(run)
-    return "text/html; charset=utf-8", align_page(name, rendering_names(run), table, key, elsewhere).encode()
+    return align_page(name, rendering_names(run), table, key, elsewhere)
 
 
 def rendering_picture(run: Path, name: str) -> Response:
@@ -361,14 +356,10 @@ def request_body(headers: Message, stream: BufferedIOBase) -> bytes:
         raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
     if int(length) > LARGEST:
         raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST >> 20} MB")
-    parts, left, end = [], int(length), time.monotonic() + SENDING
-    while left:
-        part = stream.read1(min(left, 1 << 16)) if time.monotonic() < end else b""
-        if not part:
-            raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
-        parts.append(part)
-        left -= len(part)
-    return b"".join(parts)
+    data = stream.read(int(length))
+    if len(data) < int(length):
+        raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
+    return data
 
 
 def _there(taker: PhotoTaker | None) -> PhotoTaker:

@@ -1,0 +1,222 @@
+"""Those who ask the dashboard's server: in what time each has to have asked and taken the answer, and HTTPS.
+
+A few workers answer. A client that has said nothing yet keeps none of them from others, one that is slow does so until
+its time is up, or for `GRACE` only where others wait.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import ipaddress
+import math
+import selectors
+import socket
+import ssl
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from queue import LifoQueue
+from typing import Any
+
+from advsearch.errors import InputError
+
+WORKERS = 16
+"""Requests that are answered at once; others wait."""
+
+WAITING = 128
+"""Connections that may be open beside those that are served. More wait in the operating system, without a file open
+here."""
+
+PATIENCE = 10.0
+"""Seconds in which a client has to have said what it asks for."""
+
+SLOWEST = 50_000
+"""Bytes a second at which it has to take the answer at least, beyond as long as `PATIENCE`."""
+
+GRACE = 1.0
+"""Seconds that a slow client has where others wait."""
+
+TICK = 0.05
+"""Seconds between two looks at the clock."""
+
+
+DAYS = 7
+"""For which a certificate is good."""
+
+
+def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
+    """Return what speaks HTTPS under some names and addresses, and the SHA-256 fingerprint of its new certificate.
+    Raises InputError where there is no `openssl`, or it makes none."""
+    names = ",".join(f"IP:{host}" if is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
+    with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
+        key, certificate = Path(folder) / "key.pem", Path(folder) / "certificate.pem"
+        key.touch(mode=0o600)
+        command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
+        command += ["-keyout", str(key), "-out", str(certificate), "-days", str(DAYS), "-subj", "/CN=advsearch"]
+        command += ["-addext", f"subjectAltName={names}", "-addext", "extendedKeyUsage=serverAuth"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, timeout=30.0, stdin=subprocess.DEVNULL)
+        except FileNotFoundError:
+            raise InputError(
+                "https: needs the program openssl, which makes the certificate; apt-get install openssl, or leave "
+                "`host` and `https` out"
+            ) from None
+        except (OSError, subprocess.SubprocessError) as error:
+            text = (getattr(error, "stderr", None) or b"").decode(errors="replace")[-300:]
+            raise InputError(f"https: openssl made no certificate: {text or error}") from None
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.load_cert_chain(certificate, key)
+        data = ssl.PEM_cert_to_DER_cert(certificate.read_text(encoding="ascii"))
+    digest = hashlib.sha256(data).hexdigest().upper()
+    return context, ":".join(digest[place : place + 2] for place in range(0, len(digest), 2))
+
+
+def reachable(host: str) -> str:
+    """Return the address under which others reach what listens at `host`: of any address, the one that leads out."""
+    if host not in ("0.0.0.0", "::", ""):
+        return host
+    family, far = (socket.AF_INET6, "2001:db8::1") if host == "::" else (socket.AF_INET, "192.0.2.1")
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((far, 9))  # chooses an address; nothing is sent
+            return str(probe.getsockname()[0])
+    except OSError:
+        return "::1" if host == "::" else "127.0.0.1"
+
+
+def is_address(host: str) -> bool:
+    """Whether a host is a number and no name."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+@dataclass(eq=False)
+class _Served:
+    """One that a worker serves: its connection, since when the worker waits for it, and until when that may last; both
+    are infinite while the worker itself is what takes time."""
+
+    connection: socket.socket
+    since: float = math.inf
+    due: float = math.inf
+
+
+class Clients:
+    """Serves connections until `close`.
+
+    Args:
+        listening: what accepts them.
+        answer: is called with each, in a worker's thread. It says when it waits for the client (`wait_for`) or works.
+        context: of HTTPS; None speaks HTTP.
+    """
+
+    def __init__(
+        self,
+        listening: socket.socket,
+        answer: Callable[[socket.socket, Any], None],
+        context: ssl.SSLContext | None,
+    ) -> None:
+        self._listening, self._answer, self._context = listening, answer, context
+        # Who came last is served first: a crowd may be there to keep others out.
+        self._ready: LifoQueue[tuple[socket.socket, Any] | None] = LifoQueue()
+        self._served: dict[int, _Served] = {}
+        self._closed, self._ended = threading.Event(), threading.Event()
+        self._ended.set()
+
+    def serve(self) -> None:
+        """Accept clients until `close`."""
+        self._ended.clear()
+        for _ in range(WORKERS):
+            threading.Thread(target=self._work, daemon=True).start()
+        try:
+            with selectors.DefaultSelector() as selector:
+                self._watch(selector)
+        finally:
+            self._ended.set()
+
+    def close(self) -> None:
+        """End `serve`, and let the workers end."""
+        self._closed.set()
+        self._ended.wait()
+        for _ in range(WORKERS):
+            self._ready.put(None)
+
+    def wait_for(self, seconds: float | None) -> None:
+        """Say, in a worker's thread, that it waits for its client from now on, and for how long at most; None that it
+        does not."""
+        client = self._served[threading.get_ident()]
+        now = time.monotonic()
+        client.since, client.due = (math.inf, math.inf) if seconds is None else (now, now + seconds)
+
+    def _watch(self, selector: selectors.BaseSelector) -> None:
+        """Hand each connection that has said something to the workers, and end those whose time is up."""
+        silent: dict[Any, tuple[Any, float]] = {}
+        listens = False
+        while not self._closed.is_set():
+            room = len(silent) + self._ready.qsize() < WAITING
+            if room and not listens:
+                selector.register(self._listening, selectors.EVENT_READ)
+            elif listens and not room:
+                selector.unregister(self._listening)
+            listens = room
+            for key, _ in selector.select(TICK):
+                if key.fileobj is self._listening:
+                    with suppress(OSError):
+                        connection, address = self._listening.accept()
+                        silent[connection] = address, time.monotonic()
+                        selector.register(connection, selectors.EVENT_READ)
+                else:
+                    selector.unregister(key.fileobj)
+                    self._ready.put((key.fileobj, silent.pop(key.fileobj)[0]))
+            now = time.monotonic()
+            for connection in [
+                one for one, (_, since) in silent.items() if now - since > (PATIENCE if room else GRACE)
+            ]:
+                del silent[connection]
+                selector.unregister(connection)
+                connection.close()
+            self._end_slow(now)
+        for connection in silent:
+            connection.close()
+
+    def _end_slow(self, now: float) -> None:
+        """End the connections whose time is up; where others wait, those too that have had `GRACE`, the slowest
+        first."""
+        served = sorted(self._served.copy().values(), key=lambda one: one.since)
+        others = self._ready.qsize() if len(served) == WORKERS else 0
+        for one in served:
+            pressed = others > 0 and now - one.since > GRACE
+            if one.due < now or pressed:
+                others -= 1
+                one.since = one.due = math.inf
+                with suppress(OSError):  # not the method of an SSL socket, which would forget that it is one
+                    socket.socket.shutdown(one.connection, socket.SHUT_RDWR)
+
+    def _work(self) -> None:
+        own = threading.get_ident()
+        while (job := self._ready.get()) is not None:
+            connection, address = job
+            try:
+                connection.setblocking(True)
+                if self._context is not None:
+                    connection = self._context.wrap_socket(connection, server_side=True, do_handshake_on_connect=False)
+                self._served[own] = _Served(connection)
+                self.wait_for(PATIENCE)
+                if isinstance(connection, ssl.SSLSocket):
+                    connection.do_handshake()
+                self._answer(connection, address)
+            except Exception:
+                continue  # whatever one client does, the others are answered
+            finally:
+                self._served.pop(own, None)
+                with suppress(OSError):
+                    socket.socket.shutdown(connection, socket.SHUT_WR)
+                connection.close()
