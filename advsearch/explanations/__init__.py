@@ -8,21 +8,23 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import hypergeom
 
 from advsearch import seeds
+from advsearch.attacks.units import Units, fewer_by_chance, per_unit, share_interval
 from advsearch.errors import InputError
 from advsearch.report.wording import short_name
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import ConditionRow
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME, Store
+from advsearch.runs.units import units_of
 
 PHOTOGRAPHS = "photographs"
 
@@ -46,8 +48,8 @@ OTHERS = "other objects"
 @dataclass(frozen=True)
 class Answered:
     """What a model said of one picture of a part of the recipe: what it shows, object, environment, model, and
-    parameters in their units; the answer in words, whether it is right, and its margin; and when it was stored, seconds
-    since 1970."""
+    parameters in their units; the answer in words, whether it is right, and its margin; when it was stored, seconds
+    since 1970; and what it shares with rows that are not independent of it (`runs.units`), None for nothing."""
 
     part: str
     values: Mapping[str, float | str]
@@ -56,6 +58,7 @@ class Answered:
     correct: bool
     time: float | None = None
     margin: float | None = None
+    unit: str | None = None
 
 
 def figure_value(value: float | str) -> str:
@@ -74,6 +77,8 @@ def rows_of(
     outer = {"object": summary.object, "environment": summary.environment, "model": summary.model}
     rows = []
     with Store(folder / NAME, read_only=True) as store:
+        units = units_of(store, summary) if isinstance(summary, SweepSummary) else None
+        alike = summary.samples if isinstance(summary, SweepSummary) and summary.sampler is None else 1
         for row in store.rows():
             if row.kind not in kinds:
                 continue
@@ -81,9 +86,12 @@ def rows_of(
             values |= {TRIAL: TRIALS[row.kind]} if row.kind in TRIALS else {}
             values |= {"model": summary.model} if part == PHOTOGRAPHS and "," not in summary.model else {}
             named = {name: figure_value(str(values.get(name, of_all))) for name, of_all in outer.items()}
-            units = {name: one["unit"] for name, one in row.values.items() if one["unit"]}
+            shown = {name: one["unit"] for name, one in row.values.items() if one["unit"]}
             answer = row.label or "none", bool(row.correct)
-            rows.append(Answered(part, {**values, **named}, units, *answer, row.time, row.margin))
+            unit = f"trial {row.step}" if row.kind in TRIALS else None
+            if row.kind == "sweep" and units is not None:  # without draws, samples of a point differ by noise alone
+                unit = f"{units.name} {units.of(row.step) // alike}"
+            rows.append(Answered(part, {**values, **named}, shown, *answer, row.time, row.margin, unit))
     return rows
 
 
@@ -103,34 +111,64 @@ class Factor:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Configurations (n, d) float64, of a factor with options the number of the option, and answers (n,): whether the
-    model was right."""
+    """Configurations (n, d) float64, of a factor with options the number of the option, answers (n,): whether the
+    model was right, and the unit (n,) of each: rows of one are not independent. Where that is not said, rows are one
+    that have the same numbers, but for the time along a path."""
 
     factors: tuple[Factor, ...]
     values: Numbers
     right: Mask
+    units: Units = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __post_init__(self) -> None:
+        if len(self.units) == len(self.right):
+            return
+        same = [not one.name.endswith(".time") for one in self.factors]
+        if any(not one.options for one, own in zip(self.factors, same, strict=True) if own):
+            units = np.unique(self.values[:, same], axis=0, return_inverse=True)[1].reshape(-1)
+        else:
+            units = np.arange(len(self.right))
+        object.__setattr__(self, "units", units)
 
     def __len__(self) -> int:
         return len(self.right)
 
+    @cached_property
+    def independent(self) -> bool:
+        """Whether each row is a unit."""
+        return self.count == len(self)
+
+    @cached_property
+    def count(self) -> int:
+        """How many units there are."""
+        return len(np.unique(self.units))
+
+    @cached_property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % interval of the share of right answers, over units; 0 to 1 where there is no row."""
+        if not len(self):
+            return 0.0, 1.0
+        return share_interval(*(per_unit(one, self.units) for one in (self.right, np.ones(len(self)))))
+
     def where(self, mask: Mask) -> Observations:
         """Return some of the rows, by a mask (n,)."""
-        return Observations(self.factors, self.values[mask], self.right[mask])
+        return Observations(self.factors, self.values[mask], self.right[mask], self.units[mask])
 
     def halves(self, seed: int) -> tuple[Observations, Observations]:
-        """Return two halves, drawn by a seed: one to choose on and one to count on."""
-        order = np.random.default_rng(seeds.stream(seed, "halves")).permutation(len(self))
-        first = np.zeros(len(self), dtype=bool)
-        first[order[: len(self) // 2]] = True
-        return self.where(first), self.where(~first)
+        """Return two halves, drawn by a seed, each of whole units: one to choose on and one to count on."""
+        places = np.unique(self.units, return_inverse=True)[1].reshape(-1)
+        order = np.random.default_rng(seeds.stream(seed, "halves")).permutation(self.count)
+        chosen = np.zeros(self.count, dtype=bool)
+        chosen[order[: self.count // 2]] = True
+        return self.where(chosen[places]), self.where(~chosen[places])
 
 
 RowValues = Mapping[str, tuple[float | str, str]]
 """Value and unit of everything that a row shows, by name."""
 
 
-def observed(rows: Sequence[tuple[RowValues, bool]]) -> Observations:
-    """Return rows as a table of what varies among them; what only some of them have is left out."""
+def observed(rows: Sequence[tuple[RowValues, bool]], units: Sequence[str]) -> Observations:
+    """Return rows as a table of what varies among them, with the unit of each; what only some have is left out."""
     if not rows:
         raise InputError("runs: expected sweeps with rows, got none")
     shared = [name for name in rows[0][0] if all(name in shown for shown, _ in rows)]
@@ -149,7 +187,8 @@ def observed(rows: Sequence[tuple[RowValues, bool]]) -> Observations:
     if not factors:
         raise InputError("runs: expected rows in which something varies, got none that all of them have")
     values = np.array(columns, dtype=np.float64).T
-    return Observations(tuple(factors), values, np.array([right for _, right in rows], dtype=bool))
+    right = np.array([right for _, right in rows], dtype=bool)
+    return Observations(tuple(factors), values, right, np.unique(np.array(units), return_inverse=True)[1].reshape(-1))
 
 
 def encoded(found: Observations) -> tuple[Numbers, list[tuple[int, int | None]]]:
@@ -176,8 +215,8 @@ MOST_RULES = 5
 DEPTH = 3
 """Conditions of a rule, at most."""
 TREES = 24
-LEAST_SHARE, LEAST_ROWS = 0.01, 12
-"""Of the rows that choose, a rule covers at least so many."""
+LEAST_SHARE, LEAST_ROWS, LEAST_UNITS = 0.01, 12, 3
+"""Of the rows that choose, a rule covers at least so many, and as many as so many units have."""
 KEPT = 0.97
 """Share of its weighted relative accuracy that a rule keeps when a condition is left out."""
 PASSES, BOUNDS = 3, 250
@@ -226,16 +265,29 @@ class CountedRule:
     that no rule before it covers."""
 
     conditions: RuleConditions
-    right: int
-    of: int
-    right_elsewhere: int
-    of_elsewhere: int
+    inside: Observations
+    elsewhere: Observations
 
     @property
+    def right(self) -> int:
+        return int(self.inside.right.sum())
+
+    @property
+    def of(self) -> int:
+        return len(self.inside)
+
+    @property
+    def right_elsewhere(self) -> int:
+        return int(self.elsewhere.right.sum())
+
+    @property
+    def of_elsewhere(self) -> int:
+        return len(self.elsewhere)
+
+    @cached_property
     def chance(self) -> float:
-        """The probability of so few right answers under it, or fewer, if they were spread by chance: Fisher's exact
-        test, one-sided."""
-        return _chance(self.right, self.of, self.right_elsewhere, self.of_elsewhere)
+        """The probability of so few right answers under it, or fewer, if they were spread by chance."""
+        return self._chance()
 
     @property
     def holds(self) -> bool:
@@ -252,17 +304,21 @@ class CountedRule:
         """How many times as many rows, of the same shares, would tell it; None where no number would."""
         if self._gap < LEAST_GAP:
             return None
-        counts = (self.right, self.of, self.right_elsewhere, self.of_elsewhere)
         times, own = 1.0, self.of + self.of_elsewhere
         while own * times <= MOST_NEEDED:
-            if _chance(*(round(one * times) for one in counts)) <= CHANCE:
+            if self._chance(times) <= CHANCE:
                 return times
             times *= 1.05
         return None
 
-
-def _chance(right: int, of: int, right_elsewhere: int, of_elsewhere: int) -> float:
-    return float(hypergeom.cdf(right, of + of_elsewhere, right + right_elsewhere, of))
+    def _chance(self, times: float = 1.0) -> float:
+        """That of so many times as many units."""
+        units = np.concatenate([self.inside.units, self.elsewhere.units])
+        under = np.arange(len(units)) < self.of
+        right = np.concatenate([self.inside.right, self.elsewhere.right])
+        return fewer_by_chance(
+            *(per_unit(one, units) for one in (under & right, under, ~under & right, ~under)), times=times
+        )
 
 
 @dataclass(frozen=True)
@@ -290,8 +346,7 @@ def find_rules(choosing: Observations, counting: Observations, seed: int) -> Fou
         if not conditions:
             return FoundRules(rules, None)
         inside = covered(conditions, counting)
-        here, elsewhere = counting.right[inside], counting.right[~inside]
-        rule = CountedRule(conditions, int(here.sum()), len(here), int(elsewhere.sum()), len(elsewhere))
+        rule = CountedRule(conditions, counting.where(inside), counting.where(~inside))
         if not rule.holds:
             return FoundRules(rules, rule)
         rules.append(rule)
@@ -303,6 +358,8 @@ def _best(found: Observations, seed: int) -> RuleConditions:
     """The candidate of the largest weighted relative accuracy, as short as it can be; none where all are worthless."""
     wrong = ~found.right
     least = max(LEAST_ROWS, round(LEAST_SHARE * len(found)))
+    if not found.independent:
+        least = max(least, round(LEAST_UNITS * len(found) / found.count))
     if len(found) < 2 * least or not 0 < int(wrong.sum()) < len(found):
         return ()
     excess = wrong - wrong.mean()

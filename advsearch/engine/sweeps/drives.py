@@ -1,6 +1,6 @@
 """Drives: what a sweep over the frames of a path says of whole drives, everything that varies but the time, and the
-worst of them. Frames are not independent, so intervals are over drives (a bootstrap, Efron and Tibshirani 1993, section
-13.3)."""
+worst of them. Frames are not independent, so intervals are over drives, and hold for any number of them: each number
+has ends that it cannot pass (`attacks.units`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from advsearch import seeds
+from advsearch.attacks.units import mean_interval
 from advsearch.config import SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.path import PathControl
@@ -22,9 +22,6 @@ from advsearch.report.marks import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import DriveRates, OverDrives
 from advsearch.runs.store import Row
-
-FEWEST, RESAMPLES, CONFIDENCE = 5, 2000, 0.95
-"""Drives that an interval needs, and samples of the bootstrap."""
 
 ANIMATED = 60
 
@@ -93,11 +90,12 @@ class Drives:
         self, model: str, answer: str, right: npt.NDArray[np.bool_], away: npt.NDArray[np.float64]
     ) -> DriveRates:
         """What is said of drives: (n, frames) whether the model is right, and how far away it is."""
-        seconds = float(self.times[-1] - self.times[0])
-        step = seconds / (len(self.times) - 1)
+        seconds, frames = float(self.times[-1] - self.times[0]), len(self.times)
+        step = seconds / (frames - 1)
         seen = right.any(axis=1)
         first = away[np.arange(len(right)), right.argmax(axis=1)][seen]
         changes = (right[:, 1:] != right[:, :-1]).sum(axis=1) / seconds
+        ends = float(away.min()), float(away.max())
         return DriveRates(
             model=model,
             answer=answer or None,
@@ -105,11 +103,11 @@ class Drives:
             frames=right.shape[1],
             seconds=seconds,
             right=over_drives(right.mean(axis=1), worst=min),
-            longest_gap=over_drives(np.array([longest(~one) for one in right]) * step, worst=max),
-            first_seen=over_drives(first, worst=min) if len(first) and np.isfinite(first).all() else None,
+            longest_gap=over_drives(np.array([longest(~one) for one in right]) * step, max, (0.0, frames * step)),
+            first_seen=over_drives(first, min, ends) if len(first) and np.isfinite(ends).all() else None,
             unit=self._unit,
             never_seen=int((~seen).sum()),
-            flicker=over_drives(changes, worst=max),
+            flicker=over_drives(changes, max, (0.0, (frames - 1) / seconds)),
         )
 
     def keep_worst(self, scenes: Scenes, run: RunDirectory) -> None:
@@ -138,13 +136,9 @@ def longest(flags: npt.NDArray[np.bool_]) -> int:
     return int((ends[1::2] - ends[::2]).max(initial=0))
 
 
-def over_drives(values: npt.NDArray[np.float64], worst: Callable[[list[float]], float]) -> OverDrives:
-    """Return the mean of a number over drives, its 95 % interval by a bootstrap, and that of the worst drive."""
-    interval = None
-    if len(values) >= FEWEST:
-        rng = np.random.default_rng(seeds.stream(0, "bootstrap of drives"))
-        means = values[rng.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
-        tail = (1.0 - CONFIDENCE) / 2.0
-        low, high = np.quantile(means, [tail, 1.0 - tail])
-        interval = (float(low), float(high))
-    return OverDrives(mean=float(values.mean()), interval=interval, worst=worst(values.tolist()))
+def over_drives(
+    values: npt.NDArray[np.float64], worst: Callable[[list[float]], float], ends: tuple[float, float] = (0.0, 1.0)
+) -> OverDrives:
+    """Return the mean of a number over drives, its 95 % interval, and that of the worst drive; `ends` are what it is
+    between whatever a model says."""
+    return OverDrives(mean=float(values.mean()), interval=mean_interval(values, *ends), worst=worst(values.tolist()))

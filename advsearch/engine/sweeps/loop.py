@@ -13,6 +13,7 @@ from typing import Any
 
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
+from advsearch.attacks.units import most_shown
 from advsearch.cluster import Executor, InProcess
 from advsearch.engine.attack_result import save_marked
 from advsearch.engine.journal import Journal, Sent, Shared, answering, finite, lost, other_answers, same
@@ -22,7 +23,7 @@ from advsearch.engine.sweeps import KIND, Job, check_all
 from advsearch.engine.sweeps.drives import Drives, time_axis
 from advsearch.engine.sweeps.points import Picks
 from advsearch.engine.sweeps.predicting import combined
-from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, SweepResult, Tally, rate
+from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, SweepResult, Tally
 from advsearch.engine.sweeps.surface import map_surface
 from advsearch.engine.sweeps.swept_scene import Scenes, check_worst
 from advsearch.interrupts import interruptible
@@ -37,6 +38,7 @@ from advsearch.runs.results.attack import DescribedValue, LinearTransport, Share
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import WorstConfiguration, WorstVerified
 from advsearch.runs.store import Row
+from advsearch.runs.units import NOTE
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 from advsearch.viewer.columns import EDGES
@@ -47,6 +49,9 @@ NOT_FINITE = "pictures not finite"
 
 PICTURE_SPP = 64
 """Samples a pixel of the picture that is kept, unless verification needed more."""
+
+ENOUGH_DRIVES = 20
+"""Of fewer, a sweep says what they could show at best."""
 
 TELL_SECONDS = 0.1
 
@@ -73,6 +78,9 @@ class Sweep:
         if run is not None:
             run.store.set_note(EDGES, json.dumps({one.name: one.edges for one in self._shown if one.edges}))
         self.per_scene, self.models = self.points.count, len(job.models)
+        self.units = replace(self.points.units, models=self.models)
+        if run is not None:
+            run.store.set_note(NOTE, json.dumps(self.units.noted))
         self.total = len(job.places) * self.per_scene * self.models
         self.samples = job.spp
         self._scenes = Scenes(job)
@@ -228,7 +236,7 @@ class Sweep:
 
     def _counted(self) -> Tally:
         """Counts of the rows that are stored already, read one after the other."""
-        tally = Tally(self._outer, self.job.axes, self._shown, self._pairs)
+        tally = Tally(self._outer, self.job.axes, self._shown, self._pairs, self.units)
         self._traced = self._predicted = self._lost = 0
         key, picks = (-1, -1), self.points.picks(0, 0)
         for row in self.rows():
@@ -340,7 +348,7 @@ class Sweep:
             gains=gains if len(gains) > 1 else None,
             drawn={one.name: one.varied for one in self._shown},
             planned=self.total,
-            **vars(rate(tally.correct, tally.seen)),
+            **vars(tally.whole.rate()),
             not_finite=tally.not_finite,
             answers=tally.frequent(),
             axes=tally.table(),
@@ -386,6 +394,12 @@ class Sweep:
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         remarks = lost_remarks(self._lost)
         remarks += self.journal.machines.remarks
+        few = min((one.drives for one in self._drives or ()), default=ENOUGH_DRIVES)
+        if few < ENOUGH_DRIVES:
+            remarks.append(
+                f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
+                f"that share would begin at {100 * most_shown(few):.0f} %."
+            )
         if tally.not_finite:
             remarks.append(f"{tally.not_finite} answers of the model are not numbers; they count as not right.")
         if self._not_finite:

@@ -23,6 +23,7 @@ from advsearch.controls.numbers import BoundNumbers
 from advsearch.controls.values import Fixed, OneOf, Range, to_value
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.runs.results.base import VariedValue
+from advsearch.runs.units import Units
 from advsearch.scene.description import ENVIRONMENT
 
 MOST_PARTS, FEWEST_PARTS = 10, 2
@@ -108,9 +109,8 @@ class Points:
         self.grid = Product(tuple(len(axis.values) for axis in axes))
         self.samples, self.count = samples, self.grid.count * samples
         self.parts = parts_of_ranges(self.count * among)
-        self._again = scenes * self.count
-        self._frames = next((place for place, axis in enumerate(axes) if axis.is_time), None)
-        self._drives = Product(tuple(len(axis.values) for axis in axes if not axis.is_time))
+        frames = next((place for place, axis in enumerate(axes) if axis.is_time), None)
+        self.units = Units(self.grid.sizes, frames, samples, again=scenes * self.count)
         self._space, self._domain, self._axes = space, domain, tuple(axes)
         self._start = domain.start.numpy().astype(np.float64)
         self._lower, self._upper = domain.lower.numpy(), domain.upper.numpy()
@@ -186,25 +186,13 @@ class Points:
 
     def noise(self, number: int) -> int:
         """Return the number of the noise of the picture with this number in the whole sweep."""
-        return number % self._again if self._again else number
-
-    def draw(self, number: int) -> int:
-        """Return the number of the draw of the picture with this number in the whole sweep: one for all frames of a
-        drive."""
-        number = self.noise(number)
-        if self._frames is None:
-            return number
-        scene, local = divmod(number, self.count)
-        place, sample = divmod(local, self.samples)
-        digits = list(self.grid.digits(place))
-        del digits[self._frames]
-        return (scene * self._drives.count + self._drives.index(digits)) * self.samples + sample
+        return number % self.units.again if self.units.again else number
 
     def _drawn(self, draws: Draws, first: int, count: int) -> Doubles:
         """The draws of neighbouring pictures of the whole sweep."""
-        if self._frames is None:
-            return draws.points(self.draw(first), count)
-        each = [draws.points(self.draw(number), 1) for number in range(first, first + count)]
+        if self.units.frames is None:
+            return draws.points(self.units.draw(first), count)
+        each = [draws.points(self.units.draw(number), 1) for number in range(first, first + count)]
         return np.concatenate(each) if each else draws.points(0, 0)
 
     def configurations(self, picks: Picks) -> Tensor:

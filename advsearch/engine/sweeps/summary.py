@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
 from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import paired_difference
+from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
 from advsearch.engine.sweeps import KIND
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.points import Drawn, Picks
@@ -27,6 +28,7 @@ from advsearch.runs.directory import RunDirectory, default_name
 from advsearch.runs.export import read_threedb, to_pandas
 from advsearch.runs.results.sweep import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary
 from advsearch.runs.store import Row
+from advsearch.runs.units import Units
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 from advsearch.viewer.sweep_page import write_sweep_page
@@ -45,32 +47,76 @@ MOST_ANSWERS = 20
 
 @dataclass
 class Count:
-    """Right answers among configurations, for every value of one axis: a number, a name, or a pair of ends."""
+    """Right answers among configurations, for every value of one axis: a number, a name, or a pair of ends. Of a unit
+    of sampling (`runs.units`) a value has so many answers, more than one where they are not independent."""
 
     name: str
     unit: str
     values: Sequence[Any]
-    seen: list[int] = field(init=False)
-    correct: list[int] = field(init=False)
+    of_a_unit: int = 1
+    counts: list[UnitCount] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.seen, self.correct = [0] * len(self.values), [0] * len(self.values)
+        self.counts = [UnitCount(self.of_a_unit) for _ in self.values]
 
-    def add(self, place: int, right: bool) -> None:
-        self.seen[place] += 1
-        self.correct[place] += right
+    def add(self, place: int, unit: int, right: bool) -> None:
+        self.counts[place].add(unit, right)
 
     def rows(self) -> list[AxisRow]:
         """Return the table of this axis; values without configurations so far are left out."""
         return [
-            AxisRow(axis=self.name, unit=self.unit, value=value, **vars(rate(correct, seen)))
-            for value, seen, correct in zip(self.values, self.seen, self.correct, strict=True)
-            if seen
+            AxisRow(axis=self.name, unit=self.unit, value=value, **vars(one.rate()))
+            for value, one in zip(self.values, self.counts, strict=True)
+            if one.seen
         ]
 
 
+@dataclass(slots=True)
+class UnitCount:
+    """Right answers among configurations, of units of so many answers each: by how many of a unit are right, which is
+    all that an interval takes, so that few units are open at a time."""
+
+    of_a_unit: int = 1
+    seen: int = 0
+    correct: int = 0
+    _open: dict[int, tuple[int, int]] | None = None
+    _whole: Counter[int] | None = None
+
+    def add(self, unit: int, right: bool) -> None:
+        self.seen += 1
+        self.correct += right
+        if self.of_a_unit == 1:
+            return
+        if self._open is None or self._whole is None:
+            self._open, self._whole = {}, Counter()
+        seen, correct = self._open.pop(unit, (0, 0))
+        if seen + 1 == self.of_a_unit:
+            self._whole[correct + right] += 1
+        else:
+            self._open[unit] = seen + 1, correct + right
+
+    def rate(self) -> CountedAnswers:
+        """Return count, accuracy and its interval over units; None where nothing was seen."""
+        if self.of_a_unit == 1 or not self.seen or self._open is None or self._whole is None:
+            return rate(self.correct, self.seen)
+        units = [(right, self.of_a_unit) for right in self._whole.elements()]
+        units += [(right, seen) for seen, right in self._open.values()]
+        right, of = np.array(units).T
+        return counted(right, of)
+
+
+def counted(right: npt.ArrayLike, of: npt.ArrayLike) -> CountedAnswers:
+    """Return count, accuracy and its 95 % interval, from right answers and answers of each unit (n,)."""
+    correct, seen = int(np.sum(right)), int(np.sum(of))
+    interval = share_interval(right, of) if seen else None
+    return CountedAnswers(
+        configurations=seen, correct=correct, accuracy=correct / seen if seen else None, interval=interval
+    )
+
+
 def rate(correct: int, seen: int) -> CountedAnswers:
-    """Return count, accuracy and its 95 % Clopper-Pearson interval; None where nothing was seen."""
+    """Return count, accuracy and its 95 % Clopper-Pearson interval, of answers that are independent; None where nothing
+    was seen."""
     return CountedAnswers(
         configurations=seen,
         correct=correct,
@@ -121,15 +167,29 @@ class Tally:
     configuration of the largest margin is the worst; a margin that is no number counts as not right."""
 
     def __init__(
-        self, outer: Sequence[tuple[str, Sequence[str]]], axes: Sequence[Axis], drawn: Sequence[Drawn], pairs: int = 0
+        self,
+        outer: Sequence[tuple[str, Sequence[str]]],
+        axes: Sequence[Axis],
+        drawn: Sequence[Drawn],
+        pairs: int = 0,
+        units: Units | None = None,
     ) -> None:
         self._verdicts = [bytearray(pairs), bytearray(pairs)]
-        self.seen = self.correct = self.not_finite = 0
+        self._units = Units() if units is None else units
+        self.not_finite = 0
+        self.whole = UnitCount(self._units.size)
         self.worst: tuple[int, Judgement] | None = None
         self.answers: Counter[str] = Counter()
-        self._outer = [Count(name, "", list(dict.fromkeys(values))) for name, values in outer]
-        self._grid = [Count(axis.name, axis.unit, axis.values) for axis in axes]
-        self._drawn = [Count(one.name, one.unit, one.parts) for one in drawn]
+        inside = {"model": self._units.models, "answer": 2 if self._units.again else 1}  # of each value a unit has some
+        size = self._units.size
+        self._outer = [
+            Count(name, "", list(dict.fromkeys(values)), size // inside.get(name, 1)) for name, values in outer
+        ]
+        self._grid = [
+            Count(axis.name, axis.unit, axis.values, size // (len(axis.values) if place == self._units.frames else 1))
+            for place, axis in enumerate(axes)
+        ]
+        self._drawn = [Count(one.name, one.unit, one.parts, size) for one in drawn]
         every = [*self._grid, *reversed(self._outer), *self._drawn]
         several = [number for number, count in enumerate(every) if len(count.values) > 1]
         listed = [number for number in several if number < len(every) - len(self._drawn)]
@@ -139,17 +199,16 @@ class Tally:
     def add(self, index: int, outer: Sequence[int], picks: Picks, place: int, trial: Judgement) -> None:
         """Count the configuration with a number: by its places on the outer axes, and its place among the pictures it
         belongs to."""
-        right = trial.right
+        right, unit = trial.right, self._units.of(index)
         if pairs := len(self._verdicts[0]):
             self._verdicts[index // pairs][index % pairs] = RIGHT if right else WRONG
-        self.seen += 1
-        self.correct += right
+        self.whole.add(unit, right)
         for count, digit in zip(self._outer, outer, strict=True):
-            count.add(digit, right)
+            count.add(digit, unit, right)
         for count, digit in zip(self._grid, picks.digits[place], strict=True):
-            count.add(digit, right)
+            count.add(digit, unit, right)
         for count, part in zip(self._drawn, picks.parts[place], strict=True):
-            count.add(part, right)
+            count.add(part, unit, right)
         places = (*picks.digits[place], *reversed(outer), *picks.parts[place])
         self._cells.add([places[number] for number in self._mapped], trial)
         if trial.success:
@@ -158,6 +217,14 @@ class Tally:
             self.not_finite += 1
         elif self.worst is None or trial.margin > self.worst[1].margin:
             self.worst = index, trial
+
+    @property
+    def seen(self) -> int:
+        return self.whole.seen
+
+    @property
+    def correct(self) -> int:
+        return self.whole.correct
 
     def beside(self, models: Sequence[str]) -> list[PairedRates]:
         """Return both rates of each model, of the pairs of which both are known."""
@@ -170,12 +237,14 @@ class Tally:
                 continue
             counts = [int(one.sum()) for one in (before & after, before & ~after, ~before & after, ~before & ~after)]
             both, clean_only, answer_only, neither = counts
-            difference, interval = paired_difference(*counts)
+            units = self._units.draw(np.flatnonzero(known))
+            difference, interval, _ = paired_by_unit(before, after, units)
+            of = per_unit(np.ones(len(units)), units)
             found.append(
                 PairedRates(
                     model=name,
-                    clean=rate(both + clean_only, len(before)),
-                    answer=rate(both + answer_only, len(before)),
+                    clean=counted(per_unit(before, units), of),
+                    answer=counted(per_unit(after, units), of),
                     both=both,
                     clean_only=clean_only,
                     answer_only=answer_only,
@@ -321,9 +390,9 @@ class _Counts:
         for name, table in self._values.items():
             if table is None or len(table) < 2:
                 continue
-            count = Count(name, "", sorted(table, key=lambda value: (isinstance(value, str), value)))
-            count.seen, count.correct = ([table[value][place] for value in count.values] for place in (0, 1))
-            tables += count.rows()
+            for value in sorted(table, key=lambda value: (isinstance(value, str), value)):
+                seen, correct = table[value]
+                tables.append(AxisRow(axis=name, unit="", value=value, **vars(rate(correct, seen))))
         called = {name: _listed(list(values)) for name, values in self._names.items()}
         most = sorted(self._wrong.items(), key=lambda pair: -pair[1])[:20]
         return SweepSummary(

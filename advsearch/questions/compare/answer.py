@@ -32,7 +32,7 @@ class CountOf(Fields):
 
     count: int
     total: int = Field(alias="of", description="pairs")
-    interval: Interval = Field(description="of the share, 95 % (Clopper-Pearson)")
+    interval: Interval = Field(description="of the share, 95 %")
 
 
 class PairCounts(Fields):
@@ -43,7 +43,7 @@ class PairCounts(Fields):
     second_only: int = Field(description="that the second alone gets right")
     neither: int = Field(description="that none gets right")
     difference: float = Field(description="accuracy of the second less that of the first")
-    interval: Interval = Field(description="of that difference, 95 %, of pairs (Newcombe)")
+    interval: Interval = Field(description="of that difference, 95 %, of pairs")
 
     @property
     def pairs(self) -> int:
@@ -86,9 +86,14 @@ class ComparedPair(PairCounts):
 
     first: str = Field(description="name of the side")
     second: str = Field(description="name of the other")
+    units: int | None = Field(
+        default=None,
+        description="draws that the pairs are of, such as [drives](drives.md), where some share one; absent where none "
+        "do",
+    )
     p: float = Field(
         description="how likely a split so uneven of the pairs that one alone gets right is where both are right "
-        "equally often (McNemar, exact, two-sided)"
+        "equally often (two-sided; McNemar's exact test, or where pairs share draws a bound by bets)"
     )
     worse: list[PairRule] | None = Field(description="where the first alone is right; null where it was not looked for")
     better: list[PairRule] | None = Field(description="where the second alone is right; null likewise")
@@ -119,10 +124,14 @@ class CompareResult(InNotebook, RunResult):
 RESULT = CompareResult
 
 
+LIKELY = "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
 NOTE = (
-    "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
-    "(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares "
+    f"{LIKELY}(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares "
     "Clopper-Pearson's, each for its row by itself."
+)
+NOTE_OF_UNITS = (
+    f"{LIKELY}(at most, two-sided). Frames of one drive are not independent: p and intervals are over drives, by bets, "
+    "each for its row by itself."
 )
 
 LEVEL = 0.05
@@ -157,7 +166,8 @@ def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
         [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
     ]
-    yield AnswerPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, NOTE)
+    note = NOTE if pair.units is None else NOTE_OF_UNITS
+    yield AnswerPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
     yield AnswerPart("Where one is worse", rules_texts(pair))
     tables = parts_of(pair)
     told = telling(tables, MOST_TABLES)
@@ -203,7 +213,8 @@ def headline(pair: ComparedPair) -> str:
     n, (before, after) = pair.pairs, pair.right
     return (
         f"{pair.first} is right in {percent(before / n)} and {pair.second} in {percent(after / n)} of the same "
-        f"{wording.count(n, 'picture')}: a difference of {100.0 * pair.difference:+.1f} points "
+        f"{wording.count(n, 'picture')}{'' if pair.units is None else f' of {pair.units} drives'}: a difference of "
+        f"{100.0 * pair.difference:+.1f} points "
         f"(95 % interval {points_text(pair.interval)})."
     )
 
@@ -215,7 +226,7 @@ def alone_text(pair: ComparedPair) -> str:
     shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
     return (
         f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
-        f"(exact McNemar test, p {p_text(pair.p)}){shown}."
+        f"({'exact McNemar test, ' if pair.units is None else 'by drive, '}p {p_text(pair.p)}){shown}."
     )
 
 
@@ -298,7 +309,8 @@ def values_text(one: PairPicture) -> str:
 def claims(result: CompareResult) -> Iterator[Claim]:
     """Yield what the run stands for: what was counted of each pair of sides."""
     for pair in result.pairs:
-        text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is Newcombe's, of pairs."
+        how = "Newcombe's, of pairs" if pair.units is None else "over drives"
+        text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {how}."
         side = next(one for one in result.sides if one.name == pair.second)
         extent = Extent(
             what=f"configurations in which {pair.second} is right",

@@ -12,7 +12,6 @@ from typing_extensions import Unpack
 
 from advsearch.api.keywords import Named, Names, SampledKeywords, asks, configured
 from advsearch.api.studies import carry_out_part
-from advsearch.attacks import clopper_pearson
 from advsearch.engine.loading import Controls
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError, ModelError
@@ -20,7 +19,7 @@ from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult, PairPicture
 from advsearch.questions.compare.settings import CompareConfig
-from advsearch.questions.compare.sides import Side, compared, differing, far_apart, read_sides, varying
+from advsearch.questions.compare.sides import Side, compared, differing, far_apart, interval_of, read_sides, varying
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
@@ -121,7 +120,7 @@ def _counted(first: Side, second: Side, seed: int, pictures: _Pictures) -> Compa
 def _side(side: Side) -> ComparedSide:
     right, total = int(side.right.sum()), len(side)
     counts = {"configurations": total, "correct": right, "accuracy": right / total}
-    interval = clopper_pearson(right, total)
+    interval = interval_of(side.right, side.units)
     named = {"name": side.name, "run": str(side.folder), **side.named}
     return ComparedSide(**named, **counts, interval=interval, seconds=side.seconds)
 

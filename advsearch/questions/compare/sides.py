@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch import seeds
-from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import mcnemar, paired_difference
+from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
 from advsearch.explanations import FEWEST_ROWS, CountedRule, Factor, Observations, condition_rows, find_rules
@@ -27,6 +26,7 @@ from advsearch.runs.directory import CONFIG
 from advsearch.runs.results.sweep import AxisValue, SweepSummary
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import read_result
+from advsearch.runs.units import units_of
 from advsearch.viewer.columns import KIND, Column, read_columns
 
 DRAWS = ("grid", "controls", "samples", "sampler", "seed")
@@ -53,6 +53,7 @@ class Side:
         folder, config, summary: of its sweep.
         named: object, model and answer.
         numbers: (n,) of the pictures in its sweep.
+        units: (n,) of the draws that they are of: frames of a drive have one.
         right: (n,) whether the model is right.
         margin: (n,) float32, over 0 where the answer is wrong; NaN where there was none.
         answers: (n,) in words.
@@ -66,6 +67,7 @@ class Side:
     summary: SweepSummary
     named: dict[str, str]
     numbers: npt.NDArray[np.int64]
+    units: npt.NDArray[np.int64]
     right: Mask
     margin: npt.NDArray[np.float32]
     answers: npt.NDArray[np.str_]
@@ -117,8 +119,9 @@ def varying(columns: Sequence[Column]) -> list[Column]:
     return [one for one in columns if len(np.unique(_values(one))) > 1]
 
 
-def observations(columns: Sequence[Column], right: Mask) -> Observations | None:
-    """Return parameters and a verdict (n,) as rules are sought in them; None where nothing varies."""
+def observations(columns: Sequence[Column], right: Mask, units: npt.NDArray[np.int64]) -> Observations | None:
+    """Return parameters and a verdict (n,) as rules are sought in them, and the unit (n,) of each; None where nothing
+    varies."""
     factors, values = [], []
     for one in columns:
         numbers = one.data.astype(np.float64)
@@ -131,7 +134,7 @@ def observations(columns: Sequence[Column], right: Mask) -> Observations | None:
         else:
             factors.append(Factor(one.name, one.unit))
         values.append(numbers)
-    return Observations(tuple(factors), np.stack(values, axis=1), right) if values else None
+    return Observations(tuple(factors), np.stack(values, axis=1), right, units) if values else None
 
 
 def _sides_of(folder: Path, *, alone: bool) -> list[Side]:
@@ -153,6 +156,9 @@ def _sides_of(folder: Path, *, alone: bool) -> list[Side]:
     halves = [range(pictures)]
     if config.answer_of is not None:
         halves = [range(pictures // 2), range(pictures // 2, pictures)][0 if alone else 1 :]
+    with Store(folder / NAME, read_only=True) as store:
+        units = units_of(store, summary)
+    assert units is not None
     seconds, sides = _seconds(folder), []
     for half in halves:
         numbers = np.arange(half.start, half.stop)
@@ -169,6 +175,7 @@ def _sides_of(folder: Path, *, alone: bool) -> list[Side]:
                     summary=summary,
                     named=named,
                     numbers=numbers,
+                    units=units.draw(numbers),
                     right=found.right[rows] == 1,
                     margin=found.margin[rows],
                     answers=np.array(found.answers)[found.answer[rows]],
@@ -252,15 +259,17 @@ def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> Com
     """Return what the pairs of two sides say, without pictures; an InputError where rules are sought and scikit-learn
     is missing. `seed` says which half of the pairs chooses rules, and which counts them."""
     columns = shared_columns(first, second)
-    lost, won = first.right & ~second.right, ~first.right & second.right
+    lost, won, units = first.right & ~second.right, ~first.right & second.right, first.units
+    drawn = len(np.unique(units))
     return ComparedPair(
         first=first.name,
         second=second.name,
-        **_counts(first.right, second.right),
-        p=mcnemar(int(lost.sum()), int(won.sum())),
-        worse=_rules(columns, lost, seed) if rules else None,
-        better=_rules(columns, won, seed) if rules else None,
-        parts=[part for one in columns for part in _parts(one, first.right, second.right)],
+        units=None if drawn == len(units) else drawn,
+        **_counts(first.right, second.right, units),
+        p=paired_by_unit(first.right, second.right, units)[2],
+        worse=_rules(columns, lost, units, seed) if rules else None,
+        better=_rules(columns, won, units, seed) if rules else None,
+        parts=[part for one in columns for part in _parts(one, first.right, second.right, units)],
         shown=[],
     )
 
@@ -276,9 +285,14 @@ def far_apart(first: Side, second: Side, most: int) -> list[int]:
     return found
 
 
-def _counts(first: Mask, second: Mask) -> dict[str, Any]:
+def interval_of(right: Mask, units: npt.NDArray[np.int64]) -> tuple[float, float]:
+    """Return the 95 % interval of the share of right answers (n,), over the units that they are of."""
+    return share_interval(per_unit(right, units), per_unit(np.ones(len(right)), units)) if len(right) else (0.0, 1.0)
+
+
+def _counts(first: Mask, second: Mask, units: npt.NDArray[np.int64]) -> dict[str, Any]:
     cells = [int(one.sum()) for one in (first & second, first & ~second, ~first & second, ~first & ~second)]
-    difference, interval = paired_difference(*cells)
+    difference, interval, _ = paired_by_unit(first, second, units)
     return {
         **dict(zip(("both", "first_only", "second_only", "neither"), cells, strict=True)),
         "difference": difference,
@@ -286,11 +300,11 @@ def _counts(first: Mask, second: Mask) -> dict[str, Any]:
     }
 
 
-def _parts(column: Column, first: Mask, second: Mask) -> Iterator[PairPart]:
+def _parts(column: Column, first: Mask, second: Mask, units: npt.NDArray[np.int64]) -> Iterator[PairPart]:
     """The pairs by the values of a parameter, or by the parts of its range that the sweep's tables have."""
     for value, mask in _masks(column):
         if mask.any():
-            counts = _counts(first[mask], second[mask])
+            counts = _counts(first[mask], second[mask], units[mask])
             yield PairPart(parameter=column.name, unit=column.unit, value=value, **counts)
 
 
@@ -307,12 +321,14 @@ def _masks(column: Column) -> Iterator[tuple[AxisValue, Mask]]:
             yield from ((float(f"{value:.6g}"), column.data == value) for value in values)
 
 
-def _rules(columns: Sequence[Column], alone: Mask, seed: int) -> list[PairRule] | None:
+def _rules(
+    columns: Sequence[Column], alone: Mask, units: npt.NDArray[np.int64], seed: int
+) -> list[PairRule] | None:
     """Where one side alone is right more often than elsewhere; None of too few pairs, or where nothing varies.
 
     These are the rules of `explain`, whose wrong answers are the pairs that one side alone gets right.
     """
-    found = observations(columns, ~alone)
+    found = observations(columns, ~alone, units)
     if len(alone) < FEWEST_ROWS or found is None:
         return None
     choosing, counting = found.halves(seed)
@@ -321,10 +337,11 @@ def _rules(columns: Sequence[Column], alone: Mask, seed: int) -> list[PairRule] 
 
 
 def _rule(rule: CountedRule, factors: Sequence[Factor]) -> PairRule:
-    inside = _count_of(rule.of - rule.right, rule.of)
-    elsewhere = _count_of(rule.of_elsewhere - rule.right_elsewhere, rule.of_elsewhere)
+    inside, elsewhere = _count_of(rule.inside), _count_of(rule.elsewhere)
     return PairRule(conditions=condition_rows(rule.conditions, factors), elsewhere=elsewhere, **vars(inside))
 
 
-def _count_of(count: int, total: int) -> CountOf:
-    return CountOf(count=count, total=total, interval=clopper_pearson(count, total) if total else (0.0, 1.0))
+def _count_of(pairs: Observations) -> CountOf:
+    """How many pairs one side alone gets right, which are those that are not `right`."""
+    low, high = pairs.interval
+    return CountOf(count=int((~pairs.right).sum()), total=len(pairs), interval=(1.0 - high, 1.0 - low))

@@ -45,7 +45,7 @@ class RuleNotTold(RightOf):
 
     conditions: list[ConditionRow] = Field(description="all of which hold")
     elsewhere: RightOf = Field(description="rows under no rule so far")
-    chance: float = Field(description="how likely so few right answers are by chance (Fisher's exact test)")
+    chance: float = Field(description="how likely so few right answers are by chance")
     asked: float = Field(description="how unlikely they would have to be")
     rows: int | None = Field(description="of so many rows, with these shares, it would be told; null where of none")
 
@@ -107,6 +107,11 @@ class ExplainResult(RunResult, RightOf):
     sweeps: list[str] = Field(description="folders of the runs whose rows were read")
     object: str
     model: str
+    units: int | None = Field(
+        default=None,
+        description="draws that the rows are of, such as [drives](drives.md), where some share one; absent where none "
+        "do",
+    )
     parameters: list[str] = Field(description="what varies in all of the rows")
     rules: list[RuleRow]
     not_told: RuleNotTold | None = Field(default=None, description="the next rule, which is not told; absent without")
@@ -130,8 +135,8 @@ RESULT = ExplainResult
 
 
 CHOSEN = (
-    "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % Clopper-Pearson "
-    "intervals. Chance alone would tell any rule in one of a hundred cases at most."
+    "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % intervals. "
+    "Chance alone would tell any rule in one of a hundred cases at most."
 )
 DECIDES = (
     "The share of the variance of the answers, right or wrong, that is between parts of a parameter's values with "
@@ -167,7 +172,8 @@ def shown(result: ExplainResult) -> ShownAnswer:
             else AnswerPart(),
         ],
         {
-            "rows": f"right in {right_share_text(result)}",
+            "rows": f"right in {right_share_text(result)}"
+            + (f", of {result.units:,} independent draws" if result.units else ""),
             "sweeps": ", ".join(result.sweeps),
             "parameters": ", ".join(result.parameters),
         },

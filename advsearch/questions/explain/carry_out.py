@@ -11,13 +11,11 @@ from typing import Any
 from typing_extensions import Unpack
 
 from advsearch.api.keywords import RunKeywords, asks, configured
-from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
 from advsearch.explanations import (
     CHANCE,
     FEWEST_ROWS,
-    Answered,
     CountedRule,
     Factor,
     Observations,
@@ -75,7 +73,8 @@ def explain_from_config(
     if len(rows) < FEWEST_ROWS:
         raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
     values = ({name: (value, row.units.get(name, "")) for name, value in row.values.items()} for row in rows)
-    found = observed([(one, row.correct) for one, row in zip(values, rows, strict=True)])
+    shown = [(one, row.correct) for one, row in zip(values, rows, strict=True)]
+    found = observed(shown, [unit for one in asked for unit in one.units])
     choosing, counting = found.halves(config.seed)
     progress.stage("seeking rules on one half of the rows")
     sought = find_rules(choosing, counting, config.seed)
@@ -103,7 +102,8 @@ def explain_from_config(
             parameters=[one.name for one in found.factors],
             right=right,
             total=len(found),
-            interval=clopper_pearson(right, len(found)),
+            interval=found.interval,
+            units=None if found.independent else found.count,
             rules=table,
             not_told=_not_told(sought.next, found),
             importance=[
@@ -116,7 +116,7 @@ def explain_from_config(
             clusters=clusters,
             renders=renders.count,
             ending=INTERRUPTED if renders.interrupted else "done",
-            warnings=[*renders.warnings, *_cautions(rows, importance)],
+            warnings=[*renders.warnings, *_cautions(found, importance)],
             seconds={"total": time.perf_counter() - begun},
             seed=config.seed,
             command_line=config.command_line(),
@@ -140,20 +140,21 @@ def _together(names: Iterator[str] | Sequence[str]) -> str:
     return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
 
 
-def _cautions(rows: Sequence[Answered], importance: Sequence[FactorWeight]) -> list[str]:
-    right = sum(row.correct for row in rows)
-    if right in (0, len(rows)):
-        return [f"The model is {'right' if right else 'wrong'} in every row: there is nothing to tell apart."]
+def _cautions(found: Observations, importance: Sequence[FactorWeight]) -> list[str]:
+    right, told = int(found.right.sum()), list[str]()
+    if found.count < FEWEST_ROWS:
+        told = [f"The rows are of {found.count} draws, each with several, which are not independent: few show little."]
+    if right in (0, len(found)):
+        return [*told, f"The model is {'right' if right else 'wrong'} in every row: there is nothing to tell apart."]
     if all(one.interval[0] <= 0.0 for one in importance):
-        return ["No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
-    return []
+        return [*told, "No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
+    return told
 
 
 def _told(rule: CountedRule, factors: Sequence[Factor]) -> dict[str, Any]:
     """What a rule is, and how often it holds."""
-    elsewhere = right_of(rule.right_elsewhere, rule.of_elsewhere)
     conditions = condition_rows(rule.conditions, factors)
-    return {"conditions": conditions, **vars(right_of(rule.right, rule.of)), "elsewhere": elsewhere}
+    return {"conditions": conditions, **vars(right_of(rule.inside)), "elsewhere": right_of(rule.elsewhere)}
 
 
 def _not_told(rule: CountedRule | None, found: Observations) -> RuleNotTold | None:
@@ -168,7 +169,7 @@ def _envelope_row(one: Envelope | None, factors: Sequence[Factor], accuracy: flo
     if one is None:
         return None
     rows = condition_rows(one.conditions, factors)
-    return EnvelopeRow(conditions=rows, **vars(right_of(one.right, one.of)), accuracy=accuracy, held=one.held)
+    return EnvelopeRow(conditions=rows, **vars(right_of(one.inside)), accuracy=accuracy, held=one.held)
 
 
 def round_up(rows: float) -> int:

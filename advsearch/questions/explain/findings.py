@@ -7,7 +7,10 @@ so that the index without parts is at least as large. Of two factors it is that 
 
 Of n answers and k parts, n times the share that is counted is Pearson's chi-squared statistic of a table of k x 2, and
 the true share is its noncentrality over n (Cohen's w squared). The interval is that of the noncentrality (Smithson
-2003, "Confidence Intervals"). `benchmarks/explain.py` prints in how many of repeated samples it covers the truth.
+2003, "Confidence Intervals"). Where answers are those of units (frames of drives), chance adds more to the statistic
+than with independent ones: it is divided by how much more, which the deviations of units say, and is one of F, as that
+is known from few units (Rao and Scott 1981, their first-order correction; Thomas and Rao 1987). `benchmarks/explain.py`
+and `benchmarks/drives.py` print in how many of repeated samples it covers the truth.
 
 The box is peeled (PRIM: Friedman and Fisher 1999, section 6): a thin slice of one factor, or one of its names, is taken
 off again and again where that raises the accuracy of what is left the most. One half of the rows chooses the box, and
@@ -25,9 +28,9 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2
+from scipy.stats import chi2, ncf, ncx2
+from scipy.stats import f as fisher
 
-from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.explanations import Observations, RuleCondition, RuleConditions, covered, import_library
 
@@ -58,17 +61,19 @@ def find_importance(found: Observations) -> tuple[FactorWeight, ...]:
     """
     if len(set(found.right.tolist())) < 2:
         return ()
-    count, wide = len(found), range(len(found.factors))
-    alone = [_weight((k,), _parts(found, k, round(count ** (1.0 / 3.0))), found.right) for k in wide]
+    count, wide = found.count, range(len(found.factors))
+    alone = [_weight((k,), _parts(found, k, round(count ** (1.0 / 3.0))), found) for k in wide]
     pairs, tested = [], list(combinations(wide, 2))
     few = max(2, math.isqrt(count // ROWS_IN_A_CELL))
     coarse = [_parts(found, k, few) for k in wide]
     for i, j in tested:
         both = coarse[i] * (int(coarse[j].max()) + 1) + coarse[j]
         (first, k), (second, m), (joint, cells) = (_between(one, found.right) for one in (coarse[i], coarse[j], both))
-        more, freedom = count * (joint - first - second), max(1, cells - k - m + 1)
-        if chi2.sf(more, freedom) < CHANCE / len(tested):
-            pairs.append(_weight((i, j), both, found.right))
+        more, freedom = len(found) * (joint - first - second), max(1, cells - k - m + 1)
+        if _exceeds(more, freedom, [_by_chance(one, found) for one in (both, coarse[i], coarse[j])], found) < (
+            CHANCE / len(tested)
+        ):
+            pairs.append(_weight((i, j), both, found))
     return (*sorted(alone, key=lambda one: -one.share), *sorted(pairs, key=lambda one: -one.share))
 
 
@@ -89,22 +94,67 @@ def _between(parts: Places, right: npt.NDArray[np.bool_]) -> tuple[float, int]:
     return float((seen[seen > 0] * (rate - mean) ** 2).sum()) / len(right) / (mean * (1.0 - mean)), len(rate)
 
 
-def _weight(places: tuple[int, ...], parts: Places, right: npt.NDArray[np.bool_]) -> FactorWeight:
-    (counted, k), n = _between(parts, right), len(right)
-    if k < 2:
+def _weight(places: tuple[int, ...], parts: Places, found: Observations) -> FactorWeight:
+    (counted, k), n = _between(parts, found.right), len(found)
+    by_chance = _by_chance(parts, found)
+    if k < 2 or math.isnan(by_chance):
         return FactorWeight(places, 0.0, (0.0, 1.0), k)
-    tail = (1.0 - CONFIDENCE) / 2.0
-    low = _noncentrality(n * counted, k - 1, 1.0 - tail) / n
-    high = _noncentrality(max(n * counted, k - 1.0), k - 1, tail) / n  # fewer would be less than chance gives
-    share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1)
+    tail, spread = (1.0 - CONFIDENCE) / 2.0, by_chance / (k - 1)
+    if found.independent:
+        spread, others = 1.0, math.inf
+    else:
+        others = float(found.count - k)
+    statistic = n * counted / max(spread, 1e-9)
+    low = spread * _noncentrality(statistic, k - 1, others, 1.0 - tail) / n
+    high = spread * _noncentrality(max(statistic, k - 1.0), k - 1, others, tail) / n  # fewer: less than chance gives
+    share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1) if found.independent else counted - by_chance / n
     return FactorWeight(places, max(share, 0.0), (min(low, 1.0), min(high, 1.0)), k)
 
 
-def _noncentrality(statistic: float, freedom: int, probability: float) -> float:
-    """The noncentrality at which a chi-squared variable is at most the statistic with a probability; 0 if none is."""
+def _by_chance(parts: Places, found: Observations) -> float:
+    """What chance adds to the statistic of some parts, from how much units deviate: k - 1 where answers are
+    independent; NaN where too few units say it."""
+    seen, right = np.bincount(parts), found.right
+    if found.independent:
+        return float((seen > 0).sum() - 1)
+    rate = np.bincount(parts, right) / np.maximum(seen, 1)
+    units = np.unique(found.units, return_inverse=True)[1].reshape(-1)
+    both, places = np.unique(parts * (units.max() + 1) + units, return_inverse=True)
+    away = np.bincount(places.reshape(-1), right - rate[parts])
+    of, in_part = both // (units.max() + 1), np.bincount(both // (units.max() + 1), minlength=len(seen))
+    if found.count < 2 or found.count <= (seen > 0).sum() or (in_part[seen > 0] < 2).any():
+        return math.nan
+    each = np.bincount(of, away**2, minlength=len(seen))[seen > 0]
+    mine = in_part[seen > 0]
+    alone = float((each * mine / (mine - 1) / seen[seen > 0]).sum())
+    together = np.bincount(both % (units.max() + 1), away)
+    whole = float((together**2).sum()) * found.count / (found.count - 1) / len(right)
+    mean = float(right.mean())
+    return max(alone - whole, 1e-9) / (mean * (1.0 - mean))
+
+
+def _exceeds(more: float, freedom: int, by_chance: list[float], found: Observations) -> float:
+    """How likely it is that chance makes the statistic of two factors exceed those of each by so much."""
+    if found.independent:
+        return float(chi2.sf(more, freedom))
+    adds = by_chance[0] - by_chance[1] - by_chance[2]
+    others = found.count - freedom - 1
+    if not adds > 0.0 or others < 1:
+        return 1.0
+    return float(fisher.sf(more / adds, freedom, others))
+
+
+def _noncentrality(statistic: float, freedom: int, others: float, probability: float) -> float:
+    """The noncentrality at which a chi-squared variable, or `freedom` times one of F, is at most the statistic with a
+    probability; 0 if none is."""
 
     def over(at: float) -> float:
-        return float(ncx2.cdf(statistic, freedom, at) if at > 0.0 else chi2.cdf(statistic, freedom)) - probability
+        if others < math.inf:
+            share = statistic / freedom
+            less = ncf.cdf(share, freedom, others, at) if at > 0.0 else fisher.cdf(share, freedom, others)
+        else:
+            less = ncx2.cdf(statistic, freedom, at) if at > 0.0 else chi2.cdf(statistic, freedom)
+        return float(less) - probability
 
     if over(0.0) <= 0.0:
         return 0.0
@@ -117,7 +167,7 @@ def _noncentrality(statistic: float, freedom: int, probability: float) -> float:
 SLICE = 0.05
 """Share of the rows left that is peeled off a side at a time."""
 LEAST_INSIDE = 60
-"""Fewer rows than this cannot show an accuracy of 95 %."""
+"""Fewer rows, or drives, than this cannot show an accuracy of 95 %."""
 RESERVE = 0.01
 """By how much more the choosing rows have to show, since they were chosen by."""
 
@@ -128,8 +178,7 @@ class Envelope:
     end of the interval of the accuracy, and `held` whether that is as much as was asked for."""
 
     conditions: RuleConditions
-    right: int
-    of: int
+    inside: Observations
     at_least: float
     held: bool
 
@@ -139,26 +188,26 @@ def find_envelope(choosing: Observations, counting: Observations, accuracy: floa
     of enough rows does. Some rows choose the box, and others try it, once."""
     conditions: RuleConditions = ()
     inside = np.ones(len(choosing), dtype=bool)
-    while _at_least(choosing.right[inside]) < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
+    while choosing.where(inside).interval[0] < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
         best, kept = max(
             ((one, covered(one, choosing)) for one in _peeled(conditions, choosing, inside)),
-            key=lambda pair: _mean(choosing.right[pair[1]]),
+            key=lambda pair: _mean(choosing, pair[1]),
             default=((), inside),
         )
-        if not best or int(kept.sum()) < LEAST_INSIDE:
+        if not best or _units(choosing, kept) < LEAST_INSIDE:
             return None
         conditions, inside = best, kept
-    right = counting.right[covered(conditions, counting)]
-    low = _at_least(right)
-    return Envelope(conditions, int(right.sum()), len(right), low, low >= accuracy)
+    tried = counting.where(covered(conditions, counting))
+    low = tried.interval[0]
+    return Envelope(conditions, tried, low, low >= accuracy)
 
 
-def _at_least(right: np.ndarray) -> float:
-    return clopper_pearson(int(right.sum()), len(right))[0] if len(right) else 0.0
+def _units(found: Observations, inside: np.ndarray) -> int:
+    return int(inside.sum()) if found.independent else len(np.unique(found.units[inside]))
 
 
-def _mean(right: np.ndarray) -> float:
-    return float(right.mean()) if len(right) >= LEAST_INSIDE else -1.0
+def _mean(found: Observations, inside: np.ndarray) -> float:
+    return float(found.right[inside].mean()) if _units(found, inside) >= LEAST_INSIDE else -1.0
 
 
 def _peeled(conditions: RuleConditions, found: Observations, inside: np.ndarray) -> Iterator[RuleConditions]:

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.studies import carry_out_part
-from advsearch.attacks import clopper_pearson
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.explanations import (
@@ -177,6 +176,13 @@ class AskedSweep:
             raise FileFormatError(f"{folder}: expected the run of a sweep that has ended, got one of another command")
         return cls(folder, SweepConfig.from_yaml(folder / CONFIG), summary, rows_of("", folder, summary))
 
+    @property
+    def units(self) -> list[str]:
+        """The unit of each row; sweeps of the same draws share theirs, so that two models' are not told twice."""
+        deciding = self.config.deciding()
+        drawn = {name: deciding[name] for name in ("grid", "controls", "samples", "sampler", "seed")}
+        return [f"{row.unit} {drawn}" for row in self.rows]
+
 
 @dataclass
 class Renders:
@@ -211,15 +217,17 @@ class Renders:
         """Render fresh configurations inside a rule, in the scene of each sweep."""
         if not self.config.confirm:
             return None
-        rows: list[Answered] = []
+        rows: list[tuple[int, Answered]] = []
         for place, one in enumerate(asked):
             seed = seeds.stream(self.config.seed, "confirm", number * len(asked) + place)
             samples = -(-self.config.confirm // len(asked))
             self.progress.message(f"rule {number + 1}: rendering about {samples} configurations inside it")
             own = sweep_inside(one.config, self.found, rule.conditions, samples, seed)
-            rows += self._rows(f"rule-{number + 1}-{place}", own) or []
-        kept = [row.correct for row in rows if lies_inside(rule.conditions, self.found.factors, row.values)]
-        return right_of(sum(kept), len(kept)) if kept else None
+            rows += [(place, row) for row in self._rows(f"rule-{number + 1}-{place}", own) or []]
+        kept = [each for each in rows if lies_inside(rule.conditions, self.found.factors, each[1].values)]
+        right = np.array([row.correct for _, row in kept], dtype=bool)
+        units = np.array([f"{place} {row.unit}" for place, row in kept])
+        return right_of(Observations((), np.zeros((len(kept), 0)), right, _numbers(units))) if kept else None
 
     def pairs(
         self, rules: Sequence[CountedRule], rows: Sequence[Answered], asked: Sequence[AskedSweep]
@@ -376,6 +384,10 @@ def pictures_again(config: SweepConfig, numbers: Sequence[int], progress: Progre
     return torch.stack(pictures), features_of(scenes.job.models[0])
 
 
-def right_of(right: int, of: int) -> RightOf:
+def right_of(found: Observations) -> RightOf:
     """Return a count with the interval of its share."""
-    return RightOf(right=right, total=of, interval=clopper_pearson(right, of))
+    return RightOf(right=int(found.right.sum()), total=len(found), interval=found.interval)
+
+
+def _numbers(names: npt.NDArray[np.str_]) -> npt.NDArray[np.int64]:
+    return np.unique(names, return_inverse=True)[1].reshape(-1).astype(np.int64)

@@ -1,0 +1,94 @@
+"""Which rows of a sweep are independent: those of different *units*, each of one draw. A unit is a drive with all its
+frames, or a picture, with the answers of all models and, where one was swept, without and with the answer of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import prod
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.errors import FileFormatError
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.store import Store
+
+NOTE = "units"
+"""The note of a run that says it."""
+
+Number = TypeVar("Number", int, npt.NDArray[np.int64])
+
+
+@dataclass(frozen=True)
+class Units:
+    """How rows follow from draws.
+
+    Attributes:
+        sizes: of the axes of the grid, the last one fastest.
+        frames: place of the axis whose values are frames; None where there is none.
+        samples: draws at each point of the grid.
+        models: that are shown the same pictures.
+        again: pictures after which the draws come again; 0 for never.
+    """
+
+    sizes: tuple[int, ...] = ()
+    frames: int | None = None
+    samples: int = 1
+    models: int = 1
+    again: int = 0
+
+    @property
+    def size(self) -> int:
+        """Rows of a whole unit."""
+        return self.models * (2 if self.again else 1) * (1 if self.frames is None else self.sizes[self.frames])
+
+    @property
+    def name(self) -> str:
+        """What one is called."""
+        return "picture" if self.frames is None or self.sizes[self.frames] < 2 else "drive"
+
+    def of(self, step: Number) -> Number:
+        """Return the number of the unit of a row, or of rows (n,), by their steps."""
+        return self.draw(step // self.models)
+
+    def draw(self, picture: Number) -> Number:
+        """Return the number of the draw of a picture, by its number in the whole sweep."""
+        if self.again:
+            picture = picture % self.again
+        if self.frames is None:
+            return picture
+        place, sample = picture // self.samples, picture % self.samples
+        after = prod(self.sizes[self.frames + 1 :])
+        before = place // (self.sizes[self.frames] * after)  # scenes are like one more axis, the slowest
+        return (before * after + place % after) * self.samples + sample
+
+    @property
+    def noted(self) -> dict[str, Any]:
+        """What the note says."""
+        return {**vars(self), "sizes": list(self.sizes)}
+
+
+def units_of(store: Store, summary: SweepSummary | None = None) -> Units | None:
+    """Return what a run notes of its units; of an older one, what its summary says; None where neither does."""
+    noted = store.noted(NOTE)
+    if noted is not None:
+        try:
+            return Units(**{**noted, "sizes": tuple(noted["sizes"])})
+        except (TypeError, KeyError):
+            raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}") from None
+    if summary is None:
+        return None
+    times = [name.endswith(".time") and not name.startswith("mitsuba") for name in summary.grid]
+    return Units(
+        sizes=tuple(summary.grid.values()),
+        frames=times.index(True) if any(times) else None,
+        samples=summary.samples,
+        models=summary_models(summary),
+        again=0 if summary.beside is None else summary.planned // 2 // summary_models(summary),
+    )
+
+
+def summary_models(summary: SweepSummary) -> int:
+    """Return how many models a sweep has."""
+    return max(1, len({row.value for row in summary.axes if row.axis == "model"}))
