@@ -176,6 +176,7 @@ class Verification:
             stands).
         outcomes: of each trial of the second group, whether it is a success; None where it does not count, as under
             its conditions the clean configuration is wrong.
+        begin: the number of the first trial.
     """
 
     ending: Ending
@@ -188,6 +189,7 @@ class Verification:
     renders: int
     stopped: str
     outcomes: tuple[bool | None, ...]
+    begin: int = 0
 
     @property
     def counting(self) -> tuple[Judgement, ...]:
@@ -207,6 +209,7 @@ def run_trials(
     seed: int,
     trials: int = 20,
     first: int = 0,
+    begin: int = 0,
     kind: str = "verification",
     keep: int = 0,
     until: Callable[[Sequence[Judgement]], bool] | None = None,
@@ -223,6 +226,7 @@ def run_trials(
         seed: root of the seeds.
         trials: how many there are then.
         first: how many of them there are already, which are left out.
+        begin: the number of the first of all.
         kind: of their rows.
         keep: the pictures of the first so many are wanted.
         until: see above.
@@ -236,7 +240,8 @@ def run_trials(
         raise InputError(f"verify_spp: expected at least 1, got {spp}")
     done: list[Judgement] = []
     queries = [
-        Query(u, trial_seed(seed, number), kind, number, spp=spp, keep=number < keep) for number in range(first, trials)
+        Query(u, trial_seed(seed, number), kind, number, spp=spp, keep=number < begin + keep)
+        for number in range(begin + first, begin + trials)
     ]
     for answer in evaluate(queries):
         done.append(answer.said)
@@ -267,6 +272,7 @@ def verify(
     control: str = "control",
     keep: int = 0,
     curtailed: bool = False,
+    begin: int = 0,
 ) -> Verification:
     """Check a search's answer in fresh trials against the clean configuration as control group.
 
@@ -297,6 +303,7 @@ def verify(
         control: of the rows of those of the clean configuration.
         keep: the pictures of so many of them are wanted.
         curtailed: see above; for an answer of which only the verdict matters.
+        begin: the number of the first trial: of an answer that was chosen by its trials, that of fresh ones.
 
     Raises:
         InputError: trials or spp under 1.
@@ -323,7 +330,14 @@ def verify(
         count = counted
         while True:
             missing = run_trials(
-                evaluate, domain.start, spp=spp, seed=seed, trials=count, first=len(beside), kind=control
+                evaluate,
+                domain.start,
+                spp=spp,
+                seed=seed,
+                trials=count,
+                first=len(beside),
+                begin=begin,
+                kind=control,
             )
             beside.extend(missing)
             renders += len(missing)
@@ -336,7 +350,16 @@ def verify(
         count = clean_until(look)
         until = lost if curtailed or len(looks) > 1 else None
         made = run_trials(
-            evaluate, u, spp=spp, seed=seed, trials=count, first=len(done), kind=kind, keep=keep, until=until
+            evaluate,
+            u,
+            spp=spp,
+            seed=seed,
+            trials=count,
+            first=len(done),
+            begin=begin,
+            kind=kind,
+            keep=keep,
+            until=until,
         )
         done, renders = [*done, *made], renders + len(made)
         early = count < looks[-1]
@@ -357,4 +380,5 @@ def verify(
         f"{right.trials}."
     )
     stopped = "asked for" if len(looks) == 1 and len(done) == looks[0] else "decided"
-    return Verification(ending, reason, u, right, verified, tuple(beside), tuple(done), renders, stopped, outcomes)
+    groups = tuple(beside), tuple(done)
+    return Verification(ending, reason, u, right, verified, *groups, renders, stopped, outcomes, begin)

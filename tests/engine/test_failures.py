@@ -47,7 +47,9 @@ def checked(known: Failures, *, rule: Rule | None = None, trials: int = 20) -> A
     """An attack of which everything but the different failures has been checked."""
     problem: Any = Coin(domain=NAMED)
     problem.rule = rule or problem.rule
-    attacked = attack_on(problem, configuration(), make_policy("archive"), Stages(NullProgress()))
+    attacked = attack_on(
+        problem, configuration().model_copy(update={"trials": None}), make_policy("archive"), Stages(NullProgress())
+    )
     nothing = (0.0, 0.0, 0.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
     found = SearchResult(torch.full((3,), 0.5), *nothing, failures=known)
     attacked.findings.search = found
@@ -73,8 +75,8 @@ def test_each_is_tried_until_it_is_clear_and_a_lucky_one_does_not_hold() -> None
     attacked = checked(failures(0.9, 0.45, 0.8, 0.2))
     told = described(attacked)
     assert [one.holds for one in told.listed] == [True, False, True, False]
-    assert [one.verified.trials for one in told.listed if one.verified][0::2] == [6, 6]
-    assert told.listed[3].verified is not None and told.listed[3].verified.trials == 1
+    assert [one.verified.trials for one in told.listed if one.verified][0::2] == [14, 14]
+    assert told.listed[3].verified is not None and told.listed[3].verified.trials == 2
     assert (told.tried, told.held, told.found) == (4, 2, 30)
 
 

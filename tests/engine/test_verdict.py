@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +31,10 @@ def noted(monkeypatch: pytest.MonkeyPatch, after: int = -1) -> list[tuple[Any, .
     return made
 
 
-def test_the_pictures_that_choose_the_sample_count_are_the_first_trials(
+def test_the_pictures_that_choose_the_sample_count_are_no_trials(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """They are looked at until they agree: whoever counted them as trials would find what holds by chance."""
     made = noted(monkeypatch)
     findings = carry_out(tmp_path / "run", UNASKED)
     assert findings.verification is not None and findings.verification.ending is Ending.FOUND
@@ -42,15 +42,11 @@ def test_the_pictures_that_choose_the_sample_count_are_the_first_trials(
     assert len(set(made)) == len(made) == findings.verification_renders, "no picture is made twice"
     with RunDirectory.resume(tmp_path / "run") as run:
         stored = [row for row in run.store.rows() if row.phase is None]
-    counted = Counter(row.kind for row in stored if row.renders == 0)
-    assert sum(row.renders or 0 for row in stored) == len(made)
-    assert counted["verification"] >= 4 and counted["control"] >= 4
-    chosen = {
-        (r.kind, r.seed): (r.score, r.label) for r in stored if r.kind.startswith("sample") and r.spp == findings.spp
-    }
-    for row in stored:
-        if row.renders == 0 and row.kind == "control":
-            assert (row.score, row.label) == chosen["sample count clean", row.seed]
+    assert sum(row.renders or 0 for row in stored) == len(stored) == len(made)
+    chosen, tried = (
+        {row.seed for row in stored if row.kind.startswith("sample count") is choosing} for choosing in (True, False)
+    )
+    assert chosen and tried and not chosen & tried
 
 
 @pytest.mark.parametrize("after", [3, 9, 21, 30])

@@ -88,7 +88,8 @@ def _sample_count(summary: AttackSummary) -> str:
     chosen = summary.sample_count
     if chosen is None:
         return ""
-    enough, unknown = "more would leave the margin on its side", "that more would not change it is not shown"
+    enough = "more would leave the " + ("rate about where it is" if summary.over else "margin on its side")
+    unknown = "that more would not change it is not shown"
     still = enough if chosen.converged else unknown
     return f"{chosen.spp} a pixel in the verification; {still}"
 

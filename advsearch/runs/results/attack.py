@@ -183,7 +183,10 @@ class VerificationSamples(Fields):
     """The sample count of the verification."""
 
     spp: int
-    converged: bool = Field(description="whether it is shown that more would leave the margins on their sides")
+    converged: bool = Field(
+        description="whether it is shown that more would leave the margins on their sides; over conditions that vary, "
+        "the rate within 5 points"
+    )
 
 
 class SearchClaim(Fields):
